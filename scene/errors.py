@@ -1,0 +1,28 @@
+"""The one error that a person can mend: wrong input or a wrong config."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """Wrong input: what is wrong and where, what is allowed, how to mend it.
+
+    Commands print it as one message and exit with 2; a library user catches it as a ValueError.
+    """
+
+    def __init__(self, what: str, *, where: str = "", allowed: str = "", remedy: str = "") -> None:
+        self.what, self.where, self.allowed, self.remedy = what, where, allowed, remedy
+        parts = [f"{where}: {what}" if where else what]
+        if allowed:
+            parts.append(f"allowed: {allowed}")
+        if remedy:
+            parts.append(remedy)
+        super().__init__("; ".join(parts))
+
+
+def nearest(word: str, words: Iterable[str]) -> str:
+    """The word of `words` most like `word` as a question to the user, or "" if none is near."""
+    near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
+    return f"did you mean '{near[0]}'?" if near else ""
