@@ -1,0 +1,33 @@
+# `make demo` and `make test` work from an empty clone on a bare Debian or Ubuntu with Python 3.11 to 3.13; see tools/setup.sh.
+BIN := .venv/bin
+
+.PHONY: help setup demo test format benchmarks
+
+help:
+	@echo 'make setup       the environment and the system libraries (seconds when they are there)'
+	@echo 'make demo        simulate both sensors on the demo wall, into a new folder under runs/'
+	@echo 'make test        lint, types and tests'
+	@echo 'make format      put the code into the project'"'"'s format'
+	@echo 'make benchmarks  every benchmark, each with its ratio to the limit measured in the same run'
+
+setup:
+	@sh tools/setup.sh
+
+demo: setup
+	@out=runs/demo_$$(date +%Y%m%d_%H%M%S) && \
+	$(BIN)/simulate --sensor stereo --out $$out/stereo && \
+	$(BIN)/simulate --sensor tls --out $$out/tls && \
+	printf '\nThe reports:\n  %s\n  %s\n' "$$PWD/$$out/stereo/report.html" "$$PWD/$$out/tls/report.html"
+
+test: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pytest -n 2
+
+format: setup
+	$(BIN)/ruff check --fix-only -q .
+	$(BIN)/ruff format .
+
+benchmarks: setup
+	@for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done
