@@ -23,13 +23,16 @@ DEFAULT_ALBEDO = 0.5
 _LARGEST_COORDINATE = 1e4
 """Metres from the frame's origin beyond which float32 leaves less than a millimetre."""
 
+_CHUNK = 1 << 20
+"""Faces prepared at a time, which bounds the memory of float64 intermediates."""
+
 
 @dataclass(frozen=True)
 class Hits:
     """What n rays hit, as lazy device arrays; entries of rays that hit nothing are meaningless where `valid` is False.
 
     valid: (n,) bool; distance: (n,) float64, in lengths of the direction vector (m for unit directions); face: (n,) uint32;
-    normal: 3 x (n,) float32 unit vectors, outside; albedo: (n,) float32.
+    normal: 3 x (n,) float32 unit vectors, outside; albedo: (n,) float32; block: (n,) int32 label of the face, WALL for a miss.
     """
 
     valid: mi.Bool
@@ -37,6 +40,7 @@ class Hits:
     face: mi.UInt32
     normal: mi.Vector3f
     albedo: mi.Float32
+    block: mi.Int32
 
 
 class RayCaster:
@@ -58,49 +62,46 @@ class RayCaster:
         self._scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surface": shape})
 
     @cached_property
-    def _corners(self) -> mi.Float64:
-        """(3 m,) float64: the first vertex of each face, packed."""
-        return mi.Float64(self.mesh.vertices[self.mesh.faces[:, 0]].ravel())
+    def _records(self) -> mi.Float32:
+        """(8 m,) float32, one record per face: unit normal n, albedo; then plane distance n . v as a sum of two float32, block.
 
-    @cached_property
-    def _faces(self) -> mi.Float32:
-        """(4 m,) float32: unit normal and albedo of each face, packed; a float32 normal moves a hit by nanometres at most."""
-        record = np.empty((len(self.mesh.faces), 4), dtype=np.float32)
-        for start in range(0, len(record), 1 << 20):  # blocks bound the memory of the float64 cross products
-            rows = slice(start, start + (1 << 20))
-            corners = self.mesh.vertices[self.mesh.faces[rows]]
+        One record is half a cache line, so a hit costs one visit to memory. The float32 normal moves a hit by nanometres at most
+        (its error times the distance from the face's first vertex v, which the plane passes through); the plane distance keeps
+        48 bits.
+        """
+        faces, vertices, albedo = self.mesh.faces, self.mesh.vertices, self.mesh.vertex_albedo
+        record = np.zeros((len(faces), 8), dtype=np.float32)
+        for start in range(0, len(record), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            corners = vertices[faces[rows]]
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             record[rows, :3] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-            albedo = self.mesh.vertex_albedo
-            record[rows, 3] = DEFAULT_ALBEDO if albedo is None else albedo[self.mesh.faces[rows]].mean(axis=1)
+            record[rows, 3] = DEFAULT_ALBEDO if albedo is None else albedo[faces[rows]].mean(axis=1)
+            plane = np.einsum("ij,ij->i", record[rows, :3].astype(np.float64), corners[:, 0])
+            record[rows, 4] = plane
+            record[rows, 5] = plane - record[rows, 4]
+        if self.mesh.face_block is not None:
+            record[:, 6] = self.mesh.face_block  # exact: labels stay far below 2^24
         return mi.Float32(record.ravel())
-
-    @cached_property
-    def _blocks(self) -> mi.Int32 | None:
-        return None if self.mesh.face_block is None else mi.Int32(self.mesh.face_block)
 
     def intersect(self, origin: mi.Array3f64, direction: mi.Array3f64, *, coherent: bool = True) -> Hits:
         """Cast rays; origin, direction: 3 x (n,) float64, m. The direction need not be of unit length."""
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         found = self._scene.ray_intersect_preliminary(ray, coherent=coherent)
         valid = found.is_valid()
-        corner = dr.gather(mi.Array3f64, self._corners, found.prim_index, valid)
-        face = dr.gather(mi.Array4f, self._faces, found.prim_index, valid)
-        normal = mi.Array3f64(face.x, face.y, face.z)
-        distance = dr.dot(corner - origin, normal) / dr.dot(direction, normal)
-        return Hits(valid, distance, found.prim_index, mi.Vector3f(face.x, face.y, face.z), face.w)
+        first = dr.gather(mi.Array4f, self._records, 2 * found.prim_index, valid)
+        second = dr.gather(mi.Array4f, self._records, 2 * found.prim_index + 1, valid)
+        normal = mi.Array3f64(first.x, first.y, first.z)
+        plane = mi.Float64(second.x) + mi.Float64(second.y)
+        distance = (plane - dr.dot(normal, origin)) / dr.dot(normal, direction)
+        block = dr.select(valid, mi.Int32(second.z), WALL)
+        return Hits(valid, distance, found.prim_index, mi.Vector3f(first.x, first.y, first.z), first.w, block)
 
     def occluded(self, origin: mi.Array3f64, direction: mi.Array3f64, length: mi.Float64, *, coherent: bool = True) -> mi.Bool:
         """Whether something lies on each ray before `length` (n,), m for unit directions."""
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         ray.maxt = mi.Float(length)
         return self._scene.ray_test(ray, coherent=coherent)
-
-    def block_of(self, hits: Hits) -> mi.Int32:
-        """(n,) the block label of the face that each ray hit; WALL where it hit the wall or nothing."""
-        if self._blocks is None:
-            return dr.full(mi.Int32, WALL, dr.width(hits.face))
-        return dr.gather(mi.Int32, self._blocks, hits.face, hits.valid)
 
     def nearest_vertex_label(self, hits: Hits, point: mi.Array3f64, labels: mi.Int32) -> mi.Int32:
         """(n,) the label, out of one per vertex, of the hit face's vertex that is nearest to `point` (3 x (n,), m)."""
@@ -109,8 +110,9 @@ class RayCaster:
             vertex = dr.gather(mi.UInt32, self._face_vertices, 3 * hits.face + corner, hits.valid)
             position = dr.gather(mi.Array3f64, self._vertices, vertex, hits.valid)
             distance = mi.Float32(dr.squared_norm(position - point))
-            result = dr.select(distance < nearest, dr.gather(mi.Int32, labels, vertex, hits.valid), result)
-            nearest = dr.minimum(distance, nearest)
+            nearer = distance < nearest
+            result = dr.select(nearer, dr.gather(mi.Int32, labels, vertex, hits.valid), result)
+            nearest = dr.select(nearer, distance, nearest)  # dr.minimum aborts in LLVM 15
         return dr.select(hits.valid, result, WALL)
 
     @cached_property

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, IntArray
 from scene.raycast import RayCaster
@@ -22,8 +23,8 @@ class Observation:
 
     points: (h, w, 3) float64, m, as recorded; depth: (h, w) float64, m, range (TLS) or distance along the camera's axis (stereo);
     block: (h, w) int32, the block whose niche was hit (0: wall); viewpoint: (3,) m, where the sensor stands;
-    intensity: (h, w) float32 relative received power; gps_time: (h, w) float64, s; truth: named (h, w) channels, such as
-    `true_range_m`, present where the sensor was asked for them.
+    intensity: (h, w) float32 relative received power; pulse_interval_s: time from one cell to the next, in order of rows; truth:
+    named (h, w) channels, such as `true_range_m`, present where the sensor was asked for them.
     """
 
     sensor: str
@@ -32,13 +33,25 @@ class Observation:
     block: IntArray
     viewpoint: FloatArray
     intensity: NDArray[np.float32] | None = None
-    gps_time: FloatArray | None = None
+    pulse_interval_s: float | None = None
     truth: dict[str, NDArray[np.floating]] = field(default_factory=dict)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """(h, w) where there is a return."""
         return ~np.isnan(self.depth)
+
+    @property
+    def gps_time(self) -> FloatArray | None:
+        """(h, w) float64, s since the scan's start; None for a sensor that sees everything at once."""
+        if self.pulse_interval_s is None:
+            return None
+        return self.pulse_interval_s * np.arange(self.depth.size, dtype=np.float64).reshape(self.depth.shape)
+
+
+def packed(point: mi.Array3f64) -> mi.Float64:
+    """The 3 x (n,) device points as one (3 n,) array, point by point, so that it is written once and needs no transpose."""
+    return dr.ravel(point)
 
 
 class Sensor(Protocol):

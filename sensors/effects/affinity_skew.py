@@ -1,0 +1,25 @@
+"""Change of affinity and skew."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from scene.keyed_random import KeyedRandom
+from sensors.camera import CameraPair, Side
+from sensors.effects.base import Effect, Stage, parameter
+
+
+class AffinitySkew(Effect):
+    """b_real = b_nominal + b: the pixels are not square, or the axes not at right angles."""
+
+    name: Literal["affinity_skew"] = "affinity_skew"
+    sensor = "stereo"
+    stage = Stage.CAMERA
+    camera: Side = "both"
+    b1_px: float = parameter(
+        "real minus calibrated affinity", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4
+    )
+    b2_px: float = parameter("real minus calibrated skew", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4)
+
+    def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        return state.changed(self.camera, b1=self.b1_px, b2=self.b2_px)

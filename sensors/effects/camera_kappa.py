@@ -1,0 +1,22 @@
+"""Rotation of a camera about its own z axis."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from scene.keyed_random import KeyedRandom
+from sensors.camera import CameraPair, Side
+from sensors.effects.base import Effect, Stage, parameter
+
+
+class CameraKappa(Effect):
+    """R_real = R_nominal R_z(angle), camera to world: right-handed about the camera's z axis (x right, y down, z forward)."""
+
+    name: Literal["camera_kappa"] = "camera_kappa"
+    sensor = "stereo"
+    stage = Stage.CAMERA
+    camera: Side = "both"
+    angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", ge=-1, le=1)
+
+    def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        return state.rotated(self.camera, axis=2, angle_rad=self.angle_rad)

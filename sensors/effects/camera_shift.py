@@ -1,0 +1,26 @@
+"""Shift of a camera's perspective centre."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from scene.keyed_random import KeyedRandom
+from sensors.camera import CameraPair, Side
+from sensors.effects.base import Effect, Stage, parameter
+
+
+class CameraShift(Effect):
+    """X_real = X_nominal + (x, y, z), world frame."""
+
+    name: Literal["camera_shift"] = "camera_shift"
+    sensor = "stereo"
+    stage = Stage.CAMERA
+    camera: Side = "both"
+    x_m: float = parameter("real minus nominal perspective centre, world x", unit="m", source="photogrammetry", ge=-10, le=10)
+    y_m: float = parameter("real minus nominal perspective centre, world y", unit="m", source="photogrammetry", ge=-10, le=10)
+    z_m: float = parameter("real minus nominal perspective centre, world z", unit="m", source="photogrammetry", ge=-10, le=10)
+
+    def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        return state.shifted(self.camera, np.array([self.x_m, self.y_m, self.z_m]))

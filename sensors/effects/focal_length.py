@@ -1,0 +1,24 @@
+"""Change of the principal distance."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from scene.keyed_random import KeyedRandom
+from sensors.camera import CameraPair, Side
+from sensors.effects.base import Effect, Stage, parameter
+
+
+class FocalLength(Effect):
+    """f_real = f_nominal + delta: the lens warms or is refocused (46 mm at 100 m for 20 K, Glendale lens)."""
+
+    name: Literal["focal_length"] = "focal_length"
+    sensor = "stereo"
+    stage = Stage.CAMERA
+    camera: Side = "both"
+    delta_px: float = parameter(
+        "real minus calibrated principal distance", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4
+    )
+
+    def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        return state.changed(self.camera, f_px=self.delta_px)

@@ -1,0 +1,24 @@
+"""Shift of the principal point along x."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from scene.keyed_random import KeyedRandom
+from sensors.camera import CameraPair, Side
+from sensors.effects.base import Effect, Stage, parameter
+
+
+class PrincipalPointX(Effect):
+    """cx_real = cx_nominal + delta."""
+
+    name: Literal["principal_point_x"] = "principal_point_x"
+    sensor = "stereo"
+    stage = Stage.CAMERA
+    camera: Side = "both"
+    delta_px: float = parameter(
+        "real minus calibrated principal point", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4
+    )
+
+    def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        return state.changed(self.camera, cx_px=self.delta_px)

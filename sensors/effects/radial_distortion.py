@@ -1,0 +1,29 @@
+"""Change of the radial distortion."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from scene.keyed_random import KeyedRandom
+from sensors.camera import CameraPair, Side
+from sensors.effects.base import Effect, Stage, parameter
+
+
+class RadialDistortion(Effect):
+    """k_real = k_nominal + k: a doming of the surface, on a rectified pair in the ratio 3 : 1 of u to v.
+
+    dZ = -Z k1 [3 (u - b/2)^2 + v^2 + b^2/4] (James & Robson 2014), with u, v tangents of the
+    rectified left camera and b = base / Z.
+    """
+
+    name: Literal["radial_distortion"] = "radial_distortion"
+    sensor = "stereo"
+    stage = Stage.CAMERA
+    camera: Side = "both"
+    k1: float = parameter("real minus calibrated k1", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
+    k2: float = parameter("real minus calibrated k2", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
+    k3: float = parameter("real minus calibrated k3", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
+    k4: float = parameter("real minus calibrated k4", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
+
+    def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        return state.changed(self.camera, k1=self.k1, k2=self.k2, k3=self.k3, k4=self.k4)

@@ -1,0 +1,27 @@
+"""Change of the tangential distortion."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from scene.keyed_random import KeyedRandom
+from sensors.camera import CameraPair, Side
+from sensors.effects.base import Effect, Stage, parameter
+
+
+class TangentialDistortion(Effect):
+    """p_real = p_nominal + p, in Metashape's order (OpenCV's p1 and p2 change places)."""
+
+    name: Literal["tangential_distortion"] = "tangential_distortion"
+    sensor = "stereo"
+    stage = Stage.CAMERA
+    camera: Side = "both"
+    p1: float = parameter(
+        "real minus calibrated p1, Metashape's order", unit="1", source="Metashape user manual, appendix D", ge=-10, le=10
+    )
+    p2: float = parameter(
+        "real minus calibrated p2, Metashape's order", unit="1", source="Metashape user manual, appendix D", ge=-10, le=10
+    )
+
+    def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        return state.changed(self.camera, p1=self.p1, p2=self.p2)

@@ -1,0 +1,141 @@
+"""The sensor model: base noise and a list of effects, as a config's `sensor:` section and a measurement's model.yaml hold it."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from scene.config import Config
+from scene.keyed_random import KeyedRandom
+from sensors.camera import Side
+from sensors.effects import (
+    AffinitySkew,
+    AngleNoise,
+    CameraKappa,
+    CameraOmega,
+    CameraPhi,
+    CameraShift,
+    FocalLength,
+    ParallaxNoise,
+    PrincipalPointX,
+    PrincipalPointY,
+    RadialDistortion,
+    RangeNoise,
+    RangeNoiseProportional,
+    RegularizationNoise,
+    StereoEffect,
+    TangentialDistortion,
+    TlsEffect,
+)
+from sensors.effects.base import Effect
+
+
+class TlsNoise(Config):
+    """A laser scanner's white noise, as a datasheet states it."""
+
+    range_sigma_m: float = Field(0.003, ge=0, description="standard deviation of the range [m]")
+    range_ppm: float = Field(0.0, ge=0, description="further standard deviation of the range, in proportion to it [ppm]")
+    angle_sigma_rad: float = Field(0.00005, ge=0, description="standard deviation of azimuth and of zenith [rad]")
+
+
+class TlsModel(Config):
+    """What the simulation believes about a laser scanner."""
+
+    sensor: Literal["tls"] = "tls"
+    noise: TlsNoise = TlsNoise()
+    effects: tuple[TlsEffect, ...] = Field((), description="effects of the catalogue beyond the base noise")
+
+    def chain(self) -> tuple[Effect, ...]:
+        """The base noise and the effects, as one list of effects."""
+        noise = self.noise
+        return (
+            AngleNoise(azimuth_sigma_rad=noise.angle_sigma_rad, zenith_sigma_rad=noise.angle_sigma_rad),
+            RangeNoise(sigma_m=noise.range_sigma_m),
+            RangeNoiseProportional(ppm=noise.range_ppm),
+            *self.effects,
+        )
+
+
+class Spread(Config):
+    """Mean and standard deviation of an orientation parameter drawn anew at each observation; a number alone is the latter."""
+
+    mean: float = Field(0.0, description="mean, in the parameter's unit")
+    sigma: float = Field(0.0, ge=0, description="standard deviation, in the parameter's unit")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _number(cls, value: Any) -> Any:
+        return {"sigma": value} if isinstance(value, int | float) else value
+
+
+class OrientationNoise(Config):
+    """Noise on the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values."""
+
+    omega_rad: Spread = Field(Spread(), description="rotation about the camera's x axis [rad]")
+    phi_rad: Spread = Field(Spread(), description="rotation about the camera's y axis [rad]")
+    kappa_rad: Spread = Field(Spread(), description="rotation about the camera's z axis [rad]")
+    x_m: Spread = Field(Spread(), description="perspective centre, world x [m]")
+    y_m: Spread = Field(Spread(), description="perspective centre, world y [m]")
+    z_m: Spread = Field(Spread(), description="perspective centre, world z [m]")
+    f_px: Spread = Field(Spread(), description="principal distance [px]")
+    cx_px: Spread = Field(Spread(), description="principal point x [px]")
+    cy_px: Spread = Field(Spread(), description="principal point y [px]")
+    b1: Spread = Field(Spread(), description="affinity [px]")
+    b2: Spread = Field(Spread(), description="skew [px]")
+    k1: Spread = Field(Spread(), description="radial distortion, r^2")
+    k2: Spread = Field(Spread(), description="radial distortion, r^4")
+    k3: Spread = Field(Spread(), description="radial distortion, r^6")
+    k4: Spread = Field(Spread(), description="radial distortion, r^8")
+    p1: Spread = Field(Spread(), description="tangential distortion, Metashape's order")
+    p2: Spread = Field(Spread(), description="tangential distortion, Metashape's order")
+
+    def draw(self, side: Side, random: KeyedRandom) -> tuple[Effect, ...]:
+        """One draw of all parameters for one camera, as effects; each parameter has its own random number."""
+        value = {name: self._draw(name, random.child(name)) for name in type(self).model_fields}
+        return (
+            FocalLength(camera=side, delta_px=value["f_px"]),
+            PrincipalPointX(camera=side, delta_px=value["cx_px"]),
+            PrincipalPointY(camera=side, delta_px=value["cy_px"]),
+            RadialDistortion(camera=side, **{key: value[key] for key in ("k1", "k2", "k3", "k4")}),
+            TangentialDistortion(camera=side, p1=value["p1"], p2=value["p2"]),
+            AffinitySkew(camera=side, b1_px=value["b1"], b2_px=value["b2"]),
+            CameraOmega(camera=side, angle_rad=value["omega_rad"]),
+            CameraPhi(camera=side, angle_rad=value["phi_rad"]),
+            CameraKappa(camera=side, angle_rad=value["kappa_rad"]),
+            CameraShift(camera=side, x_m=value["x_m"], y_m=value["y_m"], z_m=value["z_m"]),
+        )
+
+    def _draw(self, name: str, random: KeyedRandom) -> float:
+        spread: Spread = getattr(self, name)
+        return spread.mean + spread.sigma * float(random.generator().standard_normal())
+
+
+class StereoNoise(Config):
+    """A stereo pair's noise: matching, and orientation drawn anew at each observation."""
+
+    parallax_sigma_px: float = Field(0.3, ge=0, description="white noise of the disparity [px of the full-resolution frame]")
+    regularization_sigma_px: float = Field(0.1, ge=0, description="smooth noise of the disparity, at the nodes of a grid [px]")
+    regularization_step_px: float = Field(
+        32.0, gt=0, description="distance of the grid's nodes [px of the full-resolution frame]"
+    )
+    orientation: OrientationNoise = OrientationNoise()
+
+
+class StereoModel(Config):
+    """What the simulation believes about a stereo pair."""
+
+    sensor: Literal["stereo"] = "stereo"
+    noise: StereoNoise = StereoNoise()
+    effects: tuple[StereoEffect, ...] = Field((), description="effects of the catalogue beyond the base noise")
+
+    def chain(self, random: KeyedRandom) -> tuple[Effect, ...]:
+        """The base noise and the effects, as one list of effects; the orientation is drawn from `random`."""
+        noise = self.noise
+        return (
+            *noise.orientation.draw("left", random.child("orientation", "left")),
+            *noise.orientation.draw("right", random.child("orientation", "right")),
+            ParallaxNoise(sigma_px=noise.parallax_sigma_px),
+            RegularizationNoise(sigma_px=noise.regularization_sigma_px, step_px=noise.regularization_step_px),
+            *self.effects,
+        )

@@ -1,0 +1,108 @@
+"""Where a sensor stands that is given by its distance from the wall instead of by coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from scene.config import Config
+from scene.errors import InputError
+from scene.mesh import FloatArray, TriangleMesh
+from sensors.camera import Camera, CameraPair, Matrix3, Vector3
+
+VERTICAL = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Target:
+    """The wall as a sensor's target, world frame.
+
+    centre: (3,) m, the middle of the bounding box; outward: (3,) horizontal unit vector from the wall; bottom_m: lowest z.
+    """
+
+    centre: FloatArray
+    outward: FloatArray
+    bottom_m: float
+
+    @classmethod
+    def of(cls, mesh: TriangleMesh) -> Target:
+        """The target that `mesh` (world frame, faces counter-clockwise from outside) makes.
+
+        Raises InputError where the mesh faces straight up or down, so that no side is in front of it.
+        """
+        corners = mesh.vertices[mesh.faces]
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+        horizontal = np.array([area[0], area[1], 0.0])
+        if np.linalg.norm(horizontal) < 1e-3 * max(np.linalg.norm(area), 1e-300):
+            raise InputError(
+                "the surface has no front (it is closed or horizontal)", where="wall", remedy="give the sensor's position_m"
+            )
+        bounds = mesh.bounds
+        return cls(bounds.mean(axis=0), horizontal / np.linalg.norm(horizontal), float(bounds[0, 2]))
+
+    def stand(self, distance_m: float, height_m: float | None) -> FloatArray:
+        """(3,) the point at `distance_m` horizontally in front of the centre, `height_m` above the toe (None: level with it)."""
+        position = self.centre + distance_m * self.outward
+        return position if height_m is None else np.append(position[:2], self.bottom_m + height_m)
+
+
+class RigConfig(Config):
+    """A stereo pair of equal cameras in front of the wall, both looking at its centre (Glendale's geometry by default)."""
+
+    distance_m: float = Field(105.0, gt=0, description="horizontal distance from the wall's centre [m]")
+    base_m: float = Field(28.0, gt=0, description="distance between the cameras [m]")
+    height_m: float | None = Field(None, description="height above the wall's toe, none: level with the wall's centre [m]")
+    width: int = Field(7360, gt=0, le=100_000, description="frame width [px]")
+    height: int = Field(4912, gt=0, le=100_000, description="frame height [px]")
+    sensor_width_m: float = Field(0.0359, gt=0, description="width of the image sensor [m]")
+    focal_length_m: float = Field(0.050, gt=0, description="principal distance [m]")
+    k1: float = Field(0.0, description="radial distortion, r^2")
+    k2: float = Field(0.0, description="radial distortion, r^4")
+
+    def place(self, target: Target) -> CameraPair:
+        """The pair in front of `target`, world frame; seen from the cameras, the left one stands on the left."""
+        middle = target.stand(self.distance_m, self.height_m)
+        rightward = np.cross(-target.outward, VERTICAL)
+        shift = self.base_m / 2 * rightward
+        return CameraPair(self._camera(middle - shift, target.centre), self._camera(middle + shift, target.centre))
+
+    def _camera(self, position: FloatArray, aim: FloatArray) -> Camera:
+        f_px = self.focal_length_m / self.sensor_width_m * self.width
+        distortion = {"k1": self.k1, "k2": self.k2, "k3": 0.0, "k4": 0.0, "p1": 0.0, "p2": 0.0}
+        camera = Camera(
+            self.width, self.height, f_px, 0.0, 0.0, 0.0, 0.0, **distortion, position=position, rotation=look_at(position, aim)
+        )
+        camera.check_invertible()
+        return camera
+
+
+def look_at(position: FloatArray, aim: FloatArray) -> FloatArray:
+    """(3, 3) camera to world, of a level camera at `position` whose axis passes through `aim`."""
+    forward = (aim - position) / np.linalg.norm(aim - position)
+    right = np.cross(forward, VERTICAL)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+class StationConfig(Config):
+    """Where the laser scanner stands: by coordinates, or at a distance in front of the wall's centre."""
+
+    position_m: Vector3 | None = Field(None, description="scanner's centre, world frame; none: from distance_m and height_m [m]")
+    distance_m: float = Field(
+        105.0, gt=0, description="horizontal distance from the wall's centre, where no position_m is given [m]"
+    )
+    height_m: float = Field(1.6, description="height above the wall's toe, where no position_m is given [m]")
+    rotation: Matrix3 | None = Field(None, description="scanner to world; none: levelled, azimuth 0 towards the wall's centre")
+
+    def place(self, target: Target) -> tuple[FloatArray, FloatArray]:
+        """Position (3,) m and rotation (3, 3) scanner to world."""
+        position = np.array(self.position_m) if self.position_m else target.stand(self.distance_m, self.height_m)
+        if self.rotation:
+            return position, np.array(self.rotation)
+        forward = (target.centre - position) * [1.0, 1.0, 0.0]
+        if np.linalg.norm(forward) < 1e-6:
+            forward = -target.outward
+        forward /= np.linalg.norm(forward)
+        return position, np.stack([forward, np.cross(VERTICAL, forward), VERTICAL], axis=1)

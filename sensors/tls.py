@@ -1,0 +1,201 @@
+"""The terrestrial laser scanner: pulses in a pattern of azimuth and zenith, ray-traced, recorded in their nominal directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from scene.backend import dr, mi
+from scene.config import Config
+from scene.errors import InputError
+from scene.frame import WallFrame
+from scene.keyed_random import KeyedRandom
+from scene.mesh import WALL, FloatArray
+from scene.raycast import RayCaster
+from sensors.camera import axis_rotation
+from sensors.device import opaque, rotated, vector
+from sensors.effects.base import Stage, apply_stage
+from sensors.model import TlsModel
+from sensors.observation import Observation, packed
+from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction
+
+Window = tuple[float, float]
+
+
+class ScannerConfig(Config):
+    """A laser scanner as an instrument, and the window it scans."""
+
+    zenith_limits_rad: Window = Field((0.5, 2.3), description="field of view in zenith: smallest, largest [rad]")
+    azimuth_step_rad: float = Field(0.0005, gt=0, description="angular step between scan lines [rad]")
+    zenith_step_rad: float = Field(0.0005, gt=0, description="angular step between the pulses of a line [rad]")
+    azimuth_rad: Window | None = Field(None, description="window in azimuth: start, stop; none: the wall's extent [rad]")
+    zenith_rad: Window | None = Field(None, description="window in zenith: start, stop; none: the wall's extent [rad]")
+    pulse_rate_hz: float = Field(100_000.0, gt=0, description="pulses per second [Hz]")
+    minimum_range_m: float = Field(1.0, ge=0, description="nearest range that is recorded [m]")
+    maximum_range_m: float = Field(1000.0, gt=0, description="farthest range that is recorded [m]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ScannerConfig:
+        for name in ("zenith_limits_rad", "azimuth_rad", "zenith_rad"):
+            window = getattr(self, name)
+            if window is not None and not window[0] < window[1]:
+                raise ValueError(f"{name}: start must be smaller than stop, got {list(window)}")
+        if not 0 <= self.zenith_limits_rad[0] < self.zenith_limits_rad[1] <= np.pi:
+            raise ValueError(f"zenith_limits_rad must lie in 0..pi, got {list(self.zenith_limits_rad)} (are these degrees?)")
+        if self.minimum_range_m >= self.maximum_range_m:
+            raise ValueError("minimum_range_m must be smaller than maximum_range_m")
+        return self
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Nominal directions: scan lines in azimuth, pulses of a line in zenith; start and step in rad."""
+
+    azimuth_start: float
+    azimuth_step: float
+    lines: int
+    zenith_start: float
+    zenith_step: float
+    pulses: int
+
+    @classmethod
+    def over(cls, azimuth: Window, zenith: Window, config: ScannerConfig) -> Pattern:
+        """The pattern that starts at the windows' starts and ends at or before their stops."""
+        lines, pulses = (
+            int(np.floor((stop - start) / step + 1e-9)) + 1
+            for (start, stop), step in ((azimuth, config.azimuth_step_rad), (zenith, config.zenith_step_rad))
+        )
+        if lines * pulses >= 2**31:
+            raise InputError(f"{lines} x {pulses} pulses are too many", where="scanner", allowed="2^31", remedy="coarser steps")
+        return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)
+
+
+@dataclass(frozen=True)
+class LaserScanner:
+    """A scanner on its station. position: (3,) m and rotation: (3, 3), scanner to wall frame; pattern: what it scans."""
+
+    position: FloatArray
+    rotation: FloatArray
+    pattern: Pattern
+    config: ScannerConfig
+    model: TlsModel
+    truth: bool = False
+
+    @classmethod
+    def aimed(
+        cls,
+        station: tuple[FloatArray, FloatArray],
+        frame: WallFrame,
+        vertices: FloatArray,
+        config: ScannerConfig,
+        model: TlsModel,
+    ) -> LaserScanner:
+        """A scanner whose window, where the config leaves it open, is the extent of `vertices` ((n, 3), wall frame).
+
+        station: position (3,) and rotation (3, 3) scanner to world.
+        """
+        position, rotation = frame.to_wall(station[0]), frame.rotation @ station[1]
+        azimuth, zenith = _extent(vertices, position, rotation)
+        azimuth = config.azimuth_rad or _padded(azimuth, config.azimuth_step_rad)
+        low, high = config.zenith_rad or _padded(zenith, config.zenith_step_rad)
+        low, high = max(low, config.zenith_limits_rad[0]), min(high, config.zenith_limits_rad[1])
+        if not low < high:
+            raise InputError(
+                "the wall lies outside the scanner's field of view",
+                where="scanner.zenith_limits_rad",
+                remedy="move the station or tilt it",
+            )
+        return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model)
+
+    def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
+        """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith)."""
+        effects = self.model.chain()
+        pulses = apply_stage(effects, Stage.AIM, self._emit(), random)
+        pulses = self._trace(scene, pulses)
+        for stage in (Stage.FOOTPRINT, Stage.RANGE, Stage.POWER, Stage.RETURN):
+            pulses = apply_stage(effects, stage, pulses, random)
+        return self._record(pulses)
+
+    def _emit(self) -> Pulses:
+        pattern = self.pattern
+        index = dr.arange(mi.UInt32, pattern.lines * pattern.pulses)
+        line = index // dr.opaque(mi.UInt32, pattern.pulses)
+        pulse = index - line * dr.opaque(mi.UInt32, pattern.pulses)
+        start_azimuth, step_azimuth, start_zenith, step_zenith = opaque(
+            pattern.azimuth_start, pattern.azimuth_step, pattern.zenith_start, pattern.zenith_step
+        )
+        azimuth, zenith = start_azimuth + step_azimuth * mi.Float64(line), start_zenith + step_zenith * mi.Float64(pulse)
+        return Pulses(index, line, azimuth, zenith, aim_azimuth=azimuth, aim_zenith=zenith)
+
+    def _trace(self, scene: RayCaster, pulses: Pulses) -> Pulses:
+        """Ray-trace the emitted directions; power by the lidar range equation, rho cos i / R^2, relative."""
+        aim = rotated(self.rotation, direction(pulses.aim_azimuth, pulses.aim_zenith))
+        hits = scene.intersect(vector(self.position), aim)
+        cos_incidence = -dr.dot(hits.normal, mi.Vector3f(aim))
+        power = hits.albedo * cos_incidence * dr.square(REFERENCE_RANGE_M / mi.Float32(hits.distance))
+        nearest, farthest = opaque(self.config.minimum_range_m, self.config.maximum_range_m)
+        in_reach = (hits.distance >= nearest) & (hits.distance <= farthest)
+        return replace(
+            pulses,
+            true_range=hits.distance,
+            range_m=hits.distance,
+            cos_incidence=cos_incidence,
+            albedo=hits.albedo,
+            power=power,
+            block=hits.block,
+            returned=hits.valid & (cos_incidence > 0) & in_reach,
+        )
+
+    def _record(self, pulses: Pulses) -> Observation:
+        """Points from the nominal direction and the recorded range."""
+        returned = pulses.returned
+        range_m = dr.select(returned, pulses.range_m, np.nan)
+        nominal = rotated(self.rotation, direction(pulses.azimuth, pulses.zenith))
+        points = packed(vector(self.position) + range_m * nominal)
+        power = dr.select(returned, pulses.power, np.nan)
+        block = dr.select(returned, pulses.block, WALL)
+        channels = {"true_range_m": pulses.true_range, "cos_incidence": pulses.cos_incidence} if self.truth else {}
+        truth = {name: dr.select(returned, channel, np.nan) for name, channel in channels.items()}
+        dr.eval(points, range_m, power, block, truth, returned)
+        if dr.none(returned):
+            raise InputError(
+                "no pulse returned from the wall's front",
+                where="station",
+                remedy="check that the scanner stands in front of the rock, not in or behind it, and the scanning window",
+            )
+        shape = self.pattern.lines, self.pattern.pulses
+        return Observation(
+            sensor="tls",
+            points=points.numpy().reshape(*shape, 3),
+            depth=range_m.numpy().reshape(shape),
+            block=block.numpy().reshape(shape),
+            viewpoint=self.position,
+            intensity=power.numpy().reshape(shape),
+            pulse_interval_s=1.0 / self.config.pulse_rate_hz,
+            truth={name: channel.numpy().reshape(shape) for name, channel in truth.items()},
+        )
+
+
+def _extent(vertices: FloatArray, position: FloatArray, rotation: FloatArray) -> tuple[Window, Window]:
+    """Windows in azimuth and zenith, rad, that hold all vertices; azimuth is measured from the vertices' mean direction."""
+    middle_x, middle_y, _ = (vertices.mean(axis=0) - position) @ rotation
+    middle = float(np.arctan2(middle_y, middle_x))
+    turn = rotation @ axis_rotation(2, middle)  # so that no azimuth window straddles the cut at pi
+    limits = np.array([_angles((vertices[rows : rows + _CHUNK] - position) @ turn) for rows in range(0, len(vertices), _CHUNK)])
+    low, high = limits[:, :, 0].min(axis=0), limits[:, :, 1].max(axis=0)
+    return (middle + float(low[0]), middle + float(high[0])), (float(low[1]), float(high[1]))
+
+
+_CHUNK = 1 << 20
+
+
+def _angles(local: FloatArray) -> list[list[float]]:
+    """Smallest and largest azimuth, then zenith, of (n, 3) points in the scanner's frame, rad."""
+    angles = np.arctan2(local[:, 1], local[:, 0]), np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+    return [[angle.min(), angle.max()] for angle in angles]
+
+
+def _padded(window: Window, step: float) -> Window:
+    return window[0] - step, window[1] + step
