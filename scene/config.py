@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from pydantic_core import ErrorDetails
 
 from scene.errors import InputError, nearest
+from scene.yaml_text import parse_yaml
 
 
 class Config(BaseModel):
@@ -39,9 +40,9 @@ def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
 
 
 def load_yaml(path: Path) -> Any:
-    """Read a YAML file with the safe loader; unreadable or malformed files are InputErrors."""
+    """Read a YAML file (`parse_yaml` says which YAML); unreadable or malformed files are InputErrors."""
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(
             f"cannot be read ({error.strerror})", where=str(path), remedy="check the path and the permissions"

@@ -6,16 +6,16 @@ Standard library only: `tools/setup.sh` runs this file before any package is the
 from __future__ import annotations
 
 import ctypes
-import glob
 import os
 import re
 import shutil
 import subprocess
 from dataclasses import dataclass
+from pathlib import Path
 
 LLVM = "libLLVM"
-_LLVM_TESTED = range(22, 13, -1)
-"""LLVM releases that Dr.Jit 1.5 is known to run with, the ones to prefer first."""
+_LLVM_RELEASES = range(22, 13, -1)
+"""LLVM releases for Dr.Jit 1.5, the ones to prefer first; tried: 22, 19, 16, 15."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ def _loads(name: str) -> bool:
 def _llvm_path() -> str | None:
     """Where Dr.Jit will find LLVM: its own variable, the loader's path, Debian's folders."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    candidates = [named] if named else ["libLLVM.so", *glob.glob("/usr/lib/*-linux-gnu/libLLVM*.so.*")]
-    return next((path for path in candidates if _loads(path)), None)
+    found = sorted(map(str, Path("/usr/lib").glob("*-linux-gnu/libLLVM*.so.*")))
+    return next((path for path in ([named] if named else ["libLLVM.so", *found]) if _loads(path)), None)
 
 
 def _llvm_package() -> str:
@@ -76,7 +76,7 @@ def _llvm_package() -> str:
     if shutil.which("apt-cache"):
         listing = subprocess.run(["apt-cache", "pkgnames", "libllvm"], capture_output=True, text=True, check=False).stdout
         known = set(re.findall(r"^libllvm\d+(?:t64)?$", listing, re.MULTILINE))
-    names = (name for release in _LLVM_TESTED for name in (f"libllvm{release}", f"libllvm{release}t64"))
+    names = (name for release in _LLVM_RELEASES for name in (f"libllvm{release}", f"libllvm{release}t64"))
     return next((name for name in names if name in known), "libllvm15")
 
 

@@ -1,0 +1,175 @@
+"""`scarpsim doctor`: what is there, what is missing and how to get it. It must not crash whatever is missing."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.cli import system_libraries
+from scene.errors import InputError
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
+SUMMARY = "say what is installed, what is missing and how to get it"
+EXAMPLE = """  scarpsim doctor
+  scarpsim doctor --json"""
+_SETUP = "run `make setup` in the checkout, or install scarpsim again"
+_MEMORY_GIB, _DISK_GIB = 2.0, 1.0
+"""What the demo needs, with room to spare."""
+_IMPORTS = {
+    "laspy": "laspy",
+    "manifold3d": "manifold3d",
+    "mitsuba": "mitsuba",
+    "open3d": "open3d",
+    "opencv-contrib-python-headless": "cv2",
+    "pycocotools": "pycocotools.mask",
+    "pyyaml": "yaml",
+}
+"""The module to load for a distribution that goes by another name, or whose compiled part is not loaded with the package."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at. `ok` is None where there is nothing to be wrong about; `remedy` says how to get what is missing."""
+
+    name: str
+    ok: bool | None
+    found: str
+    remedy: str = ""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    findings = examine()
+    ready = all(finding.ok is not False for finding in findings)
+    if arguments.json:
+        print(json.dumps({"ready": ready, "findings": [asdict(finding) for finding in findings]}, indent=2))
+    else:
+        for finding in findings:
+            print(_line(finding))
+        print("\nready: `simulate` can run here" if ready else "\nnot ready: mend what is marked PROBLEM")
+    return 0 if ready else 1
+
+
+def examine() -> list[Finding]:
+    """Every finding; a probe that fails is itself a finding."""
+    probes: tuple[Callable[[], Iterator[Finding]], ...] = (_python, _packages, _libraries, _backend, _machine, _caches)
+    return [finding for probe in probes for finding in _guarded(probe)]
+
+
+def _guarded(probe: Callable[[], Iterator[Finding]]) -> list[Finding]:
+    found: list[Finding] = []
+    try:
+        found.extend(probe())
+    except InputError as error:
+        found.append(Finding(probe.__name__.strip("_"), False, str(error)))
+    except Exception as error:  # whatever it is, it is what this command is there to tell
+        found.append(Finding(probe.__name__.strip("_"), False, _brief(error), _SETUP))
+    return found
+
+
+def _line(finding: Finding) -> str:
+    mark = {True: "ok", False: "PROBLEM", None: "-"}[finding.ok]
+    return f"{mark:<8}{finding.name:<32}{finding.found}" + (f"; {finding.remedy}" if finding.remedy else "")
+
+
+def _brief(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".partition("\n")[0]
+
+
+def _python() -> Iterator[Finding]:
+    right = (3, 11) <= sys.version_info < (3, 14)
+    yield Finding("Python", right, platform.python_version(), "" if right else "install Python 3.11 to 3.13")
+    yield Finding("scarpsim", True, f"{metadata.version('scarpsim')} in {Path(__file__).parents[2]}")
+
+
+def _packages() -> Iterator[Finding]:
+    from packaging.requirements import Requirement
+
+    for requirement in map(Requirement, metadata.requires("scarpsim") or []):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            yield _package(requirement)
+
+
+def _package(requirement: Requirement) -> Finding:
+    """Whether a distribution is there, loads, and has a version that fits."""
+    name, wanted = requirement.name, requirement.specifier
+    try:
+        version = metadata.version(name)
+        importlib.import_module(_IMPORTS.get(name, name))
+    except metadata.PackageNotFoundError:
+        return Finding(name, False, f"not installed, wanted {wanted}", _SETUP)
+    except Exception as error:  # compiled packages fail in many ways, each worth reading
+        return Finding(name, False, f"{version} does not load: {_brief(error)}", "see the system libraries below")
+    fits = version in wanted
+    return Finding(name, fits, version, "" if fits else f"wanted {wanted}; {_SETUP}")
+
+
+def _libraries() -> Iterator[Finding]:
+    missing = system_libraries.missing()
+    for library in system_libraries.LIBRARIES:
+        if library.soname != system_libraries.LLVM:  # asked of Dr.Jit itself below
+            absent = library in missing
+            yield Finding(library.soname, not absent, f"for {library.needed_by}", _apt_line(missing) if absent else "")
+
+
+def _apt_line(libraries: list[system_libraries.SystemLibrary]) -> str:
+    return f"apt-get install -y --no-install-recommends {' '.join(system_libraries.packages(libraries))}"
+
+
+def _backend() -> Iterator[Finding]:
+    import drjit as dr
+
+    cuda, llvm = dr.has_backend(dr.JitBackend.CUDA), dr.has_backend(dr.JitBackend.LLVM)
+    yield Finding("CUDA device", None, _gpu_name() if cuda else "none; the CPU is used")
+    if llvm:
+        yield Finding("LLVM backend", True, "usable")
+    else:  # of no importance where there is a GPU
+        remedy = _apt_line([library for library in system_libraries.LIBRARIES if library.soname == system_libraries.LLVM])
+        yield Finding("LLVM backend", None if cuda else False, "no usable libLLVM", remedy)
+    from scene.backend import VARIANT
+
+    yield Finding("Mitsuba variant", True, f"{VARIANT} with {dr.thread_count()} threads")
+
+
+def _gpu_name() -> str:
+    try:
+        query = ["nvidia-smi", "--query-gpu=name,memory.total", "--format=csv,noheader"]
+        return subprocess.run(query, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "found"
+
+
+def _machine() -> Iterator[Finding]:
+    import psutil
+
+    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield Finding("CPU threads", None, f"{threads} usable of {os.cpu_count()}")
+    memory = psutil.virtual_memory()
+    free, disk = memory.available / 2**30, shutil.disk_usage(".").free / 2**30
+    enough, room = free >= _MEMORY_GIB, disk >= _DISK_GIB
+    short = f"the demo needs {_MEMORY_GIB:.0f} GiB: close other programs"
+    yield Finding("memory", enough, f"{free:.1f} GiB free of {memory.total / 2**30:.1f}", "" if enough else short)
+    full = f"results need at least {_DISK_GIB:.0f} GiB: make room, or use --out on another disk"
+    yield Finding("disk space here", room, f"{disk:.1f} GiB free", "" if room else full)
+
+
+def _caches() -> Iterator[Finding]:
+    folder = Path(os.environ.get("DRJIT_CACHE_DIR") or Path.home() / ".drjit")
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else 0
+    yield Finding("compiled kernels", None, f"{size / 2**20:.0f} MiB in {folder}; may be deleted at any time")

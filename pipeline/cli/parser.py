@@ -1,0 +1,68 @@
+"""The argument parser of every command: mistakes become InputErrors with the nearest right word."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import NoReturn
+
+from scene.errors import InputError, nearest
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with exact flags, an example at the end of the help, and InputErrors instead of exits."""
+
+    def __init__(self, prog: str, description: str, example: str) -> None:
+        super().__init__(
+            prog=prog,
+            description=description,
+            epilog=f"example:\n{example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+
+    def parse(self, words: list[str]) -> argparse.Namespace:
+        """Parse the words after the command's name; a misspelt flag is named before the one that is then missing."""
+        flags = [flag for action in self._actions for flag in action.option_strings]
+        for word in words:
+            flag = word.partition("=")[0]
+            if flag.startswith("--") and flag not in flags:
+                raise InputError(f"unknown option '{flag}'", where=self.prog, remedy=nearest(flag, flags) or self._see_help)
+        arguments, unknown = self.parse_known_args(words)
+        if unknown:
+            raise InputError(f"unexpected argument '{unknown[0]}'", where=self.prog, remedy=self._see_help)
+        return arguments
+
+    @property
+    def _see_help(self) -> str:
+        return f"see {self.prog} --help"
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message, where=self.prog, remedy=self._see_help)
+
+
+def one_of(*allowed: str) -> Callable[[str], str]:
+    """An argument's type: one of the words `allowed`."""
+
+    def check(text: str) -> str:
+        if text in allowed:
+            return text
+        hint = nearest(text.lower(), allowed) or f"allowed: {', '.join(allowed)}"
+        raise argparse.ArgumentTypeError(f"got '{text}'; {hint}")
+
+    return check
+
+
+def at_least(smallest: int) -> Callable[[str], int]:
+    """An argument's type: a whole number not below `smallest`."""
+
+    def check(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = smallest - 1
+        if number < smallest:
+            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: a whole number from {smallest}")
+        return number
+
+    return check

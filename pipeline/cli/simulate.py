@@ -1,0 +1,71 @@
+"""`scarpsim simulate`: observe a wall before and after rocks fall."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from datetime import datetime
+from pathlib import Path
+
+from pipeline.cli.parser import at_least, one_of
+from scene.errors import InputError
+
+SUMMARY = "observe a rock wall before and after rocks fall, and map the differences"
+EXAMPLE = """  simulate --sensor tls
+  simulate --sensor stereo --config my_site.yaml --seed 7 --set blocks.count=200 --out runs/my_site"""
+_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""The variables by which the numerical libraries learn how many threads they may use."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--sensor", required=True, type=one_of("stereo", "tls"), metavar="stereo|tls", help="what observes the wall"
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="config file (default: the bundled demo.yaml)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random numbers (default: the config's)")
+    parser.add_argument(
+        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
+    )
+    parser.add_argument("--resume", action="store_true", help="go on with the interrupted run in the folder --out")
+    parser.add_argument(
+        "--threads", type=at_least(1), metavar="N", help="threads to use (default: all; the results are the same)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.resume and not arguments.out:
+        raise InputError("needs the folder to go on with", where="--resume", remedy="add --out DIR")
+    out = arguments.out or new_folder(Path("runs"), arguments.sensor)
+    if arguments.threads:
+        _use_threads(arguments.threads)
+    from pipeline import run as pipeline_run
+    from pipeline.bundled import bundled_config
+    from pipeline.config import load_config
+    from pipeline.progress import shown_progress
+
+    config = load_config(arguments.config or bundled_config("", "demo"), arguments.overrides, arguments.sensor, arguments.seed)
+    arguments.kept = f"what was finished is in {out} and usable; go on with --resume --out {out}"
+    with shown_progress(quiet=arguments.quiet) as progress:
+        summary = pipeline_run.simulate(config, arguments.sensor, out, resume=arguments.resume, progress=progress)
+    print(f"report: {summary.report}")
+    return 0
+
+
+def new_folder(parent: Path, name: str) -> Path:
+    """A path under `parent` that is not there yet, called after `name` and the time."""
+    stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
+    names = (stem if number == 1 else f"{stem}_{number}" for number in range(1, 1000))
+    return next(parent / free for free in names if not (parent / free).exists())
+
+
+def _use_threads(count: int) -> None:
+    for variable in _POOLS:  # read when the libraries are loaded, so before the imports
+        os.environ[variable] = str(count)
+    import cv2
+
+    from scene.backend import dr
+
+    cv2.setNumThreads(count)
+    dr.set_thread_count(count)

@@ -1,0 +1,43 @@
+"""Progress as a bar on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Self, TextIO
+
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+from rich.progress import Progress as RichProgress
+
+from pipeline.progress import Progress, duration
+
+
+class BarProgress(Progress):
+    """A bar that is drawn again several times a second and vanishes at the end."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self._bar = _Bar(self, stream)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+
+class _Bar(RichProgress):
+    """rich's bar, asking `source` how far it is whenever it is drawn."""
+
+    def __init__(self, source: Progress, stream: TextIO) -> None:
+        left = TextColumn("about {task.fields[left]} left")
+        stage = TextColumn("{task.description}")
+        super().__init__(BarColumn(), TaskProgressColumn(), left, stage, console=Console(file=stream), transient=True)
+        self._source = source
+        self._task = self.add_task("", total=1.0, left="")
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        source = self._source
+        self.update(self._task, completed=source.share, description=source.current, left=duration(source.left_s))
+        yield from super().get_renderables()

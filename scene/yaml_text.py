@@ -1,0 +1,58 @@
+"""YAML as config files and `--set` use it: the core schema of YAML 1.2, safe, duplicate keys refused.
+
+PyYAML follows YAML 1.1, which reads 1e-3 as text, 1:30 as 90, 010 as 8 and a date as an object; in a config each of these is a
+silent mistake.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable
+from typing import Any
+
+import yaml
+
+_MAP, _NULL, _BOOL = "tag:yaml.org,2002:map", "tag:yaml.org,2002:null", "tag:yaml.org,2002:bool"
+_INT, _FLOAT, _MERGE = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float", "tag:yaml.org,2002:merge"
+_SCALARS = {
+    _NULL: (r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    _BOOL: (r"^(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
+    _INT: (r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$", list("-+0123456789")),
+    _FLOAT: (
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$",
+        list("-+.0123456789"),
+    ),
+    _MERGE: (r"^<<$", ["<"]),
+}
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader with the core schema's scalars."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012  (PyYAML's own name)
+
+    def integer(self, node: yaml.ScalarNode) -> int:
+        text = self.construct_scalar(node)
+        return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+
+    def mapping(self, node: yaml.MappingNode) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"the key '{key.value}' stands there twice", key.start_mark)
+            seen.add(str(key.value))
+        return self.construct_mapping(node, deep=True)
+
+
+for _tag, (_pattern, _first) in _SCALARS.items():
+    _Loader.add_implicit_resolver(_tag, re.compile(_pattern), _first)
+_Loader.add_constructor(_INT, _Loader.integer)
+_Loader.add_constructor(_MAP, _Loader.mapping)
+
+
+def parse_yaml(text: str) -> Any:
+    """The value that `text` holds; raises yaml.YAMLError where it is malformed or asks for more than plain data."""
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except RecursionError:
+        raise yaml.YAMLError("nested too deeply") from None
