@@ -1,0 +1,120 @@
+"""COCO annotations of the blocks in difference maps or their tiles.
+
+The masks come from the epoch's raster of labels, which travelled with the vertices through noise, meshing and ICP: they lie where
+the *reconstructed* niche lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+from pydantic import Field
+from scipy import ndimage
+
+from scene.config import Config
+from scene.grid import Grid
+from scene.mesh import IntArray
+
+BLOCK_CATEGORY = {"id": 1, "name": "block", "supercategory": "rockfall"}
+
+
+class AnnotationConfig(Config):
+    """Which blocks are annotated."""
+
+    minimum_area_px: int = Field(4, ge=1, description="blocks that show on fewer pixels of an image are left out")
+
+
+@dataclass(frozen=True)
+class LabelledImage:
+    """An image of the data set: its file, the label (h, w) of each of its pixels, and its place.
+
+    file_name: relative to the annotations' folder; block: int32, WALL or the id in blocks.json; row, column: the image's top-left
+    pixel in the difference map (0, 0 for a whole map).
+    """
+
+    file_name: str
+    block: IntArray
+    grid: Grid
+    epoch: int
+    row: int = 0
+    column: int = 0
+
+
+def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The data set as COCO holds it (JSON types only); image and annotation ids count from 1.
+
+    info: COCO's free description. Beyond COCO's own keys, an image has `epoch`, `row`, `column` and its grid (`x_min_m`,
+    `y_max_m`, `gsd_m`, wall frame), an annotation the `block` it shows.
+    """
+    described: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for image_id, image in enumerate(images, start=1):
+        described.append(_describe(image, image_id))
+        for annotation in block_annotations(image.block, config):
+            annotations.append({"id": len(annotations) + 1, "image_id": image_id, **annotation})
+    return {
+        "info": {"description": "Rockfall blocks in difference maps", **(info or {})},
+        "licenses": [],
+        "categories": [BLOCK_CATEGORY],
+        "images": described,
+        "annotations": annotations,
+    }
+
+
+def block_annotations(block: IntArray, config: AnnotationConfig) -> Iterator[dict[str, Any]]:
+    """One annotation, without ids, per block that shows on enough pixels of the raster of labels (h, w), by rising label."""
+    for label, box in enumerate(ndimage.find_objects(block), start=1):
+        if box is None:
+            continue
+        crop = block[box] == label
+        area = int(np.count_nonzero(crop))
+        if area < config.minimum_area_px:
+            continue
+        row, column = box[0].start, box[1].start
+        yield {
+            "category_id": BLOCK_CATEGORY["id"],
+            "bbox": [column, row, crop.shape[1], crop.shape[0]],
+            "area": area,
+            "iscrowd": 0,
+            "segmentation": run_length_encoding(crop, row, column, block.shape),
+            "block": label,
+        }
+
+
+def run_length_encoding(crop: NDArray[np.bool_], row: int, column: int, shape: tuple[int, ...]) -> dict[str, Any]:
+    """COCO's compressed run lengths, down the columns of a frame (h, w), of a mask given by a crop of it.
+
+    crop: (n, m) bool whose top-left pixel is (row, column) of the frame. The same as encoding the whole frame, in the time
+    that the crop takes.
+    """
+    height, width = shape
+    columns = np.pad(crop.T, ((0, 0), (1, 1)))  # a zero at both ends of each column, so that every run ends in it
+    place, step = np.nonzero(columns[:, 1:] != columns[:, :-1])
+    changes = (place + column) * height + step + row
+    joined = np.flatnonzero(changes[1:] == changes[:-1])  # a run that goes on at the top of the next column
+    changes = np.delete(changes, np.concatenate([joined, joined + 1]))
+    counts = np.diff(changes, prepend=0, append=height * width)
+    counts = counts[:-1] if counts[-1] == 0 else counts
+    encoded = coco_mask.frPyObjects({"size": [height, width], "counts": counts.tolist()}, height, width)
+    return {"size": [height, width], "counts": encoded["counts"].decode("ascii")}
+
+
+def _describe(image: LabelledImage, image_id: int) -> dict[str, Any]:
+    height, width = image.block.shape
+    return {
+        "id": image_id,
+        "file_name": image.file_name,
+        "width": width,
+        "height": height,
+        "epoch": image.epoch,
+        "row": image.row,
+        "column": image.column,
+        "x_min_m": image.grid.x_min,
+        "y_max_m": image.grid.y_max,
+        "gsd_m": image.grid.gsd,
+    }
