@@ -1,0 +1,90 @@
+"""The rules between the folders, read from the source: who imports whom, how long a file may be, what `--help` may load."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LONGEST_FILE = 500
+OF_SCENE_FOR_SENSORS = {"backend", "config", "errors", "frame", "grid", "keyed_random", "mesh", "raycast"}
+"""The modules of `scene` that a sensor may know: what it looks at, not how walls and blocks are made."""
+HEAVY = ("numpy", "scipy", "mitsuba", "drjit", "pydantic", "matplotlib", "open3d", "cv2", "rich")
+
+Imports = set[tuple[str, ...]]
+
+
+def imports_of(source: str) -> Imports:
+    """Every absolute module path imported anywhere in `source`, `from a import b` counted as a.b."""
+    found: Imports = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {tuple(alias.name.split(".")) for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide the layer"
+            found |= {(*str(node.module).split("."), alias.name) for alias in node.names}
+    return found
+
+
+def violations(folder: str, imports: Imports) -> Imports:
+    """The imports that a file of `folder` may not have."""
+    forbidden = {"scene": {"sensors", "pipeline"}, "sensors": {"pipeline"}}.get(folder, set())
+    wrong = {path for path in imports if path[0] in forbidden}
+    if folder == "sensors":
+        wrong |= {path for path in imports if path[0] == "scene" and path[1] not in OF_SCENE_FOR_SENSORS}
+    return wrong
+
+
+def sources(folder: str) -> list[Path]:
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+@pytest.mark.parametrize("folder", ["scene", "sensors", "pipeline"])
+def test_layers_import_downwards_only(folder: str) -> None:
+    files = sources(folder)
+    assert files
+    wrong = {str(file.relative_to(ROOT)): violations(folder, imports_of(file.read_text())) for file in files}
+    assert {file: found for file, found in wrong.items() if found} == {}
+
+
+@pytest.mark.parametrize(
+    ("folder", "line"),
+    [
+        ("scene", "from sensors.tls import Scanner"),
+        ("scene", "import pipeline.run"),
+        ("scene", "def late():\n    from pipeline import run"),
+        ("sensors", "from pipeline.run import simulate"),
+        ("sensors", "from scene.carve import carve"),
+        ("sensors", "from scene import blocks"),
+    ],
+)
+def test_the_rule_sees_a_violation(folder: str, line: str) -> None:
+    assert violations(folder, imports_of(line))
+
+
+@pytest.mark.parametrize("folder", ["scene", "sensors", "pipeline"])
+def test_mitsuba_comes_through_the_backend_only(folder: str) -> None:
+    allowed = {ROOT / "scene/backend.py", ROOT / "pipeline/cli/doctor.py"}  # doctor looks where there may be no backend
+    direct = [file for file in sources(folder) if {path[0] for path in imports_of(file.read_text())} & {"mitsuba", "drjit"}]
+    assert set(direct) <= allowed
+
+
+def test_files_stay_short() -> None:
+    lengths = {
+        str(file.relative_to(ROOT)): len(file.read_text().splitlines())
+        for folder in ("scene", "sensors", "pipeline")
+        for file in sources(folder)
+    }
+    assert {file: lines for file, lines in lengths.items() if lines > LONGEST_FILE} == {}
+
+
+@pytest.mark.parametrize("words", [["--help"], ["simulate", "--help"], ["init", "--help"], ["doctor", "--help"]])
+def test_help_loads_nothing_heavy(words: list[str]) -> None:
+    program = f"import sys; from pipeline.cli.main import main; main({words}); print(*sys.modules, file=sys.stderr)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert "example:" in result.stdout
+    assert set(HEAVY) & set(result.stderr.split()) == set()
