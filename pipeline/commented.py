@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from enum import Enum
 from typing import Any, Literal, get_args, get_origin
 
-import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
+
+from scene.yaml_text import yaml_line
 
 _WIDTH = 110
 _UNITS = {
@@ -33,8 +34,8 @@ _BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "up to {}", "lt": "below {}"
 
 def commented_yaml(config: BaseModel) -> str:
     """The config's values as YAML that loads into the same config, with a comment above each key."""
-    summary = [f"# {line}" for line in (type(config).__doc__ or "").strip().splitlines()[:1]]
-    return "\n".join([*summary, "", *_section(config, 0)]).lstrip("\n") + "\n"
+    title = _first_line(type(config))
+    return "\n".join([f"# {title}" if title else "", "", *_section(config, 0)]).strip("\n") + "\n"
 
 
 def _section(config: BaseModel, depth: int) -> Iterator[str]:
@@ -63,13 +64,7 @@ def _entry(name: str, value: Any, depth: int) -> Iterator[str]:
         for key, item in value.items():
             yield from _entry(str(key), item, depth + 1)
     else:
-        yield f"{indent}{name}: {_flow(value)}"
-
-
-def _flow(value: Any) -> str:
-    """A value on one line."""
-    text = yaml.safe_dump(_plain(value), default_flow_style=True, width=10**9, allow_unicode=True, sort_keys=False)
-    return text.removesuffix("\n").removesuffix("\n...")
+        yield f"{indent}{name}: {yaml_line(_plain(value))}"
 
 
 def _plain(value: Any) -> Any:
@@ -87,11 +82,21 @@ def _plain(value: Any) -> Any:
 
 def _comment(name: str, field: FieldInfo, value: Any) -> str:
     unit = _UNITS.get(name.rpartition("_")[2], "") if "_" in name else ""
-    parts = [(field.description or name.replace("_", " ")).rstrip("."), unit, _bounds(field), _choices(field.annotation)]
+    parts = [_description(field, value), unit, _bounds(field), _choices(field.annotation)]
     default = field.default
     if default is not PydanticUndefined and default != value and not isinstance(default, BaseModel):
-        parts.append(f"default {_flow(default)}")
+        parts.append(f"default {yaml_line(_plain(default))}")
     return "; ".join(part for part in parts if part)
+
+
+def _description(field: FieldInfo, value: Any) -> str:
+    """What the field says of itself, else what its section does."""
+    told = field.description or (_first_line(type(value)) if isinstance(value, BaseModel) else "")
+    return told.rstrip(".")
+
+
+def _first_line(section: type[BaseModel]) -> str:
+    return (section.__doc__ or "").strip().partition("\n")[0]
 
 
 def _bounds(field: FieldInfo) -> str:
@@ -106,16 +111,21 @@ def _choices(annotation: Any) -> str:
         return f"one of {', '.join(words)}" if len(words) > 1 else ""
     if isinstance(annotation, type) and issubclass(annotation, Enum):
         return f"one of {', '.join(str(member.value) for member in annotation)}"
-    kinds = [_kind(option) for option in get_args(annotation)]
-    named = [kind for kind in kinds if kind]
+    named = [kind for option in _sections(annotation) if (kind := _kind(option))]
     return f"kinds: {', '.join(named)}" if len(named) > 1 else ""
 
 
-def _kind(option: Any) -> str:
+def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The config models that an annotation allows, in its order."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _sections(inner)
+
+
+def _kind(section: type[BaseModel]) -> str:
     """The word by which a section of a union is told, its only field with one allowed word; "" where there is none."""
-    if not (isinstance(option, type) and issubclass(option, BaseModel)):
-        return ""
-    for name, field in option.model_fields.items():
+    for name, field in section.model_fields.items():
         if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
             return f"{name}={get_args(field.annotation)[0]}"
     return ""

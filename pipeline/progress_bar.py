@@ -31,13 +31,14 @@ class _Bar(RichProgress):
     """rich's bar, asking `source` how far it is whenever it is drawn."""
 
     def __init__(self, source: Progress, stream: TextIO) -> None:
+        self._source = source
         left = TextColumn("about {task.fields[left]} left")
         stage = TextColumn("{task.description}")
         super().__init__(BarColumn(), TaskProgressColumn(), left, stage, console=Console(file=stream), transient=True)
-        self._source = source
-        self._task = self.add_task("", total=1.0, left="")
+        self.add_task("", total=1.0, left="")
 
     def get_renderables(self) -> Iterable[RenderableType]:
         source = self._source
-        self.update(self._task, completed=source.share, description=source.current, left=duration(source.left_s))
+        for task in self.task_ids:  # rich draws once before there is one
+            self.update(task, completed=source.share, description=source.current, left=duration(source.left_s))
         yield from super().get_renderables()

@@ -50,9 +50,24 @@ _Loader.add_constructor(_INT, _Loader.integer)
 _Loader.add_constructor(_MAP, _Loader.mapping)
 
 
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that quotes the texts which `_Loader` would read as something else."""
+
+    yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
 def parse_yaml(text: str) -> Any:
     """The value that `text` holds; raises yaml.YAMLError where it is malformed or asks for more than plain data."""
     try:
         return yaml.load(text, Loader=_Loader)
     except RecursionError:
         raise yaml.YAMLError("nested too deeply") from None
+
+
+def yaml_line(value: Any) -> str:
+    """Plain data as one line of YAML that `parse_yaml` reads back."""
+    text = yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=10**9, allow_unicode=True, sort_keys=False)
+    return text.removesuffix("\n").removesuffix("\n...")

@@ -18,11 +18,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from pipeline.bundled import bundled_config
     from pipeline.commented import commented_yaml
-    from pipeline.config import load_config
+    from pipeline.config import SimulationConfig
+    from scene.config import load_yaml, parse
     from scene.errors import InputError
 
     source = bundled_config("sites", arguments.site) if arguments.site else bundled_config("", "demo")
-    text = commented_yaml(load_config(source, [], None, None))
+    text = commented_yaml(parse(SimulationConfig, load_yaml(source) or {}, str(source)))
     try:
         with arguments.out.open("x", encoding="utf-8") as file:
             file.write(text)

@@ -1,0 +1,54 @@
+"""The doctor: right about this machine, and alive where things are missing."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib import metadata
+
+import pytest
+
+from pipeline.cli import doctor, system_libraries
+from pipeline.cli.main import main
+
+
+def test_this_machine_is_ready(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    found = {finding["name"]: finding for finding in told["findings"]}
+    assert told["ready"] is True
+    assert found["numpy"]["found"] == metadata.version("numpy")
+    assert found["Mitsuba variant"]["found"].split()[0] in ("llvm_ad_mono", "cuda_ad_mono")
+    assert {"Python", "open3d", "CPU threads", "memory", "disk space here", "compiled kernels", "CUDA device"} <= set(found)
+
+
+def test_missing_things_are_told_with_their_remedy(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    absent = system_libraries.SystemLibrary("libnonesuch.so.7", "libnonesuch7", "nobody")
+    monkeypatch.setattr(system_libraries, "LIBRARIES", (absent,))
+    monkeypatch.setattr(metadata, "requires", lambda _: ["nonesuch>=3", "numpy>=1000", "psutil; extra == 'detect'", "rich>=14"])
+    monkeypatch.setitem(sys.modules, "rich", None)
+    monkeypatch.setitem(sys.modules, "psutil", None)
+    assert main(["doctor"]) == 1
+    lines = {line[8:40].strip(): line for line in capsys.readouterr().out.splitlines()}
+    assert lines["libnonesuch.so.7"].startswith("PROBLEM")
+    assert lines["libnonesuch.so.7"].endswith("apt-get install -y --no-install-recommends libnonesuch7")
+    assert "not installed, wanted >=3; run `make setup`" in lines["nonesuch"]
+    assert "wanted >=1000" in lines["numpy"]
+    assert "does not load: ModuleNotFoundError" in lines["rich"]
+    assert "ModuleNotFoundError" in lines["machine"]
+
+
+def test_a_probe_that_fails_is_a_finding() -> None:
+    def explode() -> None:
+        raise ZeroDivisionError("by nought")
+
+    (finding,) = doctor._guarded(explode)
+    assert (finding.name, finding.ok, finding.found) == ("explode", False, "ZeroDivisionError: by nought")
+
+
+def test_llvm_is_looked_for_where_drjit_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nowhere/libLLVM.so")
+    (library,) = (library for library in system_libraries.LIBRARIES if library.soname == system_libraries.LLVM)
+    assert not library.present
+    (package,) = system_libraries.packages([library])
+    assert package.startswith("libllvm")
