@@ -1,0 +1,304 @@
+"""Mending a triangle mesh: welded, without degenerate or doubled faces, manifold, consistently wound.
+
+Every step returns the mended mesh and says in words what it did ("" for nothing). All are vectorised sorts and gathers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from scene.errors import InputError
+from scene.mesh import FloatArray, TriangleMesh
+
+Mended = tuple[TriangleMesh, str]
+Index = NDArray[np.int64]
+
+WELD_M = 1e-6
+"""Vertices nearer to one another than this are one, m."""
+_FLAT_M = 1e-9
+"""A triangle of a smaller height than this has no area, m."""
+_FACES_AT_ONCE = 1 << 18
+_DIRECTION = np.array([0.5377, 0.6349, 0.5548])
+
+
+def clean(mesh: TriangleMesh, where: str) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """The mended mesh and what was mended. Coordinates should be local (float64 with micrometres to spare).
+
+    Raises InputError where nothing with an area is left, or where the surface has only one side.
+    """
+    steps: tuple[Callable[[TriangleMesh], Mended], ...] = (weld, drop_flat, drop_doubled, part_edges)
+    repairs = []
+    for step in steps:
+        mesh, words = step(mesh)
+        repairs.append(words)
+        if not len(mesh.faces):
+            raise InputError(
+                "no triangle has an area: all vertices lie on lines or points", where=where, remedy="export the surface anew"
+            )
+    mesh, words = rewind(mesh, where)
+    repairs.append(words)
+    for step in (part_vertices, drop_unused):
+        mesh, words = step(mesh)
+        repairs.append(words)
+    return mesh, tuple(text for text in (*repairs, pieces(mesh)) if text)
+
+
+def weld(mesh: TriangleMesh) -> Mended:
+    """Join vertices that are the same or within WELD_M of one another (chains of such vertices too); the first one stays."""
+    first, inverse = unique_rows(mesh.vertices + 0.0)  # + 0.0: minus zero is zero
+    near = _near_pairs(mesh.vertices[first])
+    if len(near):
+        group = _groups(near, len(first))
+        first, inverse = first[np.unique(group, return_index=True)[1]], group[inverse]
+    removed = len(mesh.vertices) - len(first)
+    if not removed:
+        return mesh, ""
+    albedo = None if mesh.vertex_albedo is None else mesh.vertex_albedo[first]
+    welded = replace(mesh, vertices=mesh.vertices[first], faces=inverse[mesh.faces].astype(np.int32), vertex_albedo=albedo)
+    return welded, f"{removed} duplicate vertices welded"
+
+
+def drop_flat(mesh: TriangleMesh) -> Mended:
+    """Remove triangles without an area: two corners the same, or all three on one line."""
+    keep = _by_parts(mesh, _has_area, bool)
+    return _keep(mesh, keep, "degenerate triangles removed")
+
+
+def drop_doubled(mesh: TriangleMesh) -> Mended:
+    """Remove all but the first of the triangles over the same three vertices, whatever their winding."""
+    first, _ = unique_rows(np.sort(mesh.faces, axis=1))
+    keep = np.zeros(len(mesh.faces), bool)
+    keep[first] = True
+    return _keep(mesh, keep, "duplicate triangles removed")
+
+
+def part_edges(mesh: TriangleMesh) -> Mended:
+    """Where more than two triangles share an edge, keep the two largest."""
+    edges = undirected_edges(mesh)
+    order = np.argsort(edges, kind="stable")
+    ordered = edges[order]
+    crowded = np.zeros(len(edges), bool)
+    crowded[2:] = ordered[2:] == ordered[:-2]
+    if not crowded.any():
+        return mesh, ""
+    fin = np.flatnonzero(np.isin(edges, ordered[crowded]))
+    face = fin % len(mesh.faces)
+    ranked = np.lexsort((-areas(mesh)[face], edges[fin]))
+    place = np.zeros(len(ranked), bool)
+    place[2:] = edges[fin][ranked][2:] == edges[fin][ranked][:-2]
+    keep = np.ones(len(mesh.faces), bool)
+    keep[face[ranked[place]]] = False
+    return _keep(mesh, keep, f"triangles removed at {len(np.unique(ordered[crowded]))} edges shared by more than two")
+
+
+def rewind(mesh: TriangleMesh, where: str) -> Mended:
+    """Flip the triangles wound against the larger part of their piece of surface.
+
+    Each triangle stands twice in a graph, as it is and flipped; neighbours are joined so that the windings agree. A piece
+    whose two copies are connected has only one side.
+    """
+    count = len(mesh.faces)
+    pair, same = _neighbours(mesh)
+    if not same.any():
+        return mesh, ""
+    flip, none = same * count, np.zeros(len(same), np.int64)
+    links = np.concatenate([pair + np.stack([none, flip], axis=1), pair + np.stack([none + count, count - flip], axis=1)])
+    label = _groups(links, 2 * count)
+    if np.any(label[:count] == label[count:]):
+        raise InputError("the surface has only one side (a Moebius strip), so it has no outside", where=where)
+    size = np.bincount(label[:count], minlength=label.max() + 1)
+    minor = size[label[:count]] < size[label[count:]]
+    tie = (size[label[:count]] == size[label[count:]]) & (label[:count] > label[count:])
+    return flipped(mesh, minor | tie), f"{int(np.sum(minor | tie))} triangles wound the other way round"
+
+
+def part_vertices(mesh: TriangleMesh) -> Mended:
+    """Where fans of triangles touch only in a vertex, keep the largest fan; repeated, as that may bare another such vertex.
+
+    The mesh must be manifold along its edges and consistently wound.
+    """
+    removed = 0
+    while (pinched := _pinched(mesh)).any():
+        lesser = _lesser_fans(mesh, pinched)
+        removed += int(lesser.sum())
+        mesh = replace(mesh, faces=mesh.faces[~lesser])
+    return mesh, f"{removed} triangles removed where the surface touched itself in a vertex" if removed else ""
+
+
+def drop_unused(mesh: TriangleMesh) -> Mended:
+    """Remove the vertices that no triangle uses."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    if used.all():
+        return mesh, ""
+    place = (np.cumsum(used) - 1).astype(np.int32)
+    albedo = None if mesh.vertex_albedo is None else mesh.vertex_albedo[used]
+    kept = replace(mesh, vertices=mesh.vertices[used], faces=place[mesh.faces], vertex_albedo=albedo)
+    return kept, f"{int(np.sum(~used))} unused vertices removed"
+
+
+def pieces(mesh: TriangleMesh) -> str:
+    """What a report should say about pieces that are not connected to the main one; "" if there is one."""
+    label = _groups(mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
+    sizes = np.sort(np.bincount(label[mesh.faces[:, 0]]))
+    if len(sizes) == 1:
+        return ""
+    return f"kept {len(sizes) - 1} pieces apart from the main surface, of {sizes[0]} to {sizes[-2]} triangles"
+
+
+def flipped(mesh: TriangleMesh, which: NDArray[np.bool_]) -> TriangleMesh:
+    """The mesh with the triangles `which` wound the other way round."""
+    return replace(mesh, faces=np.where(which[:, None], mesh.faces[:, ::-1], mesh.faces))
+
+
+def areas(mesh: TriangleMesh) -> FloatArray:
+    """(m,) areas of the triangles, m2."""
+    return _by_parts(mesh, lambda corners: np.sqrt(np.sum(_area_vectors(corners) ** 2, axis=1)), float)
+
+
+def facing_area(mesh: TriangleMesh, towards: FloatArray) -> float:
+    """Area that faces the point `towards` less the area that faces away, each triangle by the cosine of its incidence, m2."""
+
+    def facing(corners: FloatArray) -> FloatArray:
+        line = towards - corners[:, 0]
+        line /= np.sqrt(np.sum(line**2, axis=1, keepdims=True))
+        return np.einsum("ni,ni->n", _area_vectors(corners), line)
+
+    return float(np.sum(_by_parts(mesh, facing, float)))
+
+
+def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]], kind: type) -> NDArray[Any]:
+    """(m,) `evaluate` of the (k, 3, 3) corners of the triangles, some at a time to save memory."""
+    result: NDArray[Any] = np.empty(len(mesh.faces), kind)
+    for start in range(0, len(result), _FACES_AT_ONCE):
+        part = slice(start, start + _FACES_AT_ONCE)
+        result[part] = evaluate(mesh.vertices[mesh.faces[part]])
+    return result
+
+
+def _area_vectors(corners: FloatArray) -> FloatArray:
+    """(k, 3) normals of the triangles, as long as their areas, m2."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+
+
+def _has_area(corners: FloatArray) -> NDArray[np.bool_]:
+    longest = np.sqrt(np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2), axis=1))
+    return 2 * np.sqrt(np.sum(_area_vectors(corners) ** 2, axis=1)) > _FLAT_M * longest
+
+
+def undirected_edges(mesh: TriangleMesh) -> Index:
+    """(3 m,) a number per edge, the same for both directions: edges 01 of all triangles, then 12, then 20."""
+    faces = mesh.faces.astype(np.int64)
+    start, stop = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
+    return np.minimum(start, stop) * len(mesh.vertices) + np.maximum(start, stop)
+
+
+def unique_rows(rows: NDArray[np.generic]) -> tuple[Index, Index]:
+    """Index of the first of each group of equal rows, in order of appearance, and the group of every row.
+
+    rows: (n, 3). They are sorted by a 64-bit hash; should two different ones share a hash, they are sorted in full.
+    """
+    key = np.zeros(len(rows), np.uint64)
+    for column in rows.T.astype(f"{rows.dtype.kind}8"):
+        key = (key ^ (key >> np.uint64(29)) ^ column.view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+    ordered = np.sort(key)
+    if np.all(ordered[1:] != ordered[:-1]):
+        return np.arange(len(rows)), np.arange(len(rows))
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first][inverse], rows):
+        _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return first[order], place[inverse.ravel()]
+
+
+def _near_pairs(vertices: FloatArray) -> Index:
+    """(k, 2) pairs of vertices within WELD_M, found as neighbours along one skew direction."""
+    along = np.einsum("ni,i->n", vertices, _DIRECTION)
+    order = np.argsort(along, kind="stable")
+    along = along[order]
+    candidate = np.arange(len(order) - 1)
+    found = [np.empty((0, 2), np.int64)]
+    for lag in range(1, len(order)):
+        candidate = candidate[: np.searchsorted(candidate, len(order) - lag)]
+        candidate = candidate[along[candidate + lag] - along[candidate] <= WELD_M]
+        if not len(candidate):
+            break
+        pair = order[np.stack([candidate, candidate + lag], axis=1)]
+        distance = vertices[pair[:, 0]] - vertices[pair[:, 1]]
+        found.append(pair[np.sum(distance**2, axis=1) <= WELD_M**2])
+    return np.concatenate(found)
+
+
+def _groups(pairs: NDArray[np.integer], count: int) -> Index:
+    """(count,) number of the connected group of each element, in order of first appearance."""
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def _twins(edges: Index) -> tuple[Index, Index]:
+    """The two places of each number that stands twice in `edges`."""
+    order = np.argsort(edges, kind="stable")
+    twin = np.flatnonzero(edges[order[1:]] == edges[order[:-1]])
+    return order[twin], order[twin + 1]
+
+
+def _neighbours(mesh: TriangleMesh) -> tuple[Index, NDArray[np.bool_]]:
+    """(k, 2) triangles that share an edge, and whether both run along it in the same direction (a winding that disagrees)."""
+    start = mesh.faces.T.ravel()
+    one, other = _twins(undirected_edges(mesh))
+    return np.stack([one, other], axis=1) % len(mesh.faces), start[one] == start[other]
+
+
+def _pinched(mesh: TriangleMesh) -> NDArray[np.bool_]:
+    """(n,) vertices whose triangles are not one fan: a walk about the vertex, edge by edge, does not meet them all."""
+    count, corners = len(mesh.faces), mesh.faces.T.ravel()  # half-edge k m + f leaves corner k of triangle f
+    one, other = _twins(undirected_edges(mesh))
+    twin = np.full(3 * count, -1)
+    twin[one], twin[other] = other, one
+    rim = np.flatnonzero(twin < 0)
+    start = np.full(len(mesh.vertices), -1)
+    start[corners] = np.arange(3 * count)
+    start[corners[rim]] = rim  # an open fan is walked from its rim
+    unmet = np.bincount(corners, minlength=len(mesh.vertices))
+    vertex = np.flatnonzero(start >= 0)
+    edge = start[vertex]
+    while len(vertex):
+        unmet[vertex] -= 1
+        edge = twin[(edge + 2 * count) % (3 * count)]  # the twin of the edge that ends here leaves here too
+        onwards = (edge >= 0) & (edge != start[vertex])
+        vertex, edge = vertex[onwards], edge[onwards]
+    return unmet > 0
+
+
+def _lesser_fans(mesh: TriangleMesh, pinched: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(m,) the triangles in all but the largest fan about each vertex in `pinched`."""
+    near = np.flatnonzero(pinched[mesh.faces].any(axis=1))
+    patch = replace(mesh, faces=mesh.faces[near])
+    corners, count = patch.faces.T.ravel(), len(near)
+    one, other = _twins(undirected_edges(patch))  # wound alike, so that one leaves where the other arrives
+    links = np.concatenate([np.stack([one, (other + count) % (3 * count)], 1), np.stack([(one + count) % (3 * count), other], 1)])
+    fan = _groups(links, 3 * count)
+    first, size = np.unique(fan, return_index=True, return_counts=True)[1:]
+    centre = corners[first]
+    ranked = np.lexsort((-size, centre))
+    lesser = np.zeros(len(ranked), bool)
+    lesser[ranked[1:]] = centre[ranked[1:]] == centre[ranked[:-1]]
+    shed = lesser[fan] & pinched[corners]
+    result = np.zeros(len(mesh.faces), bool)
+    result[near[np.flatnonzero(shed) % count]] = True
+    return result
+
+
+def _keep(mesh: TriangleMesh, keep: NDArray[np.bool_], words: str) -> Mended:
+    if keep.all():
+        return mesh, ""
+    return replace(mesh, faces=mesh.faces[keep]), f"{int(np.sum(~keep))} {words}"

@@ -1,0 +1,126 @@
+"""Rock walls read from mesh files, cleaned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydantic import Field
+
+from scene.cleaning import clean, facing_area, flipped
+from scene.config import Config
+from scene.errors import InputError, nearest
+from scene.mesh import FloatArray, TriangleMesh
+
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+_SMALLEST_M, _LARGEST_M = 0.5, 5000.0
+"""A wall smaller or larger than this is likely to be in another unit."""
+_ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""ITU-R BT.709, of linear red, green and blue."""
+
+
+class ImportedWall(Config):
+    """A wall from a mesh file in any format that trimesh reads."""
+
+    mesh: Path = Field(description="mesh file (ply, obj, stl, off, glb, ...), in the survey's coordinates")
+    unit: Literal["m", "cm", "mm", "ft"] = Field("m", description="of the file's coordinates")
+    albedo: float | None = Field(
+        None, ge=0.0, le=1.0, description="of the whole wall; the luminance of the vertex colours if not given"
+    )
+
+    def load(self) -> tuple[TriangleMesh, tuple[str, ...]]:
+        """The cleaned mesh in the world frame, m, and what was mended. Raises InputError where the file cannot be used."""
+        where = str(self.mesh)
+        mesh = _read(self.mesh)
+        _check_finite(mesh, where)
+        mesh = mesh.with_vertices(mesh.vertices * _METRES[self.unit])
+        self._check_extent(mesh)
+        origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres: taken off and added again without loss
+        mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where)
+        if self.albedo is not None:
+            mesh = replace(mesh, vertex_albedo=np.full(len(mesh.vertices), self.albedo, np.float32))
+        return mesh.with_vertices(mesh.vertices + origin), repairs
+
+    def _check_extent(self, mesh: TriangleMesh) -> None:
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        extent = float(np.max(corners.max(axis=0) - corners.min(axis=0)))
+        if not _SMALLEST_M <= extent <= _LARGEST_M:
+            likely = [unit for unit, metres in _METRES.items() if 2 <= extent / _METRES[self.unit] * metres <= 1000]
+            remedy = f"set `unit` to {' or '.join(likely)} if that is the file's unit" if likely else "check the file"
+            raise InputError(
+                f"the wall is {extent:.4g} m in size with `unit: {self.unit}`",
+                where=str(self.mesh),
+                allowed=f"{_SMALLEST_M} m to {_LARGEST_M:.0f} m",
+                remedy=remedy,
+            )
+
+
+def oriented(mesh: TriangleMesh, towards: FloatArray) -> TriangleMesh:
+    """The mesh wound so that most of its area faces the point `towards` ((3,), the mesh's frame, m)."""
+    if facing_area(mesh, np.asarray(towards)) >= 0:
+        return mesh
+    return flipped(mesh, np.ones(len(mesh.faces), bool))
+
+
+def _read(path: Path) -> TriangleMesh:
+    """The file's triangles as they are, in the file's unit; all meshes of a scene joined."""
+    where, kind = str(path), _format(path)
+    if not path.is_file():
+        raise InputError("there is no such file", where=where, remedy="check the path")
+    options = {"skip_materials": True} if kind == "obj" else {}
+    try:
+        loaded = trimesh.load(str(path), file_type=kind, process=False, **options)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the permissions") from None
+    except Exception as error:  # trimesh's readers raise whatever their parsing meets
+        problem = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"is not a valid {kind} file: {problem}", where=where, remedy="export it anew") from None
+    faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
+    if not len(faces):
+        raise InputError("holds no triangles", where=where, remedy="mesh the points first, then export the surface")
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
+    return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
+
+
+def _format(path: Path) -> str:
+    """The file's format by its suffix; InputError where trimesh has no mesh reader for it."""
+    known = sorted(set(trimesh.available_formats()) - _ARCHIVES)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in known:
+        raise InputError(
+            f"'{path.suffix}' is no mesh format that can be read",
+            where=str(path),
+            allowed=", ".join(known),
+            remedy=nearest(kind, known),
+        )
+    return kind
+
+
+def _check_finite(mesh: TriangleMesh, where: str) -> None:
+    bad = np.logical_not(np.isfinite(mesh.vertices).all(axis=1))
+    if bad.any():
+        first = int(np.argmax(bad))
+        coordinates = ", ".join(f"{value:g}" for value in mesh.vertices[first])
+        raise InputError(
+            f"{int(bad.sum())} of {len(mesh.vertices)} vertices are not finite, the first is vertex {first} at ({coordinates})",
+            where=where,
+            allowed="finite coordinates",
+            remedy="remove these vertices and the triangles that use them",
+        )
+
+
+def _albedo(mesh: Any) -> NDArray[np.float32] | None:
+    """(n,) relative luminance of the vertex colours (sRGB, IEC 61966-2-1), None where there are none."""
+    if getattr(mesh.visual, "kind", None) != "vertex":
+        return None
+    colour = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0
+    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    return np.einsum("nc,c->n", linear, _LUMINANCE).astype(np.float32)

@@ -1,0 +1,46 @@
+"""The wall that a run starts from: made by rule or read from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import Discriminator, Tag
+
+from scene.imported import ImportedWall
+from scene.keyed_random import KeyedRandom
+from scene.mesh import TriangleMesh
+from scene.procedural import ProceduralWall
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A rock wall. mesh: world frame, m, float64; repairs: what was mended in it, in words with counts; name: for reports."""
+
+    mesh: TriangleMesh
+    repairs: tuple[str, ...]
+    name: str
+
+
+def _kind(values: Any) -> str:
+    """The key `mesh` makes it an imported wall."""
+    named = "mesh" in values if isinstance(values, Mapping) else isinstance(values, ImportedWall)
+    return "mesh" if named else "style"
+
+
+WallConfig = Annotated[
+    Annotated[ProceduralWall, Tag("style")] | Annotated[ImportedWall, Tag("mesh")],
+    Discriminator(_kind),
+]
+
+
+def build_wall(config: ProceduralWall | ImportedWall, random: KeyedRandom) -> Wall:
+    """The wall that `config` describes; `random` serves a procedural wall without a seed of its own.
+
+    Raises InputError where the mesh file cannot be used.
+    """
+    if isinstance(config, ProceduralWall):
+        return Wall(config.mesh(random), (), config.style)
+    mesh, repairs = config.load()
+    return Wall(mesh, repairs, config.mesh.stem)

@@ -1,0 +1,310 @@
+"""Imported walls: coordinates kept, each defect mended and named, each wrong input answered."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from scene.cleaning import clean, unique_rows, weld
+from scene.errors import InputError
+from scene.imported import ImportedWall, oriented
+from scene.keyed_random import KeyedRandom
+from scene.mesh import TriangleMesh
+from scene.wall import build_wall
+
+UTM = np.array([500_000.0, 5_000_000.0, 800.0])
+
+
+def sheet(rows=6, columns=8, step=1.0):
+    """An open, slightly wavy sheet of 2 (rows - 1)(columns - 1) triangles."""
+    v, u = np.meshgrid(np.arange(rows) * step, np.arange(columns) * step, indexing="ij")
+    vertices = np.stack([u, 0.1 * np.sin(u + 2 * v) + 1 / 3, v], axis=-1).reshape(-1, 3)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    lower = np.stack([corner, corner + 1, corner + columns + 1], axis=1)
+    upper = np.stack([corner, corner + columns + 1, corner + columns], axis=1)
+    return TriangleMesh(vertices, np.concatenate([lower, upper]).astype(np.int32))
+
+
+def written(path, mesh, colours=None):
+    """Write a mesh: .obj and .off as text; .ply binary in double precision (trimesh itself writes float32)."""
+    vertices, faces = mesh.vertices, mesh.faces
+    if path.suffix == ".obj":
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+        path.write_text("\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist())]) + "\n")
+    elif path.suffix == ".off":
+        lines = [f"{x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+        lines = ["OFF", f"{len(vertices)} {len(faces)} 0", *lines, *(f"3 {a} {b} {c}" for a, b, c in faces.tolist())]
+        path.write_text("\n".join(lines) + "\n")
+    else:
+        fields = [("position", "<f8", 3)] + ([("colour", "u1", 3)] if colours is not None else [])
+        points = np.zeros(len(vertices), fields)
+        points["position"] = vertices
+        header = "ply\nformat binary_little_endian 1.0\n" + f"element vertex {len(vertices)}\n"
+        header += "".join(f"property double {axis}\n" for axis in "xyz")
+        if colours is not None:
+            points["colour"] = colours
+            header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+        triangles = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+        triangles["count"], triangles["corners"] = 3, faces
+        header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        path.write_bytes(header.encode() + points.tobytes() + triangles.tobytes())
+    return path
+
+
+def load(path, **keys):
+    wall = build_wall(ImportedWall(mesh=path, **keys), KeyedRandom(0))
+    return wall.mesh, wall.repairs
+
+
+def edge_uses(faces):
+    """How often each undirected edge is used, the slow and obvious way."""
+    uses = {}
+    for a, b, c in faces.tolist():
+        for edge in ((a, b), (b, c), (c, a)):
+            uses.setdefault(frozenset(edge), []).append(edge)
+    return uses
+
+
+def assert_sound(mesh):
+    uses = edge_uses(mesh.faces).values()
+    assert max(map(len, uses)) <= 2
+    assert all(len(set(edges)) == len(edges) for edges in uses), "neighbours run along an edge in opposite directions"
+    assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
+    assert set(mesh.faces.ravel().tolist()) == set(range(len(mesh.vertices)))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off"])
+def test_utm_coordinates_survive_to_a_micrometre(tmp_path, suffix):
+    mesh = sheet()
+    mesh = mesh.with_vertices(mesh.vertices + UTM)
+    read, repairs = load(written(tmp_path / f"wall{suffix}", mesh))
+    np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-6, rtol=0)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    assert read.vertices.dtype == np.float64
+    assert repairs == ()
+
+
+@pytest.mark.parametrize("suffix", ["stl", "glb", "ply", "obj"])
+def test_what_trimesh_writes_can_be_read(tmp_path, suffix):
+    mesh = sheet()
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / f"wall.{suffix}")
+    read, _ = load(tmp_path / f"wall.{suffix}")
+    assert len(read.vertices) == len(mesh.vertices)  # the STL's triangle soup is welded
+    assert len(read.faces) == len(mesh.faces)
+    distance = np.linalg.norm(read.vertices[:, None] - mesh.vertices, axis=2).min(axis=1)
+    assert distance.max() < 1e-5  # these are stored in float32 or 8 digits
+    assert_sound(read)
+
+
+def test_scenes_of_several_meshes_are_joined(tmp_path):
+    mesh = sheet()
+    scene = trimesh.Scene([trimesh.Trimesh(mesh.vertices + shift, mesh.faces, process=False) for shift in (0.0, [0.0, 0.0, 9.0])])
+    scene.export(tmp_path / "wall.glb")
+    read, repairs = load(tmp_path / "wall.glb")
+    assert len(read.faces) == 2 * len(mesh.faces)
+    assert repairs == (f"kept 1 pieces apart from the main surface, of {len(mesh.faces)} to {len(mesh.faces)} triangles",)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048)])
+def test_units(tmp_path, unit, metres):
+    mesh = sheet()
+    read, _ = load(written(tmp_path / "wall.ply", mesh.with_vertices(mesh.vertices / metres)), unit=unit)
+    np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-12)
+
+
+def test_albedo_is_the_luminance_of_the_colours_or_as_given(tmp_path):
+    mesh = sheet()
+    colours = np.zeros((len(mesh.vertices), 3), np.uint8)
+    colours[0], colours[1], colours[2] = (255, 255, 255), (0, 255, 0), (188, 188, 188)
+    path = written(tmp_path / "wall.ply", mesh, colours)
+    # sRGB 188 is half of the light (0.5029 by IEC 61966-2-1); green carries 0.7152 of the luminance
+    np.testing.assert_allclose(load(path)[0].vertex_albedo[:4], [1.0, 0.7152, 0.5029, 0.0], atol=1e-4)
+    np.testing.assert_allclose(load(path, albedo=0.3)[0].vertex_albedo, 0.3, atol=1e-7)
+    assert load(written(tmp_path / "plain.ply", mesh))[0].vertex_albedo is None
+
+
+def with_duplicates(mesh):
+    soup = mesh.with_vertices(mesh.vertices[mesh.faces].reshape(-1, 3))
+    return replace(soup, faces=np.arange(len(soup.vertices), dtype=np.int32).reshape(-1, 3))
+
+
+def with_faces(mesh, *faces):
+    return replace(mesh, faces=np.concatenate([mesh.faces, np.array(faces, np.int32)]))
+
+
+def with_vertices(mesh, *vertices):
+    return mesh.with_vertices(np.concatenate([mesh.vertices, np.array(vertices)]))
+
+
+def with_flips(mesh):
+    faces = mesh.faces.copy()
+    faces[[3, 10, 11]] = faces[[3, 10, 11], ::-1]
+    return replace(mesh, faces=faces)
+
+
+def with_fin(mesh):
+    fin = mesh.vertices[[9, 10]].mean(axis=0) - [0, 0.1, 0]  # smaller than the two triangles at the inner edge 9-10
+    return with_faces(with_vertices(mesh, fin), [9, 10, 48])
+
+
+def with_touching_fan(mesh):
+    base = mesh.vertices[0]
+    return with_faces(with_vertices(mesh, base - [1, 0, 0], base - [1, 0, 1]), [0, 48, 49])
+
+
+DEFECTS = {
+    "duplicate vertices": (with_duplicates, "162 duplicate vertices welded"),
+    "unused vertices": (lambda mesh: with_vertices(mesh, [1.0, 1.0, 1.5]), "1 unused vertices removed"),
+    "repeated corner": (lambda mesh: with_faces(mesh, [0, 0, 1], [5, 5, 5]), "2 degenerate triangles removed"),
+    "doubled": (lambda mesh: with_faces(mesh, mesh.faces[5, [1, 2, 0]], mesh.faces[7, ::-1]), "2 duplicate triangles removed"),
+    "winding": (with_flips, "3 triangles wound the other way round"),
+    "fin": (with_fin, "1 triangles removed at 1 edges shared by more than two"),
+    "touching": (with_touching_fan, "1 triangles removed where the surface touched itself in a vertex"),
+}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_each_defect_is_mended_and_named(tmp_path, name):
+    mesh = sheet()
+    harm, words = DEFECTS[name]
+    read, repairs = load(written(tmp_path / "wall.ply", harm(mesh)))
+    assert words in repairs
+    assert_sound(read)
+    whole = {tuple(np.round(np.sort(corners, axis=0).ravel(), 9)) for corners in mesh.vertices[mesh.faces]}
+    mended = {tuple(np.round(np.sort(corners, axis=0).ravel(), 9)) for corners in read.vertices[read.faces]}
+    assert mended == whole
+
+
+def test_collinear_triangles_have_no_area():
+    mesh = with_faces(with_vertices(sheet(), [0.0, 9.0, 0.0], [1.0, 9.0, 0.0], [2.0, 9.0, 0.0]), [48, 49, 50])
+    assert clean(mesh, "wall")[1] == ("1 degenerate triangles removed", "3 unused vertices removed")
+
+
+def test_vertices_within_a_micrometre_are_one_at_utm_scale(tmp_path):
+    mesh = sheet()
+    soup = with_duplicates(mesh.with_vertices(mesh.vertices + UTM))
+    shift = np.random.default_rng(1).uniform(-1, 1, soup.vertices.shape)
+    # shifts below 0.25 um keep any two copies within 0.87 um of one another; UTM coordinates in float64 step by 0.93 nm
+    read, _ = load(written(tmp_path / "wall.ply", soup.with_vertices(soup.vertices + 0.25e-6 * shift)))
+    assert len(read.vertices) == len(mesh.vertices)
+    far = soup.with_vertices(soup.vertices + 1e-4 * shift)
+    assert len(load(written(tmp_path / "far.ply", far))[0].vertices) == len(soup.vertices)
+
+
+def test_welding_equals_the_brute_force_grouping():
+    random = np.random.default_rng(3)
+    vertices = random.uniform(0, 4e-6, (120, 3))
+    distance = np.linalg.norm(vertices[:, None] - vertices, axis=2)
+    label = np.arange(len(vertices))
+    for _ in range(len(vertices)):
+        label = np.where(distance <= 1e-6, label, len(vertices)).min(axis=1)
+    welded, _ = weld(TriangleMesh(vertices, np.arange(120, dtype=np.int32).reshape(-1, 3)))
+    np.testing.assert_array_equal(welded.vertices, vertices[np.unique(label)])
+    np.testing.assert_array_equal(welded.vertices[welded.faces.ravel()], vertices[label])
+
+
+def test_unique_rows_keep_the_first_of_each_group():
+    rows = np.random.default_rng(2).integers(0, 5, (400, 3))
+    first, group = unique_rows(rows)
+    seen = list(dict.fromkeys(map(tuple, rows.tolist())))
+    assert [tuple(row) for row in rows[first].tolist()] == seen
+    np.testing.assert_array_equal(rows[first][group], rows)
+
+
+def test_winding_follows_the_larger_part_of_each_piece():
+    mesh = sheet()
+    faces = mesh.faces.copy()
+    faces[: len(faces) - 4] = faces[: len(faces) - 4, ::-1]
+    mended = clean(replace(mesh, faces=faces), "wall")[0]
+    np.testing.assert_array_equal(mended.faces, mesh.faces[:, ::-1])
+
+
+def test_a_closed_surface_stays_closed_and_an_open_one_open():
+    sphere = trimesh.creation.icosphere(3)
+    ball = TriangleMesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32))
+    mended, repairs = clean(with_duplicates(ball), "ball")
+    assert repairs == (f"{3 * len(ball.faces) - len(ball.vertices)} duplicate vertices welded",)
+    assert all(len(edges) == 2 for edges in edge_uses(mended.faces).values())
+    rim = sum(len(edges) == 1 for edges in edge_uses(clean(sheet(), "sheet")[0].faces).values())
+    assert rim == 2 * (5 + 7)
+
+
+def test_two_balls_that_touch_in_a_vertex_are_parted():
+    sphere = trimesh.creation.icosphere(2)
+    small = trimesh.creation.icosphere(1)
+    vertices = np.concatenate([sphere.vertices, small.vertices * -1 + sphere.vertices[0] + small.vertices[0]])
+    faces = np.concatenate([sphere.faces, small.faces[:, ::-1] + len(sphere.vertices)]).astype(np.int32)
+    mended, repairs = clean(TriangleMesh(vertices, faces), "balls")
+    assert any("touched itself in a vertex" in words for words in repairs)
+    assert_sound(mended)
+
+
+def test_oriented_turns_the_faces_to_the_point():
+    mesh = sheet()  # wound counter-clockwise seen from -y
+    np.testing.assert_array_equal(oriented(mesh, np.array([4.0, -50.0, 3.0])).faces, mesh.faces)
+    np.testing.assert_array_equal(oriented(mesh, np.array([4.0, 50.0, 3.0])).faces, mesh.faces[:, ::-1])
+
+
+def broken(vertex):
+    mesh = sheet()
+    mesh.vertices[[7, 9]] = vertex
+    return mesh
+
+
+def line():
+    return TriangleMesh(np.arange(9.0)[:, None] * [1.0, 2.0, 3.0], np.arange(9, dtype=np.int32).reshape(3, 3))
+
+
+WRONG = {
+    "nan": (broken(np.nan), {}, r"2 of 48 vertices are not finite, the first is vertex 7 at \(nan, nan, nan\); allowed: finite"),
+    "infinite": (broken(np.inf), {}, r"2 of 48 vertices are not finite, the first is vertex 7 at \(inf"),
+    "empty": (replace(sheet(), faces=np.empty((0, 3), np.int32)), {}, "holds no triangles"),
+    "line": (line(), {}, "no triangle has an area"),
+    "millimetres": (sheet(step=1e4), {}, r"7e\+04 m in size with `unit: m`; allowed: 0.5 m to 5000 m; set `unit` to cm or mm"),
+    "tiny": (sheet(), {"unit": "mm"}, "set `unit` to m or ft"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_each_wrong_mesh_is_answered_in_one_line(tmp_path, name):
+    mesh, keys, words = WRONG[name]
+    path = written(tmp_path / "wall.ply", mesh)
+    with pytest.raises(InputError, match=words) as caught:
+        load(path, **keys)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("missing.ply", None, "there is no such file"),
+        ("wall.plx", b"", "'.plx' is no mesh format that can be read; allowed: .*did you mean 'ply'"),
+        ("wall.pkl", b"cos\nsystem\n", "'.pkl' is no mesh format"),
+        ("wall.ply", b"this is no mesh", "is not a valid ply file"),
+        ("empty.ply", b"", "is not a valid ply file"),
+        ("cut.off", b"OFF\n3 1 0\n0 0 0\n", "is not a valid off file"),
+        ("wild.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7 of 3|is not a valid off file"),
+        ("points.xyz", b"0 0 0\n1 0 0\n0 1 0\n", "holds no triangles"),
+    ],
+)
+def test_each_wrong_file_is_answered_in_one_line(tmp_path, name, content, words):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_one_sided_surface_is_refused():
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    centre = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    across = 0.3 * np.stack([np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)], axis=1)
+    vertices = np.stack([centre + across, centre - across], axis=1).reshape(-1, 3)
+    near, far = 2 * np.arange(12), 2 * np.arange(12) + 1
+    next_near, next_far = np.append(near[1:], far[0]), np.append(far[1:], near[0])
+    faces = np.concatenate([np.stack([near, far, next_near], 1), np.stack([far, next_far, next_near], 1)]).astype(np.int32)
+    with pytest.raises(InputError, match="only one side"):
+        clean(TriangleMesh(vertices, faces), "strip")
