@@ -78,11 +78,10 @@ class Progress:
         done, total = self._done(), sum(self._weights.values())
         return (total - done) * (self.elapsed_s / done if done > 0 else 1.0)
 
-    def describe(self) -> str:
-        """One line: the share done, the stage, the time left; without a plan the stage and the time so far."""
-        if not self._weights:
-            return f"{self.current}, {duration(self.elapsed_s)} so far"
-        return f"{self.share:.0%} done, about {duration(self.left_s)} left: {self.current}"
+    @property
+    def time(self) -> str:
+        """The time left, for people; without a plan the time so far."""
+        return f"about {duration(self.left_s)} left" if self._weights else f"{duration(self.elapsed_s)} so far"
 
     def _done(self) -> float:
         """Weight done so far; a stage that has not said how far it is goes by the pace of the stages before it."""
@@ -115,7 +114,7 @@ class LineProgress(Progress):
     def _tick(self) -> None:
         wait = self._quiet_s
         while not self._stop.wait(wait):
-            self._stream.write(f"{self.describe()}\n")
+            self._stream.write(f"{self.share:.0%} done, {self.time}: {self.current}\n")
             self._stream.flush()
             wait = self._interval_s
 

@@ -9,7 +9,7 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn
 from rich.progress import Progress as RichProgress
 
-from pipeline.progress import Progress, duration
+from pipeline.progress import Progress
 
 
 class BarProgress(Progress):
@@ -32,13 +32,12 @@ class _Bar(RichProgress):
 
     def __init__(self, source: Progress, stream: TextIO) -> None:
         self._source = source
-        left = TextColumn("about {task.fields[left]} left")
-        stage = TextColumn("{task.description}")
-        super().__init__(BarColumn(), TaskProgressColumn(), left, stage, console=Console(file=stream), transient=True)
-        self.add_task("", total=1.0, left="")
+        time, stage = TextColumn("{task.fields[time]}"), TextColumn("{task.description}")
+        super().__init__(BarColumn(), TaskProgressColumn(), time, stage, console=Console(file=stream), transient=True)
+        self.add_task("", total=1.0, time="")
 
     def get_renderables(self) -> Iterable[RenderableType]:
         source = self._source
         for task in self.task_ids:  # rich draws once before there is one
-            self.update(task, completed=source.share, description=source.current, left=duration(source.left_s))
+            self.update(task, completed=source.share, description=source.current, time=source.time)
         yield from super().get_renderables()

@@ -27,8 +27,9 @@ class Terminal(io.StringIO):
 def test_share_and_time_left_follow_weights_and_pace() -> None:
     clock = Clock()
     progress = Progress(clock)
+    assert progress.time == "0 s so far"
     progress.plan({"wall": 1.0, "observe": 3.0})
-    assert (progress.share, progress.left_s) == (0.0, 4.0)
+    assert (progress.share, progress.left_s, progress.time) == (0.0, 4.0, "about 4 s left")
     with progress.stage("wall"):
         clock.now += 2.0  # twice as slow as planned
     assert progress.share == pytest.approx(0.25)
