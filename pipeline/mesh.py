@@ -29,7 +29,7 @@ BoolArray = NDArray[np.bool_]
 
 _POISSON_DEPTH_LIMIT = 12
 """The deepest octree chosen by itself: 4,096 cells along the cloud's longest side."""
-_NORMAL_NEIGHBOURS = 16
+_NORMAL_NEIGHBOURS = 30
 _VOTES = 4096
 """Triangles asked for the winding of an organised grid; all but folded ones agree."""
 
@@ -81,7 +81,7 @@ def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, confi
 
     points: (n, 3), m; block: (n,) labels; viewpoint: (3,), m, the side that the normals and the winding look to. Poisson
     closes the surface where there are no points; vertices farther from every point than `poisson_trim_spacings` median spacings
-    are trimmed. Labels come from the nearest point. Single-threaded, so that the result is repeatable to the byte.
+    are trimmed. Labels come from the nearest point. Single-threaded: with more threads Open3D gives other bytes in every run.
     """
     if len(points) <= _NORMAL_NEIGHBOURS:
         raise InputError(f"{len(points)} points are too few", where="Poisson surface", allowed="more than 16")

@@ -227,8 +227,8 @@ def test_poisson_of_an_observation_is_repeatable():
 def test_errors_name_the_remedy():
     with pytest.raises(InputError, match="no triangle between the 0 points of the synthetic observation"):
         mesh_observation(observation(np.full((*SHAPE, 3), np.nan)), SurfaceConfig())
-    with pytest.raises(InputError, match="16 points are too few"):
-        mesh_cloud(np.zeros((16, 3)), np.zeros(16, dtype=np.int32), VIEWPOINT, SurfaceConfig())
+    with pytest.raises(InputError, match="30 points are too few"):
+        mesh_cloud(np.zeros((30, 3)), np.zeros(30, dtype=np.int32), VIEWPOINT, SurfaceConfig())
     with pytest.raises(InputError, match="same place"):
         mesh_cloud(np.ones((40, 3)), np.zeros(40, dtype=np.int32), VIEWPOINT, SurfaceConfig())
     with pytest.raises(ValidationError):
