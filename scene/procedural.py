@@ -83,10 +83,10 @@ SITES = {
         throw_m=0.3,
         roughness=0.04,
         hurst=0.8,
-        albedo=0.46,
-        bed_tone=0.05,
-        block_tone=0.025,
-        streaks=0.04,
+        albedo=0.48,
+        bed_tone=0.04,
+        block_tone=0.018,
+        streaks=0.025,
         band=Band(
             at=0.45,
             thickness_m=2.3,
@@ -258,7 +258,7 @@ class Rock:
             fractal("roughness", site.roughness, site.hurst, (2.0, 0.03125)),
             Noise.make(random.child("patches"), size, 3.0),
             fractal("streaks", 1.0, 0.5, (1.0, 0.25), aspect=8.0),
-            fractal("grain", 0.05, 0.15, (0.5, 0.03125)),
+            fractal("grain", 0.035, 0.15, (0.5, 0.03125)),
             blocks("band", site.band.blocks if site.band else ()),
         )
 

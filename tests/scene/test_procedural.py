@@ -102,7 +102,8 @@ def test_the_coal_of_glendale_is_dark_and_of_its_thickness():
     albedo = config.mesh(KeyedRandom(2)).vertex_albedo.reshape(451, 701)
     dark = albedo < 0.2
     assert np.median(0.1 * dark.sum(axis=0)) == pytest.approx(2.3, abs=0.3)
-    assert np.std(np.nonzero(dark)[0]) * 0.1 < 1.5  # one seam that bends by a metre, not dark spots all over
+    rows = np.nonzero(dark)[0]
+    assert np.mean(np.abs(rows - np.median(rows)) < 40) > 0.95  # one seam that bends by metres, not dark spots all over
 
 
 def test_the_run_seed_or_the_walls_own_decides():
