@@ -23,9 +23,6 @@ DEFAULT_ALBEDO = 0.5
 _LARGEST_COORDINATE = 1e4
 """Metres from the frame's origin beyond which float32 leaves less than a millimetre."""
 
-_CHUNK = 1 << 20
-"""Faces prepared at a time, which bounds the memory of float64 intermediates."""
-
 
 @dataclass(frozen=True)
 class Hits:
@@ -56,33 +53,44 @@ class RayCaster:
         self.mesh = mesh
         shape = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))
         parameters = mi.traverse(shape)
-        parameters["vertex_positions"] = mi.Float(mesh.vertices.astype(np.float32).ravel())
-        parameters["faces"] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
+        self._vertices = mi.Float64(mesh.vertices.ravel())
+        self._face_vertices = mi.UInt32(mesh.faces.astype(np.uint32, copy=False).ravel())
+        parameters["vertex_positions"] = mi.Float(self._vertices)
+        parameters["faces"] = self._face_vertices
         parameters.update()
         self._scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surface": shape})
 
     @cached_property
     def _records(self) -> mi.Float32:
-        """(8 m,) float32, one record per face: unit normal n, albedo; then plane distance n . v as a sum of two float32, block.
+        """(8 m,) float32, one record per face, half a cache line, so that a hit costs one visit to memory.
 
-        One record is half a cache line, so a hit costs one visit to memory. The float32 normal moves a hit by nanometres at most
-        (its error times the distance from the face's first vertex v, which the plane passes through); the plane distance keeps
-        48 bits.
+        The face's plane is n . x = d with n scaled so that its largest component, along `axis`, is +-1; the other two (cyclic
+        order after the axis) and d are sums of two float32, which keep 48 bits. In order: n_1 high, n_1 low, n_2 high, n_2 low,
+        d high, d low, albedo, 6 block + 2 axis + (1 where n's largest component is negative).
         """
-        faces, vertices, albedo = self.mesh.faces, self.mesh.vertices, self.mesh.vertex_albedo
-        record = np.zeros((len(faces), 8), dtype=np.float32)
-        for start in range(0, len(record), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            corners = vertices[faces[rows]]
-            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            record[rows, :3] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-            record[rows, 3] = DEFAULT_ALBEDO if albedo is None else albedo[faces[rows]].mean(axis=1)
-            plane = np.einsum("ij,ij->i", record[rows, :3].astype(np.float64), corners[:, 0])
-            record[rows, 4] = plane
-            record[rows, 5] = plane - record[rows, 4]
-        if self.mesh.face_block is not None:
-            record[:, 6] = self.mesh.face_block  # exact: labels stay far below 2^24
-        return mi.Float32(record.ravel())
+        index = dr.arange(mi.UInt32, len(self.mesh.faces))
+        labels = mi.Int32(WALL) if self.mesh.face_block is None else dr.gather(mi.Int32, mi.Int32(self.mesh.face_block), index)
+        vertex = [dr.gather(mi.UInt32, self._face_vertices, 3 * index + corner) for corner in range(3)]
+        corner, second, third = (dr.gather(mi.Array3f64, self._vertices, number) for number in vertex)
+        normal = dr.cross(second - corner, third - corner)
+        axis, largest = _largest_component(normal)
+        normal /= dr.abs(largest)  # NaN for a face without area, which is never hit
+        following = dr.select(axis == 0, normal.y, dr.select(axis == 1, normal.z, normal.x))
+        last = dr.select(axis == 0, normal.z, dr.select(axis == 1, normal.x, normal.y))
+        code = mi.Float32(6 * labels + 2 * mi.Int32(axis) + dr.select(largest < 0, 1, 0))  # exact below 2^24: 2.7 million blocks
+        columns = [part for value in (following, last, dr.dot(normal, corner)) for part in _split(value)]
+        records = dr.empty(mi.Float32, 8 * len(self.mesh.faces))
+        for column, value in enumerate((*columns, self._albedo(vertex), code)):
+            dr.scatter(records, value, 8 * index + column)
+        dr.eval(records)
+        return records
+
+    def _albedo(self, vertex: list[mi.UInt32]) -> mi.Float32:
+        """Mean albedo of each face's three vertices."""
+        if self.mesh.vertex_albedo is None:
+            return mi.Float32(DEFAULT_ALBEDO)
+        albedo = mi.Float32(self.mesh.vertex_albedo)
+        return sum((dr.gather(mi.Float32, albedo, number) for number in vertex), mi.Float32(0)) / 3
 
     def intersect(self, origin: mi.Array3f64, direction: mi.Array3f64, *, coherent: bool = True) -> Hits:
         """Cast rays; origin, direction: 3 x (n,) float64, m. The direction need not be of unit length."""
@@ -91,11 +99,11 @@ class RayCaster:
         valid = found.is_valid()
         first = dr.gather(mi.Array4f, self._records, 2 * found.prim_index, valid)
         second = dr.gather(mi.Array4f, self._records, 2 * found.prim_index + 1, valid)
-        normal = mi.Array3f64(first.x, first.y, first.z)
-        plane = mi.Float64(second.x) + mi.Float64(second.y)
-        distance = (plane - dr.dot(normal, origin)) / dr.dot(normal, direction)
-        block = dr.select(valid, mi.Int32(second.z), WALL)
-        return Hits(valid, distance, found.prim_index, mi.Vector3f(first.x, first.y, first.z), first.w, block)
+        code = mi.UInt32(second.w)
+        block, rest = code // 6, code % 6
+        normal = _plane_normal(rest >> 1, (rest & 1) == 1, _joined(first.x, first.y), _joined(first.z, first.w))
+        distance = (_joined(second.x, second.y) - dr.dot(normal, origin)) / dr.dot(normal, direction)
+        return Hits(valid, distance, found.prim_index, dr.normalize(mi.Vector3f(normal)), second.z, mi.Int32(block))
 
     def occluded(self, origin: mi.Array3f64, direction: mi.Array3f64, length: mi.Float64, *, coherent: bool = True) -> mi.Bool:
         """Whether something lies on each ray before `length` (n,), m for unit directions."""
@@ -115,14 +123,6 @@ class RayCaster:
             nearest = dr.select(nearer, distance, nearest)  # dr.minimum aborts in LLVM 15
         return dr.select(hits.valid, result, WALL)
 
-    @cached_property
-    def _face_vertices(self) -> mi.UInt32:
-        return mi.UInt32(self.mesh.faces.astype(np.uint32).ravel())
-
-    @cached_property
-    def _vertices(self) -> mi.Float64:
-        return mi.Float64(self.mesh.vertices.ravel())
-
     def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
         """Cast rays given as NumPy arrays, (n, 3) each, m; returns distance and face (n,); a miss is NaN and -1."""
         columns = (np.ascontiguousarray(np.broadcast_to(array, directions.shape).T) for array in (origins, directions))
@@ -141,6 +141,33 @@ class RayCaster:
         origin = mi.Array3f64(x_min + (column + 0.5) * gsd, y_max - (row + 0.5) * gsd, start)
         hits = self.intersect(origin, mi.Array3f64(0.0, 0.0, -1.0))
         return hits, mi.Array3f64(origin.x, origin.y, origin.z - hits.distance)
+
+
+def _largest_component(vector: mi.Array3f64) -> tuple[mi.UInt32, mi.Float64]:
+    """Axis and value of the component that is largest in magnitude."""
+    size = dr.abs(vector)
+    axis = dr.select(size.x >= size.y, dr.select(size.x >= size.z, 0, 2), dr.select(size.y >= size.z, 1, 2))
+    return mi.UInt32(axis), dr.select(axis == 0, vector.x, dr.select(axis == 1, vector.y, vector.z))
+
+
+def _split(value: mi.Float64) -> tuple[mi.Float32, mi.Float32]:
+    """`value` as the sum of two float32."""
+    high = mi.Float32(value)
+    return high, mi.Float32(value - mi.Float64(high))
+
+
+def _joined(high: mi.Float32, low: mi.Float32) -> mi.Float64:
+    return mi.Float64(high) + mi.Float64(low)
+
+
+def _plane_normal(axis: mi.UInt32, negative: mi.Bool, following: mi.Float64, last: mi.Float64) -> mi.Array3f64:
+    """The vector whose component along `axis` is +-1; `following` and `last` are the next two in cyclic order."""
+    largest = dr.select(negative, mi.Float64(-1.0), mi.Float64(1.0))
+    return mi.Array3f64(
+        dr.select(axis == 0, largest, dr.select(axis == 1, last, following)),
+        dr.select(axis == 1, largest, dr.select(axis == 2, last, following)),
+        dr.select(axis == 2, largest, dr.select(axis == 0, last, following)),
+    )
 
 
 def heights(caster: RayCaster, grid: Grid) -> NDArray[np.float32]:

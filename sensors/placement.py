@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
@@ -17,35 +18,34 @@ VERTICAL = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Target:
-    """The wall as a sensor's target, world frame.
+    """The wall as a sensor's target: a mesh in the world frame, faces counter-clockwise seen from outside."""
 
-    centre: (3,) m, the middle of the bounding box; outward: (3,) horizontal unit vector from the wall; bottom_m: lowest z.
-    """
+    mesh: TriangleMesh
 
-    centre: FloatArray
-    outward: FloatArray
-    bottom_m: float
+    @cached_property
+    def centre(self) -> FloatArray:
+        """(3,) the middle of the bounding box, m."""
+        return self.mesh.bounds.mean(axis=0)
 
-    @classmethod
-    def of(cls, mesh: TriangleMesh) -> Target:
-        """The target that `mesh` (world frame, faces counter-clockwise from outside) makes.
+    @cached_property
+    def outward(self) -> FloatArray:
+        """(3,) horizontal unit vector from the wall towards the side its faces look to.
 
-        Raises InputError where the mesh faces straight up or down, so that no side is in front of it.
+        Raises InputError where the mesh faces straight up or down or is closed, so that no side is in front of it.
         """
-        corners = mesh.vertices[mesh.faces]
-        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
-        horizontal = np.array([area[0], area[1], 0.0])
-        if np.linalg.norm(horizontal) < 1e-3 * max(np.linalg.norm(area), 1e-300):
+        corners = self.mesh.vertices[self.mesh.faces]
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        total, horizontal = np.linalg.norm(area, axis=1).sum(), area.sum(axis=0) * [1.0, 1.0, 0.0]
+        if np.linalg.norm(horizontal) < 1e-3 * total:
             raise InputError(
-                "the surface has no front (it is closed or horizontal)", where="wall", remedy="give the sensor's position_m"
+                "the wall has no front (it is closed or horizontal)", where="wall", remedy="give the sensor's position_m"
             )
-        bounds = mesh.bounds
-        return cls(bounds.mean(axis=0), horizontal / np.linalg.norm(horizontal), float(bounds[0, 2]))
+        return horizontal / np.linalg.norm(horizontal)
 
     def stand(self, distance_m: float, height_m: float | None) -> FloatArray:
         """(3,) the point at `distance_m` horizontally in front of the centre, `height_m` above the toe (None: level with it)."""
         position = self.centre + distance_m * self.outward
-        return position if height_m is None else np.append(position[:2], self.bottom_m + height_m)
+        return position if height_m is None else np.append(position[:2], self.mesh.bounds[0, 2] + height_m)
 
 
 class RigConfig(Config):
@@ -64,8 +64,7 @@ class RigConfig(Config):
     def place(self, target: Target) -> CameraPair:
         """The pair in front of `target`, world frame; seen from the cameras, the left one stands on the left."""
         middle = target.stand(self.distance_m, self.height_m)
-        rightward = np.cross(-target.outward, VERTICAL)
-        shift = self.base_m / 2 * rightward
+        shift = self.base_m / 2 * np.cross(-target.outward, VERTICAL)
         return CameraPair(self._camera(middle - shift, target.centre), self._camera(middle + shift, target.centre))
 
     def _camera(self, position: FloatArray, aim: FloatArray) -> Camera:

@@ -63,3 +63,28 @@ def _named(effects: tuple[type[Effect], ...]) -> Any:
 
 TlsEffect = _named(TLS_EFFECTS)
 StereoEffect = _named(STEREO_EFFECTS)
+
+__all__ = [
+    "STEREO_EFFECTS",
+    "TLS_EFFECTS",
+    "AffinitySkew",
+    "AngleNoise",
+    "CameraKappa",
+    "CameraOmega",
+    "CameraPhi",
+    "CameraShift",
+    "Effect",
+    "FocalLength",
+    "ParallaxNoise",
+    "PrincipalPointX",
+    "PrincipalPointY",
+    "RadialDistortion",
+    "RangeNoise",
+    "RangeNoiseProportional",
+    "RangeOffset",
+    "RangeScale",
+    "RegularizationNoise",
+    "StereoEffect",
+    "TangentialDistortion",
+    "TlsEffect",
+]

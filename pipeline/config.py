@@ -1,0 +1,184 @@
+"""The config of a simulation: the model of all its sections, and how files and overrides become one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag, field_validator
+
+from pipeline.annotate import AnnotationConfig
+from pipeline.difference import DifferenceConfig
+from pipeline.formats.cameras import PairConfig, read_cameras_yaml
+from pipeline.formats.metashape import read_metashape
+from pipeline.mesh import SurfaceConfig
+from pipeline.overrides import apply_overrides
+from pipeline.register import IcpConfig
+from pipeline.tiles import TileConfig
+from scene.blocks import RockfallConfig
+from scene.config import Config, load_yaml, parse
+from scene.errors import InputError, nearest
+from scene.procedural import ProceduralWall
+from scene.wall import WallConfig
+from sensors.camera import CameraPair
+from sensors.model import StereoModel, TlsModel
+from sensors.placement import RigConfig, StationConfig, Target
+from sensors.stereo import Quality
+from sensors.tls import ScannerConfig
+
+SensorName = Literal["stereo", "tls"]
+
+
+class CamerasFile(Config):
+    """A stereo pair out of a file: the project's cameras.yaml, or Metashape's camera XML."""
+
+    file: Path = Field(description="cameras.yaml or a Metashape camera XML")
+    left: str | None = Field(
+        None, description="label of the left camera in the XML; none: the only pair, told by where they stand"
+    )
+    right: str | None = Field(None, description="label of the right camera in the XML")
+
+    def pair(self) -> CameraPair:
+        """The cameras, world frame."""
+        if self.file.suffix.lower() != ".xml":
+            return read_cameras_yaml(self.file)
+        found = read_metashape(self.file)
+        labels = [self.left, self.right] if self.left and self.right else list(found.cameras)
+        where = f"{self.file}"
+        for label in labels:
+            if label not in found.cameras:
+                why = "is not aligned" if label in found.unaligned else "is not in the file"
+                raise InputError(f"camera '{label}' {why}", where=where, allowed=", ".join(found.cameras))
+        if len(labels) != 2:
+            raise InputError(
+                f"holds {len(labels)} aligned cameras, a pair is two",
+                where=where,
+                allowed=", ".join(labels),
+                remedy="name them as cameras.left and cameras.right",
+            )
+        first, second = (found.cameras[label] for label in labels)
+        swapped = not self.left and first.rotation[:, 0] @ (second.position - first.position) < 0
+        return CameraPair(second, first) if swapped else CameraPair(first, second)
+
+
+def _camera_kind(values: Any) -> str:
+    if isinstance(values, CamerasFile) or (isinstance(values, dict) and "file" in values):
+        return "file"
+    return "pair" if isinstance(values, PairConfig) or (isinstance(values, dict) and "left" in values) else "rig"
+
+
+CamerasConfig = Annotated[
+    Annotated[RigConfig, Tag("rig")] | Annotated[PairConfig, Tag("pair")] | Annotated[CamerasFile, Tag("file")],
+    Discriminator(_camera_kind),
+]
+
+
+def _model_kind(values: Any) -> str:
+    return str(values.get("sensor") if isinstance(values, dict) else values.sensor)
+
+
+SensorModel = Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_model_kind)]
+
+
+class ProductsConfig(Config):
+    """What is written beyond the raster products."""
+
+    truth_channels: bool = Field(True, description="the true range or depth of each point, as extra dimensions of points.laz")
+    world: bool | None = Field(None, description="points and surface in the wall's own coordinates too; none: for imported walls")
+
+
+class SimulationConfig(Config):
+    """A simulation of one wall, observed before and after rocks fall."""
+
+    seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
+    epochs: int = Field(1, ge=1, le=9999, description="epochs after the reference, each with rockfalls of its own")
+    wall: WallConfig = ProceduralWall()
+    rockfall: RockfallConfig = RockfallConfig()
+    sensor: tuple[SensorModel, ...] = Field((), description="sensor models (noise and effects), at most one of each sensor")
+    cameras: CamerasConfig = RigConfig()
+    depth_map: Quality = Field("medium", description="depth map at 1/2 (high), 1/4 (medium), 1/8 (low) of the frame")
+    scanner: ScannerConfig = ScannerConfig()
+    station: StationConfig = StationConfig()
+    surface: SurfaceConfig = SurfaceConfig()
+    registration: IcpConfig | None = Field(IcpConfig(), description="ICP of each epoch to the reference; none: left out")
+    difference: DifferenceConfig = DifferenceConfig()
+    annotation: AnnotationConfig = AnnotationConfig()
+    tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")
+    products: ProductsConfig = ProductsConfig()
+
+    @field_validator("sensor", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        models = [value] if isinstance(value, dict) else value
+        for model in models if isinstance(models, list) else []:
+            name = model.get("sensor") if isinstance(model, dict) else None
+            if isinstance(model, dict) and name not in ("stereo", "tls"):
+                raise ValueError(
+                    f"a sensor model needs `sensor: stereo` or `sensor: tls`; {nearest(str(name), ('stereo', 'tls'))}"
+                )
+        return models
+
+    @field_validator("cameras", mode="before")
+    @classmethod
+    def _from_path(cls, value: Any) -> Any:
+        return {"file": value} if isinstance(value, str) else value
+
+    @field_validator("sensor")
+    @classmethod
+    def _one_of_each(cls, models: tuple[StereoModel | TlsModel, ...]) -> tuple[StereoModel | TlsModel, ...]:
+        if len({model.sensor for model in models}) < len(models):
+            raise ValueError("holds two models of one sensor")
+        return models
+
+    def stereo_model(self) -> StereoModel:
+        return next((model for model in self.sensor if isinstance(model, StereoModel)), StereoModel())
+
+    def tls_model(self) -> TlsModel:
+        return next((model for model in self.sensor if isinstance(model, TlsModel)), TlsModel())
+
+    def camera_pair(self, target: Target) -> CameraPair:
+        """The nominal pair, world frame; a rig is placed in front of `target`."""
+        return self.cameras.place(target) if isinstance(self.cameras, RigConfig) else self.cameras.pair()
+
+
+def load_config(path: Path, overrides: Sequence[str], sensor: SensorName, seed: int | None) -> SimulationConfig:
+    """Read a config file, apply `--set` overrides and the seed; paths in the file are relative to its folder.
+
+    A bare sensor model (model.yaml, model_after.yaml: its `sensor` is a word) is a config of which all else is default. Raises
+    InputError for whatever is wrong, and where the config's only models are of another sensor than `sensor`.
+    """
+    values = load_yaml(path)
+    values = {} if values is None else values
+    if not isinstance(values, dict):
+        raise InputError("is not a mapping of keys", where=str(path), remedy="write `key: value` lines; see `scarpsim init`")
+    if isinstance(values.get("sensor"), str) and values["sensor"] in ("stereo", "tls"):
+        values = {"sensor": [values]}
+    values = apply_overrides(_with_paths(values, path.parent), overrides)
+    if isinstance(values.get("sensor"), str):
+        values["sensor"] = load_yaml(Path(values["sensor"]))
+    if seed is not None:
+        values["seed"] = seed
+    config = parse(SimulationConfig, values, str(path))
+    if config.sensor and sensor not in {model.sensor for model in config.sensor}:
+        raise InputError(
+            f"the only sensor model is of '{config.sensor[0].sensor}', and --sensor is {sensor}",
+            where=f"{path}: sensor",
+            remedy=f"add a model with `sensor: {sensor}`, or take the other --sensor",
+        )
+    return config
+
+
+def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The values with the paths in them made absolute, relative to `folder`."""
+
+    def absolute(path: Any) -> Any:
+        return str((folder / path).resolve()) if isinstance(path, str) else path
+
+    result = dict(values)
+    for section, key in (("wall", "mesh"), ("cameras", "file")):
+        if isinstance(result.get(section), dict) and key in result[section]:
+            result[section] = {**result[section], key: absolute(result[section][key])}
+    for key in ("cameras", "sensor"):
+        result = {**result, key: absolute(result[key])} if isinstance(result.get(key), str) else result
+    return result
