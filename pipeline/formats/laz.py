@@ -1,0 +1,164 @@
+"""LAS and LAZ point clouds: LAS 1.4, point format 6, compressed by lazrs."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import laspy
+import numpy as np
+from lazrs import LazrsError  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+
+from pipeline.formats.atomic import writing
+from pipeline.formats.point_cloud import PointCloud
+from scene.errors import InputError
+from scene.mesh import FloatArray
+
+_CHUNK = 1_000_000
+"""Points in memory at a time while writing; a multiple of the 50,000 of a LAZ chunk."""
+_COUNTS = 65535
+_LARGEST = 2**31 - 1
+_USER, _FULL_SCALE_RECORD = "scarpsim", 1
+_ONE_RETURN = 0x11
+"""Return 1 of 1, in the two half-bytes of point format 6."""
+EXACT_INTENSITY = "intensity_relative"
+"""An extra dimension of this name is read as the intensity, in place of the 16-bit field."""
+
+
+def write_laz(
+    path: Path,
+    points: FloatArray,
+    *,
+    intensity: NDArray[np.floating] | None = None,
+    gps_time: FloatArray | None = None,
+    extra: Mapping[str, NDArray[Any]] | None = None,
+    scale_m: float = 1e-6,
+    date: datetime.date = datetime.date(2000, 1, 1),
+) -> None:
+    """Write a point cloud as LAZ, or as LAS where `path` ends in .las; equal arguments give equal bytes.
+
+    points: (n, 3), m, finite; intensity: (n,) relative received power, at least 0, stored in 16 bits (see `_full_scale`);
+    gps_time: (n,), s; extra: named (n,) channels, stored as extra dimensions in the type they have.
+    Coordinates are stored as int32 multiples of `scale_m` from an offset in whole metres at the middle of the cloud; a cloud
+    wider than 4295 m takes the next power of ten. Raises InputError where the file cannot be written.
+    """
+    extra = dict(extra or {})
+    channels = extra if gps_time is None else {"gps_time": gps_time, **extra}
+    header = _header(points, extra, scale_m, date)
+    full_scale = _full_scale(intensity)
+    if intensity is not None:
+        header.vlrs.append(laspy.VLR(_USER, _FULL_SCALE_RECORD, "intensity of 65535 counts", struct.pack("<d", full_scale)))
+    with writing(path) as temporary, temporary.open("wb") as file, _writer(file, header, path.suffix != ".las") as writer:
+        for start in range(0, len(points), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            record = laspy.ScaleAwarePointRecord.zeros(len(points[rows]), header=header)
+            _fill(record.array, header, points[rows])
+            for name, channel in channels.items():
+                record.array[name] = channel[rows]
+            if intensity is not None:
+                record.array["intensity"] = np.rint(intensity[rows] * (_COUNTS / full_scale))
+            writer.write_points(record)
+
+
+def read_laz(path: Path) -> PointCloud:
+    """Read a LAS or LAZ file of any version.
+
+    Intensity is relative received power: of files of ours on the scale they hold, of others as counts / 65535. Intensity and
+    GPS time that are zero throughout count as not recorded. Raises InputError for a missing, truncated or foreign file.
+    """
+    try:
+        _check_extent(path)
+        las = laspy.read(path)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
+    except (laspy.LaspyException, LazrsError, ValueError, struct.error, MemoryError, OverflowError) as error:
+        raise InputError(f"is not a whole LAS or LAZ file ({_line(error)})", where=str(path), remedy="export it again") from None
+    if len(las.points) < las.header.point_count:
+        problem = f"holds {len(las.points):,} of the {las.header.point_count:,} points it announces"
+        raise InputError(problem, where=str(path), remedy="export it again")
+    extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names}
+    counts = las.points.array["intensity"]
+    intensity = counts.astype(np.float32) * np.float32(_stored_full_scale(las.header) / _COUNTS) if counts.any() else None
+    timed = "gps_time" in las.point_format.dimension_names and np.any(las.points.array["gps_time"])
+    return PointCloud(
+        points=np.ascontiguousarray(las.xyz),
+        intensity=extra.pop(EXACT_INTENSITY, intensity),
+        gps_time=np.array(las.points.array["gps_time"]) if timed else None,
+        extra=extra,
+    )
+
+
+def _check_extent(path: Path) -> None:
+    """Raise ValueError for a file cut off in its header, or whose table of LAZ chunks is absurd (lazrs would abort on it)."""
+    with path.open("rb") as file:
+        header = laspy.LasHeader.read_from(file)
+        if path.stat().st_size < header.offset_to_point_data:
+            raise ValueError("cut off within the header")
+        if not header.are_points_compressed:
+            return
+        file.seek(header.offset_to_point_data)
+        (table,) = struct.unpack("<q", file.read(8))
+        if table < 0:  # written as a stream: the place of the table stands at the end
+            file.seek(-8, os.SEEK_END)
+            (table,) = struct.unpack("<q", file.read(8))
+        file.seek(table + 4)
+        (chunks,) = struct.unpack("<I", file.read(4))
+        if chunks > header.point_count:
+            raise ValueError(f"{chunks:,} chunks for {header.point_count:,} points")
+
+
+def _header(points: FloatArray, extra: Mapping[str, NDArray[Any]], scale_m: float, date: datetime.date) -> laspy.LasHeader:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.generating_software, header.system_identifier, header.creation_date = "scarpsim", "scarpsim", date
+    header.global_encoding.wkt = True  # point formats 6 and up know no other form of coordinate system
+    header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in extra.items()])
+    header.scales, header.offsets = _quantisation(points, scale_m)
+    return header
+
+
+def _writer(file: BinaryIO, header: laspy.LasHeader, compress: bool) -> laspy.LasWriter:
+    """The parallel back end gives the same bytes as the serial one, whatever the number of threads."""
+    return laspy.LasWriter(file, header, do_compress=compress, laz_backend=laspy.LazBackend.LazrsParallel, closefd=False)
+
+
+def _quantisation(points: FloatArray, scale_m: float) -> tuple[FloatArray, FloatArray]:
+    """(3,) scales and (3,) offsets, m, with which the coordinates fit int32."""
+    if len(points) == 0:
+        return np.full(3, scale_m), np.zeros(3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    if not np.isfinite(low + high).all():
+        raise ValueError("points must be finite: leave out those without a return")
+    offsets = np.rint((low + high) / 2)
+    reach = float(np.maximum(high - offsets, offsets - low).max())
+    while reach / scale_m > _LARGEST:
+        scale_m *= 10
+    return np.full(3, scale_m), offsets
+
+
+def _fill(record: NDArray[np.void], header: laspy.LasHeader, points: FloatArray) -> None:
+    counts = np.rint((points - header.offsets) / header.scales)
+    for axis, name in enumerate("XYZ"):
+        record[name] = counts[:, axis]
+    record["bit_fields"] = _ONE_RETURN
+
+
+def _full_scale(intensity: NDArray[np.floating] | None) -> float:
+    """The power that is stored as 65535 counts: the smallest power of two that no point exceeds."""
+    brightest = float(np.max(intensity)) if intensity is not None and len(intensity) else 1.0
+    return float(2.0 ** np.ceil(np.log2(brightest))) if brightest > 0 else 1.0
+
+
+def _stored_full_scale(header: laspy.LasHeader) -> float:
+    for record in header.vlrs:
+        if record.user_id == _USER and record.record_id == _FULL_SCALE_RECORD:
+            return float(struct.unpack("<d", record.record_data)[0])
+    return 1.0
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
