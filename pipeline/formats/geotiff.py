@@ -1,0 +1,111 @@
+"""Rasters as float32 TIFF, and as GeoTIFF georeferenced to the wall frame.
+
+Uncompressed: on a noisy difference map deflate saves a fifth and takes forty times as long.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from pipeline.formats.atomic import writing
+from scene.errors import InputError
+from scene.grid import Grid
+
+_PIXEL_SCALE, _TIEPOINT, _GEO_KEYS, _GEO_ASCII, _NODATA = 33550, 33922, 34735, 34737, 42113
+_ASCII, _SHORT, _DOUBLE = 2, 3, 12
+_CITATION = "wall frame: x along the wall, y up the wall, z towards the sensors, metres"
+_MODEL_TYPE, _RASTER_TYPE, _CITATION_KEY, _LINEAR_UNITS = 1024, 1025, 1026, 3076
+_USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
+
+
+def write_geotiff(path: Path, raster: NDArray[np.floating], grid: Grid, *, description: str = "") -> None:
+    """Write a raster (h, w), m, NaN where there is no data, as float32 at the place and scale of `grid` in the wall frame.
+
+    The coordinate system is a local one in metres (GeoTIFF 1.1, user-defined model, pixel is area). description: ASCII.
+    """
+    if raster.shape != grid.shape:
+        raise ValueError(f"expected a raster of shape {grid.shape}, got {raster.shape}")
+    _write(path, raster, description, _georeference(grid))
+
+
+def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = "") -> None:
+    """Write an image (h, w), such as a depth map, m, as float32 without a place in the world."""
+    _write(path, image, description, [(_NODATA, _ASCII, 0, "nan", False)])
+
+
+def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
+    """Read a raster of one band and where its pixels lie: (h, w) float32, NaN where there is no data, and its grid.
+
+    Raises InputError for a damaged file, one without a place, and pixels that are not square or not along the axes.
+    """
+    raster, tags = _read(path)
+    scale, tie = tags.get(_PIXEL_SCALE), tags.get(_TIEPOINT)
+    if scale is None or tie is None or len(tie) != 6 or not np.isclose(scale[0], scale[1], rtol=1e-9, atol=0):
+        raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
+    gsd = float(scale[0])
+    height, width = raster.shape
+    return raster, Grid(float(tie[3] - tie[0] * gsd), float(tie[4] + tie[1] * gsd), gsd, width, height)
+
+
+def read_tiff(path: Path) -> NDArray[np.float32]:
+    """Read an image of one band as float32, NaN where there is no data; raises InputError for a damaged file."""
+    return _read(path)[0]
+
+
+def _georeference(grid: Grid) -> list[tuple[int, int, int, Any, bool]]:
+    citation = f"{_CITATION}|"
+    keys = [
+        (1, 1, 1, 4),  # version 1, revision 1.1, four keys
+        (_MODEL_TYPE, 0, 1, _USER_DEFINED),
+        (_RASTER_TYPE, 0, 1, _PIXEL_IS_AREA),
+        (_CITATION_KEY, _GEO_ASCII, len(citation), 0),
+        (_LINEAR_UNITS, 0, 1, _METRE),
+    ]
+    return [
+        (_PIXEL_SCALE, _DOUBLE, 3, (grid.gsd, grid.gsd, 0.0), False),
+        (_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, grid.x_min, grid.y_max, 0.0), False),
+        (_GEO_KEYS, _SHORT, 4 * len(keys), tuple(number for key in keys for number in key), False),
+        (_GEO_ASCII, _ASCII, 0, citation, False),
+        (_NODATA, _ASCII, 0, "nan", False),
+    ]
+
+
+def _write(path: Path, raster: NDArray[np.floating], description: str, tags: list[tuple[int, int, int, Any, bool]]) -> None:
+    """Without metadata of tifffile's, software and date: equal rasters give equal bytes."""
+    data = np.ascontiguousarray(raster, dtype=np.float32)
+    with writing(path) as temporary:
+        tifffile.imwrite(
+            temporary,
+            data,
+            photometric="minisblack",
+            description=description or None,
+            metadata=None,
+            software=False,
+            extratags=tags,
+        )
+
+
+def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
+    try:
+        with tifffile.TiffFile(path) as file:
+            page = file.pages.first
+            tags = {tag.code: tag.value for tag in page.tags}
+            raster = page.asarray()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
+    except (tifffile.TiffFileError, ValueError, IndexError, KeyError, struct.error, MemoryError, TypeError) as error:
+        problem = " ".join(str(error).split())
+        raise InputError(f"is not a whole TIFF file ({problem})", where=str(path), remedy="export it again") from None
+    if raster.ndim != 2:
+        raise InputError(f"has the shape {raster.shape}", where=str(path), allowed="one band")
+    raster = raster.astype(np.float32, copy=False)
+    nodata = str(tags.get(_NODATA, "nan")).strip("\0 ")
+    if nodata.lower() not in ("nan", ""):
+        raster = np.where(raster == np.float32(nodata), np.float32(np.nan), raster)
+    return raster, tags
