@@ -1,0 +1,55 @@
+"""What the benchmarks share: interleaved timing, peak memory, and the bare casts they are compared with."""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from scene.backend import dr, mi
+from scene.raycast import RayCaster
+
+ROUNDS = 7
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Wall time of one call, s, device work included."""
+    start = time.perf_counter()
+    work()
+    dr.sync_thread()
+    return time.perf_counter() - start
+
+
+def medians(*works: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
+    """Median wall time of each work, s, taken in turns after one round that compiles kernels and fills caches."""
+    for work in works:
+        seconds(work)
+    timed: Sequence[Sequence[float]] = [[seconds(work) for work in works] for _ in range(rounds)]
+    return [statistics.median(column) for column in zip(*timed, strict=True)]
+
+
+def peak_memory_gb() -> float:
+    """The largest memory that this process has taken so far, GB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def bare_cast(caster: RayCaster, origin: Any, direction: Any) -> Callable[[], None]:
+    """`ray_intersect_preliminary` alone on rays that are ready in memory (3 x (n,) float64), coherent, as fast as it goes."""
+    ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+    dr.eval(ray)
+
+    def work() -> None:
+        found = caster._scene.ray_intersect_preliminary(ray, coherent=True)
+        dr.eval(found.t, found.prim_index)
+
+    return work
+
+
+def bare_test(caster: RayCaster, origin: Any, direction: Any, reach: float) -> Callable[[], None]:
+    """`ray_test` alone on rays that are ready in memory."""
+    ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+    ray.maxt = mi.Float(reach)
+    dr.eval(ray)
+    return lambda: dr.eval(caster._scene.ray_test(ray, coherent=True))

@@ -1,0 +1,63 @@
+"""One TLS observation of 5 M pulses on 1.3 M triangles against the bare cast of the same rays and against Open3D's cast_rays.
+
+To reach: at least 0.5 of the bare rate, and at least Open3D's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+from measure import bare_cast, medians, peak_memory_gb
+
+from scene.backend import VARIANT, dr, mi
+from scene.frame import WallFrame
+from scene.keyed_random import KeyedRandom
+from scene.procedural import ProceduralWall
+from scene.raycast import RayCaster
+from sensors.device import rotated, vector
+from sensors.model import TlsModel
+from sensors.placement import StationConfig, Target
+from sensors.pulses import direction
+from sensors.tls import LaserScanner, ScannerConfig
+
+PULSES = 5_000_000
+
+
+def main() -> None:
+    random = KeyedRandom(1)
+    world = ProceduralWall(style="glendale", resolution_m=0.0697).mesh(random)
+    station = StationConfig().place(Target(world))
+    frame = WallFrame.fit(world.vertices, station[0])
+    mesh = world.with_vertices(frame.to_wall(world.vertices))
+    coarse = LaserScanner.aimed(station, frame, mesh.vertices, ScannerConfig(), TlsModel())
+    step = ScannerConfig().azimuth_step_rad * np.sqrt(coarse.pattern.lines * coarse.pattern.pulses / PULSES)
+    scanner = LaserScanner.aimed(
+        station, frame, mesh.vertices, ScannerConfig(azimuth_step_rad=step, zenith_step_rad=step), TlsModel()
+    )
+    count = scanner.pattern.lines * scanner.pattern.pulses
+    caster = RayCaster(mesh)
+
+    pulses = scanner._emit()
+    aim = rotated(scanner.rotation, direction(pulses.aim_azimuth, pulses.aim_zenith))
+    origin = vector(scanner.position)
+    bare = bare_cast(caster, origin, aim)
+
+    peer = o3d.t.geometry.RaycastingScene()
+    peer.add_triangles(o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    rays = np.empty((count, 6), dtype=np.float32)
+    rays[:, :3] = scanner.position
+    rays[:, 3:] = np.array(mi.Vector3f(aim)).T
+    rays = o3d.core.Tensor(rays)
+
+    ours, cast, open3d = medians(lambda: scanner.observe(caster, random), bare, lambda: peer.cast_rays(rays))
+    print(f"{VARIANT}, {dr.thread_count()} threads, {len(mesh.faces):,} triangles, {count:,} pulses")
+    print(f"bare ray_intersect_preliminary        {cast:6.3f} s   {count / cast / 1e6:5.1f} M/s")
+    print(f"Open3D cast_rays                      {open3d:6.3f} s   {count / open3d / 1e6:5.1f} M/s")
+    print(f"observation: noise, float64, points   {ours:6.3f} s   {count / ours / 1e6:5.1f} M/s")
+    print(f"share of the bare rate                {cast / ours:6.2f}     (target: at least 0.5)")
+    print(f"rate over Open3D's                    {open3d / ours:6.2f}     (target: at least 1)")
+    print(f"peak memory                           {peak_memory_gb():6.2f} GB")
+
+
+if __name__ == "__main__":
+    main()
