@@ -47,8 +47,8 @@ class IcpConfig(Config):
     `threshold` and `delta_threshold` both end the search, whichever is met first. `threshold` looks at one number, the error of
     the fit: near the minimum it changes with the square of the motion, so it says when going on no longer pays. `delta_threshold`
     looks at every point's residual and what the last step changed in it: that is in proportion to the motion, so it says when the
-    pose stands still. Neither is asked before the outlier threshold has reached its final value; with a threshold of 0 the first
-    ends the search only when the error rises, the second never does.
+    pose stands still. Neither is asked before the outlier threshold has reached its final value. The error counts outliers at the
+    outlier threshold, because the inliers' RMS alone stands still, or rises, while a better pose brings more points in.
     """
 
     method: Literal["point_to_plane", "point_to_point"] = Field(
@@ -70,13 +70,15 @@ class IcpConfig(Config):
     )
     remove_outlier: bool = Field(True, description="leave outliers out of the fit; false: every point counts")
     threshold: float = Field(
-        1e-7,
+        1e-8,
         ge=0,
-        description="m; converged when the RMS error (outliers counted at the outlier threshold) fell by less from one iteration "
-        "to the next, or rose",
+        description="m; converged when the RMS error (outliers counted at the outlier threshold) improved by less than this from "
+        "one iteration to the next; a rise by more is no end either. 0: never",
     )
     delta_threshold: float = Field(
-        1e-4, ge=0, description="m; converged when a step changed the points' residuals by less than this (RMS over the points)"
+        1e-4,
+        ge=0,
+        description="m; converged when a step changed the points' residuals by less than this (RMS over the points). 0: never",
     )
     subsample_points: bool = Field(False, description="fit a random part of the moving points")
     subsample_ratio: float = Field(0.9, ge=0, lt=1, description="share of the moving points that subsampling leaves out")
@@ -345,8 +347,8 @@ class _Search:
             return f"the residuals changed by less than delta_threshold = {self.config.delta_threshold:g} m"
         if before is None or (before.points, before.outlier_threshold_m) != (last.points, last.outlier_threshold_m):
             return ""
-        if before.error_m - last.error_m < self.config.threshold:
-            return f"the RMS error fell by less than threshold = {self.config.threshold:g} m"
+        if abs(before.error_m - last.error_m) < self.config.threshold:
+            return f"the RMS error changed by less than threshold = {self.config.threshold:g} m"
         return ""
 
     def _too_few(self, blocks: list[FloatArray], pose: RigidTransform, gate: float, inliers: int) -> InputError:

@@ -219,6 +219,9 @@ def test_a_niche_biases_only_without_outlier_removal(reference: ReferenceSurface
     assert removed.inliers == pytest.approx(0.95 * removed.points, rel=0.01)
     assert abs(errors(kept, cloud[0])[5]) > 0.005  # 5 % of 0.3 m is 0.015 m
     assert kept.inliers == kept.points
+    last = removed.history[-1]
+    squares = last.inliers * last.rms_m**2 + (last.points - last.inliers) * last.outlier_threshold_m**2
+    assert last.error_m == pytest.approx(np.sqrt(squares / last.points), rel=1e-12)
     assert kept.to_dict()["history"][0]["outlier_threshold_m"] is None
 
 
