@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from scene.errors import InputError
 from scene.footprint import faces_under
 from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh
 from scene.slivers import mend
-from scene.solid import Piece, boundary, close, piece, solid, split
+from scene.solid import Piece, boundary, close, piece, prism_volumes, solid, split
 
 FRESH_ALBEDO = 0.6
 """Albedo of rock that no weather has darkened yet."""
@@ -31,8 +31,9 @@ class Carved:
 
     mesh: the surface; face_block is the label (1 .. k) of the block whose niche a face belongs to, WALL elsewhere; vertex_block
     likewise for the vertices inside niches, while those on a rim, which lie on the old surface too, are WALL;
-    removed_volume_m3: (k,) rock that each block took along; wall_volume_m3: volume of the wall before, of an open one above
-    its lowest point; balance_m3: wall before - wall after - sum of the removed volumes, 0 but for rounding and mending.
+    removed_volume_m3: (k,) rock that each block took along (the boolean's, corrected for the mending of its rim);
+    wall_volume_m3: volume of the wall before, of an open one above its lowest point;
+    balance_m3: wall before - wall after - sum of the removed volumes, 0 but for rounding.
     """
 
     mesh: TriangleMesh
@@ -76,8 +77,8 @@ def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO
     rows = faces_under(mesh, blocks.bbox, _HALO_M)
     wall, corners = close(mesh, rows, float(blocks.bbox[:, 0, 2].min()))
     removed, left = split(wall, solid(blocks.vertices, blocks.faces, "blocks"))
-    volumes = _removed_volumes(removed, blocks)
-    surface = _mended(_surface(mesh, rows, corners, left, blocks, fresh_albedo))
+    surface, gain = _mended(_surface(mesh, rows, corners, left, blocks, fresh_albedo))
+    volumes = _removed_volumes(removed, blocks) - gain[1:]
     carved = _put_back(mesh, rows, surface)
     low = float(mesh.vertices[:, 2].min())
     before = _volume(mesh.vertices, mesh.faces, low)
@@ -133,7 +134,7 @@ def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
     label[component[~removed.first]] = blocks.face_label[removed.source[~removed.first]]
     whole = np.flatnonzero(label == 0)  # pieces of wall that float inside a block: no face of the block is in them
     label[whole] = _containing(blocks, removed, component, whole)
-    parts = _prisms(removed.vertices, removed.faces, 0.0)
+    parts = prism_volumes(removed.vertices, removed.faces)
     volumes = np.bincount(label[component], parts, minlength=len(blocks) + 1)[1:].astype(np.float64)
     nothing = np.flatnonzero(volumes <= 0)
     if len(nothing):
@@ -187,14 +188,14 @@ def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
     return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
 
 
-def _mended(surface: _Surface) -> _Surface:
-    """The surface without slivers along the rims; vertices on the patches' boundary stay."""
+def _mended(surface: _Surface) -> tuple[_Surface, FloatArray]:
+    """The surface without slivers along the rims, and the volume this adds by label; vertices on the patches' boundary stay."""
     of_wall, of_niche = (_used(surface, is_wall) for is_wall in (True, False))
     rank = np.ones(len(surface.vertices), dtype=np.int8)
     rank[of_wall & (of_niche | (surface.origin < 0))] = 2
     rank[boundary(surface.faces)[0]] = 0
-    faces, label = mend(surface.vertices, surface.faces, surface.label, rank)
-    return _Surface(surface.vertices, faces, label, surface.origin, surface.albedo)
+    mended = mend(surface.vertices, surface.faces, surface.label, rank)
+    return replace(surface, faces=mended.faces, label=mended.label), mended.gain_m3
 
 
 def _used(surface: _Surface, is_wall: bool) -> NDArray[np.bool_]:
@@ -232,11 +233,4 @@ def _put_back(mesh: TriangleMesh, rows: IntArray, surface: _Surface) -> Triangle
 def _volume(vertices: FloatArray, faces: IntArray, base_m: float) -> float:
     """Volume between a surface and z = base_m; of a closed surface its volume, whatever the base."""
     starts = range(0, len(faces), _CHUNK)
-    return float(sum(_prisms(vertices, faces[start : start + _CHUNK], base_m).sum() for start in starts))
-
-
-def _prisms(vertices: FloatArray, faces: IntArray, base_m: float) -> FloatArray:
-    """(m,) signed volume of the vertical prism between each face and z = base_m (divergence theorem, field (0, 0, z))."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    u, v = b - a, c - a
-    return (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * ((a[:, 2] + b[:, 2] + c[:, 2]) / 3 - base_m) / 2
+    return float(sum(prism_volumes(vertices, faces[start : start + _CHUNK], base_m).sum() for start in starts))

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from scene.mesh import FloatArray, IntArray
-from scene.solid import boundary
+from scene.solid import boundary, prism_volumes
 
 SLIVER_M = 2e-5
 """A face whose smallest height is below this is a sliver: single precision (8 um at 70 m) would lose its normal."""
@@ -65,14 +66,27 @@ class _Edges:
         return _Edges(self.start[chosen], self.end[chosen], number[self.operation[kept]], self.face[kept])
 
 
-def mend(vertices: FloatArray, faces: IntArray, tag: IntArray, rank: NDArray[np.int8]) -> tuple[IntArray, IntArray]:
-    """Faces and tags without slivers at the cut.
+@dataclass(frozen=True)
+class Mended:
+    """A surface without slivers at the cut.
 
-    vertices: (n, 3), m, left as they are (some fall out of use); faces: (m, 3); tag: (m,) carried along with the faces;
-    rank: (n,) 0 for vertices that have to stay, 1 for original ones, 2 for those on the cut. Only faces at the cut are
-    mended; of two vertices the one of higher rank gives way.
+    faces: (m, 3); label: (m,); gain_m3: (largest label + 1,) volume below the surface (towards -z) that mending has added,
+    by the label near which it did.
     """
-    cut = rank == 2
+
+    faces: IntArray
+    label: IntArray
+    gain_m3: FloatArray
+
+
+def mend(vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[np.int8]) -> Mended:
+    """Mend the faces at the cut; those elsewhere are not looked at.
+
+    vertices: (n, 3), m, left as they are (some fall out of use); faces: (m, 3); label: (m,) of the faces;
+    rank: (n,) 0 for vertices that have to stay, 1 for original ones, 2 for those on the cut; of two vertices the one of
+    higher rank gives way.
+    """
+    cut, gain = rank == 2, np.zeros(int(label.max(initial=0)) + 1)
     suspects = np.flatnonzero(_at(cut, faces))
     for attempt in range(_ATTEMPTS):
         bad = suspects[smallest_height(vertices[faces[suspects]]) < SLIVER_M]
@@ -80,12 +94,27 @@ def mend(vertices: FloatArray, faces: IntArray, tag: IntArray, rank: NDArray[np.
             break
         near = _around(faces, bad, len(vertices))
         limit_m = _COLLAPSIBLE_M * 2.0**attempt  # what resists is given more freedom
-        mended, tags = _mend_part(vertices, faces[near], tag[near], rank, cut, limit_m)
+        mended, labels = _mend_part(vertices, faces[near], label[near], rank, cut, limit_m)
+        gain += _gain(vertices, faces[near], label[near], mended, len(gain))
         away = np.ones(len(faces), dtype=bool)
         away[near] = False
-        faces, tag = np.concatenate([faces[away], mended]), np.concatenate([tag[away], tags])
+        faces, label = np.concatenate([faces[away], mended]), np.concatenate([label[away], labels])
         suspects = len(faces) - len(mended) + np.flatnonzero(_at(cut, mended))
-    return faces, tag
+    return Mended(faces, label, gain)
+
+
+def _gain(vertices: FloatArray, before: IntArray, label: IntArray, after: IntArray, count: int) -> FloatArray:
+    """(count,) the volume that each connected part of a surface has gained, under the largest label in it."""
+    used, number = np.unique(before, return_inverse=True)
+    number = number.reshape(-1, 3)
+    links = np.concatenate([number[:, :2], number[:, 1:]]).T
+    graph = sparse.coo_array((np.ones(links.shape[1], dtype=bool), (links[0], links[1])), shape=(len(used), len(used)))
+    parts, part = sparse.csgraph.connected_components(graph, directed=False)
+    largest = np.zeros(parts, dtype=label.dtype)
+    np.maximum.at(largest, part[number[:, 0]], label)
+    now = np.bincount(part[np.searchsorted(used, after[:, 0])], prism_volumes(vertices, after), minlength=parts)
+    then = np.bincount(part[number[:, 0]], prism_volumes(vertices, before), minlength=parts)
+    return np.bincount(largest, now - then, minlength=count).astype(np.float64)
 
 
 def _at(flagged: BoolArray, faces: IntArray) -> BoolArray:
@@ -104,7 +133,7 @@ def _around(faces: IntArray, rows: IndexArray, count: int) -> IndexArray:
 
 
 def _mend_part(
-    vertices: FloatArray, faces: IntArray, tag: IntArray, rank: NDArray[np.int8], cut: BoolArray, limit_m: float
+    vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[np.int8], cut: BoolArray, limit_m: float
 ) -> tuple[IntArray, IntArray]:
     """Mend a part of a surface as far as this can be done without its boundary; `cut` grows with the vertices collapsed onto."""
     used, number = np.unique(faces, return_inverse=True)
@@ -113,12 +142,12 @@ def _mend_part(
     rank[boundary(faces)[0]] = 0
     for _ in range(_ROUNDS):
         vanished = _collapse(vertices, faces, rank, part_cut, _slivers(vertices, faces, part_cut), limit_m)
-        faces, tag = faces[~vanished], tag[~vanished]
-        flipped = _flip(vertices, faces, tag, _slivers(vertices, faces, part_cut))
+        faces, label = faces[~vanished], label[~vanished]
+        flipped = _flip(vertices, faces, label, _slivers(vertices, faces, part_cut))
         if not (flipped or vanished.any()):
             break
     cut[used] = part_cut
-    return used[faces].astype(np.int32), tag
+    return used[faces].astype(np.int32), label
 
 
 def _slivers(vertices: FloatArray, faces: IntArray, cut: BoolArray) -> IndexArray:
@@ -207,8 +236,8 @@ def _independent(faces: IntArray, edges: _Edges, count: int) -> BoolArray:
     return np.bincount(operation[best[around] != operation], minlength=len(edges.start)) == 0
 
 
-def _flip(vertices: FloatArray, faces: IntArray, tag: IntArray, bad: IndexArray) -> bool:
-    """Flip the longest edge of the bad faces, in place, where that helps; both new faces take the other face's tag.
+def _flip(vertices: FloatArray, faces: IntArray, label: IntArray, bad: IndexArray) -> bool:
+    """Flip the longest edge of the bad faces, in place, where that helps; both new faces take the other face's label.
     Returns whether any was flipped.
 
     For a sliver whose apex lies almost on its longest edge this amounts to taking the sliver away and putting its apex
@@ -237,7 +266,7 @@ def _flip(vertices: FloatArray, faces: IntArray, tag: IntArray, bad: IndexArray)
     free = _independent(faces, edges, len(vertices))
     chosen = np.flatnonzero(chosen)[free]
     faces[bad[chosen]], faces[other[chosen]] = first[chosen], second[chosen]
-    tag[bad[chosen]] = tag[other[chosen]]
+    label[bad[chosen]] = label[other[chosen]]
     return len(chosen) > 0
 
 

@@ -20,6 +20,10 @@ from scene.mesh import FloatArray, IntArray, TriangleMesh
 _MARGIN_M = 1.0
 """Distance from the lowest point of patch and blocks to the closure's bottom."""
 
+_SPREAD_M, _IRRATIONAL = 2e-6, (0.6180339887498949, 0.7548776662466927)
+"""How far the foot of each side stands from below its top: where a straight boundary folds back on itself, sides in one plane
+would overlap, which Manifold takes for one flat face and retriangulates, the neighbours included."""
+
 
 @dataclass(frozen=True)
 class Solid:
@@ -55,11 +59,12 @@ def solid(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
             face_id=np.arange(len(faces), dtype=np.uint64),
         )
     )
-    if manifold.status() != Error.NoError:
+    if manifold.status() != Error.NoError or manifold.num_tri() != len(faces):
+        status = manifold.status().name if manifold.status() != Error.NoError else "degenerate triangles"
         raise InputError(
-            f"the triangles make no solid ({manifold.status().name})",
+            f"the triangles make no solid ({status})",
             where=name,
-            allowed="finite vertices; each edge in one triangle or in two of opposite direction",
+            allowed="finite vertices; each edge in one triangle or in two of opposite direction; no triangles without area",
             remedy="weld and clean the mesh",
         )
     return Solid(manifold, identity)
@@ -114,7 +119,8 @@ def _closed(vertices: FloatArray, faces: IntArray, start: IntArray, end: IntArra
     """Vertices and faces with the sides below the boundary edges start -> end, and a fan below the sides."""
     rim, place = np.unique(np.concatenate([start, end]), return_inverse=True)
     start_low, end_low = (place + len(vertices)).astype(np.int32).reshape(2, -1)
-    low = vertices[rim] * [1, 1, 0] + [0, 0, bottom]
+    spread = (np.arange(len(rim))[:, None] * _IRRATIONAL % 1.0 - 0.5) * _SPREAD_M
+    low = np.column_stack([vertices[rim, :2] + spread, np.full(len(rim), bottom)])
     loop, apex = _apexes(low, *place.reshape(2, -1))
     top = (len(vertices) + len(rim) + loop).astype(np.int32)
     sides = [(end, start, start_low), (end, start_low, end_low), (end_low, start_low, top)]
@@ -150,3 +156,10 @@ def _split_pinched(vertices: FloatArray, faces: IntArray, pinched: NDArray[np.bo
     faces = faces.copy()
     faces[face, corner] = number[fan]
     return np.concatenate([vertices, vertices[owner]]), faces
+
+
+def prism_volumes(vertices: FloatArray, faces: IntArray, base_m: float = 0.0) -> FloatArray:
+    """(m,) signed volume of the vertical prism between each face and z = base_m (divergence theorem, field (0, 0, z))."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    u, v = b - a, c - a
+    return (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * ((a[:, 2] + b[:, 2] + c[:, 2]) / 3 - base_m) / 2
