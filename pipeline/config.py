@@ -101,7 +101,7 @@ class SimulationConfig(Config):
     scanner: ScannerConfig = ScannerConfig()
     station: StationConfig = StationConfig()
     surface: SurfaceConfig = SurfaceConfig()
-    registration: IcpConfig | None = Field(IcpConfig(), description="ICP of each epoch to the reference; none: left out")
+    icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: left out")
     difference: DifferenceConfig = DifferenceConfig()
     annotation: AnnotationConfig = AnnotationConfig()
     tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")

@@ -36,3 +36,12 @@ class TriangleMesh:
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
         """The same triangles over moved vertices."""
         return replace(self, vertices=vertices)
+
+    def vertex_normals(self) -> FloatArray:
+        """(n, 3) unit normals, outside: the sum of the adjacent faces' normals weighted by area; NaN for an unused vertex."""
+        corners = [self.vertices[self.faces[:, corner]] for corner in range(3)]
+        area = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        vertex, count = self.faces.ravel(), len(self.vertices)
+        total = np.stack([np.bincount(vertex, np.repeat(area[:, axis], 3), count) for axis in range(3)], axis=1)
+        with np.errstate(invalid="ignore"):
+            return total / np.linalg.norm(total, axis=1, keepdims=True)

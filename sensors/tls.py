@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import psutil
 from pydantic import Field, model_validator
 
 from scene.backend import dr, mi
@@ -22,6 +23,9 @@ from sensors.observation import Observation, packed
 from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction
 
 Window = tuple[float, float]
+
+_BYTES_PER_PULSE = 400
+"""What a pulse takes at the peak: rays, points, surface and the difference's ray tracing of it."""
 
 
 class ScannerConfig(Config):
@@ -67,8 +71,14 @@ class Pattern:
             int(np.floor((stop - start) / step + 1e-9)) + 1
             for (start, stop), step in ((azimuth, config.azimuth_step_rad), (zenith, config.zenith_step_rad))
         )
-        if lines * pulses >= 2**31:
-            raise InputError(f"{lines} x {pulses} pulses are too many", where="scanner", allowed="2^31", remedy="coarser steps")
+        most = min(psutil.virtual_memory().available // _BYTES_PER_PULSE, 2**31)
+        if lines * pulses > most:
+            raise InputError(
+                f"{lines:,} lines of {pulses:,} pulses would take {lines * pulses * _BYTES_PER_PULSE / 1e9:,.0f} GB of memory",
+                where="scanner.azimuth_step_rad, scanner.zenith_step_rad",
+                allowed=f"up to {most:,} pulses in the free memory",
+                remedy="choose coarser steps or a smaller window",
+            )
         return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)
 
 
@@ -91,6 +101,7 @@ class LaserScanner:
         vertices: FloatArray,
         config: ScannerConfig,
         model: TlsModel,
+        truth: bool = False,
     ) -> LaserScanner:
         """A scanner whose window, where the config leaves it open, is the extent of `vertices` ((n, 3), wall frame).
 
@@ -107,7 +118,7 @@ class LaserScanner:
                 where="scanner.zenith_limits_rad",
                 remedy="move the station or tilt it",
             )
-        return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model)
+        return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model, truth)
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
         """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith)."""

@@ -1,0 +1,144 @@
+"""The files of an epoch. A folder gets its final name when all of its files are written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.annotate import LabelledImage, coco
+from pipeline.config import SimulationConfig
+from pipeline.epoch import Epoch, Reference
+from pipeline.formats.atomic import write_bytes, write_json
+from pipeline.formats.geotiff import write_geotiff, write_tiff
+from pipeline.formats.laz import write_laz
+from pipeline.formats.ply import write_ply
+from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
+from pipeline.site import Site
+from pipeline.tiles import tiles
+from scene.imported import ImportedWall
+from scene.mesh import WALL, FloatArray, TriangleMesh
+from sensors.observation import Observation
+
+EPOCH_RECORD = "epoch.json"
+
+
+def epoch_folder(out: Path, number: int) -> Path:
+    return out / f"epoch_{number:03d}"
+
+
+def write_reference(out: Path, config: SimulationConfig, site: Site, reference: Reference) -> None:
+    """Write epoch_000 and the hillshade of the reference, unless the folder is there already."""
+    if epoch_folder(out, 0).exists():
+        return
+    with _folder(out, 0) as folder:
+        _write_common(folder, config, site, reference.observation, reference.surface, site.mesh, [])
+        write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
+        record = {
+            "epoch": 0,
+            "points": int(reference.observation.valid.sum()),
+            "blocks": [],
+            "annotations": coco([], config.annotation),
+        }
+        write_json(folder / EPOCH_RECORD, record)
+
+
+def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Reference, epoch: Epoch) -> None:
+    """Write an epoch's folder, its difference map, tiles and pictures."""
+    name = f"difference_{epoch.number:03d}"
+    grid = reference.raster.grid
+    with _folder(out, epoch.number) as folder:
+        _write_common(folder, config, site, epoch.observation, epoch.surface, epoch.carved.mesh, epoch.blocks)
+        write_geotiff(
+            out / f"{name}.tif", epoch.difference, grid, description="reference minus epoch, m; missing rock is positive"
+        )
+        images = list(_images(out, config, epoch, reference, name))
+        sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
+        masks = epoch.raster.block != WALL
+        write_bytes(out / f"{name}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
+        write_bytes(
+            out / f"hillshade_{epoch.number:03d}.png", hillshade_figure(epoch.raster.heights, grid, f"Epoch {epoch.number}")
+        )
+        histogram = histogram_figure(epoch.difference[~masks], epoch.difference[masks])
+        write_bytes(out / f"histogram_{epoch.number:03d}.png", histogram)
+        if epoch.registration is not None:
+            write_bytes(out / f"icp_{epoch.number:03d}.png", convergence_figure(epoch.registration.history))
+        write_json(folder / EPOCH_RECORD, _record(config, epoch, images, sigma))
+
+
+def _record(config: SimulationConfig, epoch: Epoch, images: list[LabelledImage], sigma: float) -> dict[str, Any]:
+    return {
+        "epoch": epoch.number,
+        "points": int(epoch.observation.valid.sum()),
+        "volume_balance_m3": epoch.carved.balance_m3,
+        "wall_volume_m3": epoch.carved.wall_volume_m3,
+        "registration": None if epoch.registration is None else epoch.registration.to_dict(),
+        "statistics": {
+            "inside_blocks": epoch.statistics.inside.to_dict(),
+            "outside_blocks": epoch.statistics.outside.to_dict(),
+            "sigma_m": sigma,
+        },
+        "blocks": epoch.blocks,
+        "annotations": coco(images, config.annotation),
+    }
+
+
+def _images(out: Path, config: SimulationConfig, epoch: Epoch, reference: Reference, name: str) -> Iterator[LabelledImage]:
+    """The images of the data set: the difference map, or its tiles, which are written here."""
+    labels = np.where(np.isnan(epoch.difference), WALL, epoch.raster.block)
+    if config.tiles is None:
+        yield LabelledImage(f"{name}.tif", labels, reference.raster.grid, epoch.number)
+        return
+    for tile in tiles(epoch.difference, labels, reference.raster.grid, config.tiles):
+        file_name = f"tiles/{name}_{tile.name}.tif"
+        write_geotiff(out / file_name, tile.values, tile.grid)
+        yield LabelledImage(file_name, tile.block, tile.grid, epoch.number, tile.row, tile.column)
+
+
+def _write_common(
+    folder: Path,
+    config: SimulationConfig,
+    site: Site,
+    observation: Observation,
+    surface: TriangleMesh,
+    truth: TriangleMesh,
+    blocks: list[dict[str, Any]],
+) -> None:
+    """What every epoch has: points, depth map, surface, truth, blocks."""
+    valid = observation.valid
+    channels = {name: channel[valid].astype(np.float32) for name, channel in observation.truth.items()}
+    optional = {"intensity": observation.intensity, "gps_time": observation.gps_time}
+    values: dict[str, Any] = {name: channel[valid] for name, channel in optional.items() if channel is not None}
+    values["extra"] = {**channels, "block": observation.block[valid]}
+    points = observation.points[valid]
+    write_laz(folder / "points.laz", points, **values)
+    if observation.sensor == "stereo":
+        write_tiff(
+            folder / "depth_left.tif", observation.depth.astype(np.float32), description="depth along the left camera's axis, m"
+        )
+    write_ply(folder / "surface.ply", surface)
+    write_ply(folder / "truth.ply", truth)
+    write_json(folder / "blocks.json", blocks)
+    wanted = config.products.world
+    if wanted or (wanted is None and isinstance(config.wall, ImportedWall)):
+        write_laz(folder / "points_world.laz", site.frame.to_world(points), **values)
+        write_ply(folder / "surface_world.ply", _in_world(surface, site))
+
+
+def _in_world(mesh: TriangleMesh, site: Site) -> TriangleMesh:
+    vertices: FloatArray = site.frame.to_world(mesh.vertices)
+    return replace(mesh, vertices=vertices)
+
+
+@contextmanager
+def _folder(out: Path, number: int) -> Iterator[Path]:
+    """The epoch's folder under a temporary name, renamed when everything in it and beside it is written."""
+    final = epoch_folder(out, number)
+    temporary = final.with_name(f".{final.name}")
+    temporary.mkdir(parents=True, exist_ok=True)
+    yield temporary
+    temporary.rename(final)

@@ -1,0 +1,33 @@
+"""Which versions of what made a result."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+
+PACKAGES = (
+    "scarpsim",
+    "mitsuba",
+    "drjit",
+    "manifold3d",
+    "open3d",
+    "opencv-contrib-python-headless",
+    "trimesh",
+    "numpy",
+    "scipy",
+    "laspy",
+    "lazrs",
+    "tifffile",
+    "pycocotools",
+)
+
+
+def versions() -> dict[str, str]:
+    """Version of Python, of this package and of those it computes with; packages that are not installed are left out."""
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

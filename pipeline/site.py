@@ -1,0 +1,50 @@
+"""The stage of a simulation: the wall in its frame, and the sensor in front of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.config import SensorName, SimulationConfig
+from scene.frame import WallFrame
+from scene.keyed_random import KeyedRandom
+from scene.mesh import TriangleMesh
+from scene.wall import build_wall
+from sensors.observation import Sensor
+from sensors.placement import Target
+from sensors.stereo import StereoPair
+from sensors.tls import LaserScanner
+
+
+@dataclass(frozen=True)
+class Site:
+    """The untouched wall (wall frame), its frame, and the sensor that observes it.
+
+    name: of the wall; repairs: what was mended in an imported mesh.
+    """
+
+    name: str
+    repairs: tuple[str, ...]
+    mesh: TriangleMesh
+    frame: WallFrame
+    sensor: Sensor
+
+
+def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Site:
+    """Build the wall, place the sensor and fit the wall's frame, whose z axis points to the sensor.
+
+    Raises InputError for a wall that cannot be used and a sensor that cannot be placed.
+    """
+    wall = build_wall(config.wall, random.child("wall"))
+    target = Target(wall.mesh)
+    if sensor == "stereo":
+        cameras = config.camera_pair(target)
+        frame = WallFrame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
+        mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
+        pair = StereoPair(cameras, frame, config.stereo_model(), config.depth_map, config.products.truth_channels)
+        return Site(wall.name, wall.repairs, mesh, frame, pair)
+    station = config.station.place(target)
+    frame = WallFrame.fit(wall.mesh.vertices, station[0])
+    mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
+    truth = config.products.truth_channels
+    scanner = LaserScanner.aimed(station, frame, mesh.vertices, config.scanner, config.tls_model(), truth=truth)
+    return Site(wall.name, wall.repairs, mesh, frame, scanner)
