@@ -72,7 +72,7 @@ def _plain(value: Any) -> Any:
 
 def _as_input_error(error: OSError, path: Path) -> Exception:
     """What a person can mend, as an InputError; any other error as it is."""
-    where, code = str(path), error.errno or 0
+    where, code = str(path), error.errno or _numpy_errno(error)
     if code in _FULL:
         free = shutil.disk_usage(_existing(path)).free / 1e6
         return InputError(f"{_FULL[code]}, {free:,.0f} MB are free", where=where, remedy=f"make room or {_ELSEWHERE}")
@@ -81,6 +81,11 @@ def _as_input_error(error: OSError, path: Path) -> Exception:
     if code in _NO_SUCH_PLACE:
         return InputError(f"cannot be a file ({error.strerror})", where=where, remedy=_ELSEWHERE)
     return error
+
+
+def _numpy_errno(error: OSError) -> int:
+    """ndarray.tofile, which tifffile uses, tells a full disk by its words alone: "1000 requested and 10 written"."""
+    return errno.ENOSPC if "requested and" in str(error) else 0
 
 
 def _existing(path: Path) -> Path:

@@ -1,0 +1,231 @@
+"""The pictures of a report: hillshades, difference maps, histograms, convergence of the registration; each as PNG bytes.
+
+Equal arguments give equal bytes. Colours can be told apart by colour-blind readers (Okabe and Ito's pair, RdBu for differences).
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from pipeline.difference import DifferenceStatistics, statistics
+from scene.grid import Grid
+from scene.mesh import WALL, IntArray
+
+SCALE_SIGMAS = 6.0
+"""A difference map's colours end at this many sigma on either side of zero."""
+_WIDEST_PX = 2000
+_DPI = 150
+_MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.6, 9.0
+_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.7, 1.25, 0.6, 0.4
+_OUTSIDE, _INSIDE = "#0072B2", "#D55E00"
+_NO_DATA, _NO_DATA_HILLSHADE = "#b5b5b5", "#c9dced"
+_LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
+"""Towards the light: from the upper left, 45 degrees above the wall's plane."""
+_BINS = 120
+_COLOURS = colormaps["RdBu_r"].resampled(49)
+"""In steps of a quarter of a sigma, which cannot be told apart by eye and make a smaller file."""
+_GREYS = colormaps["gray"].resampled(64)
+
+
+class Iteration(Protocol):
+    """What a convergence picture needs of an iteration of the registration."""
+
+    @property
+    def rms_m(self) -> float: ...
+    @property
+    def inliers(self) -> int: ...
+    @property
+    def points(self) -> int: ...
+
+
+def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "") -> bytes:
+    """A raster of heights (h, w), m, NaN without data, lit from the upper left."""
+    heights, pixel = _mean_pooled(heights, _pooling(grid)), grid.gsd * _pooling(grid)
+    down, right = np.gradient(heights, pixel) if min(heights.shape) > 1 else (0 * heights, 0 * heights)
+    shade = (-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / np.sqrt(
+        1 + right**2 + down**2
+    )  # the normal is (-dz/dx, -dz/dy, 1)
+    figure, axes = _map_figure(grid, title, right_in=0.2)
+    axes.set_facecolor(_NO_DATA_HILLSHADE)
+    axes.imshow(shade, cmap=_GREYS, vmin=-0.1, vmax=1.0, extent=_extent(grid, shade.shape), interpolation="nearest")
+    _no_data_legend(axes, heights, _NO_DATA_HILLSHADE)
+    return _png(figure)
+
+
+def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, title: str = "") -> bytes:
+    """A difference map (h, w), m, NaN without data, on a scale of +-6 `sigma_m`, with outlines of the labels `block` (h, w)."""
+    if not sigma_m > 0:
+        raise ValueError(f"sigma_m must be positive, got {sigma_m}")
+    values = _mean_pooled(difference, _pooling(grid)) * 1e3
+    limit, extent = SCALE_SIGMAS * sigma_m * 1e3, _extent(grid, values.shape)
+    figure, axes = _map_figure(grid, title)
+    axes.set_facecolor(_NO_DATA)
+    image = axes.imshow(values, cmap=_COLOURS, vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
+    inside = _max_pooled(block != WALL, _pooling(grid))
+    if inside.any() and min(inside.shape) > 1:
+        axes.contour(inside, levels=[0.5], colors="black", linewidths=0.6, origin="upper", extent=extent)
+    _colour_bar(figure, axes, image, sigma_m * 1e3)
+    _no_data_legend(axes, values, _NO_DATA, "outline: block" if inside.any() else "")
+    return _png(figure)
+
+
+def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating], title: str = "") -> bytes:
+    """Histograms of differences, m, outside and inside the blocks: the noise on a linear scale, all on a logarithmic one."""
+    groups = [("outside the blocks", outside, _OUTSIDE), ("inside the blocks", inside, _INSIDE)]
+    samples = [(name, values[~np.isnan(values)] * 1e3, colour) for name, values, colour in groups]
+    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.6), dpi=_DPI, layout="constrained")
+    figure.suptitle(title, fontsize=11)
+    noise, whole = figure.subplots(1, 2)
+    _histogram(noise, samples, _noise_range(samples[0][1]))
+    noise.set_title("The noise: linear scale", fontsize=10)
+    _histogram(whole, samples, _whole_range(samples))
+    whole.set_title("Everything: logarithmic scale", fontsize=10)
+    whole.set_yscale("symlog", linthresh=1)
+    whole.set_ylim(bottom=0)
+    handles = [Patch(color=colour, label=f"{name}\n{_in_words(statistics(values))}") for name, values, colour in samples]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    return _png(figure)
+
+
+def convergence_figure(history: Sequence[Iteration], title: str = "") -> bytes:
+    """RMS of the inliers' residuals and share of inliers over the iterations of the registration."""
+    iteration = np.arange(1, len(history) + 1)
+    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 3.4), dpi=_DPI, layout="constrained")
+    figure.suptitle(title, fontsize=11)
+    panels = [
+        ("RMS of the inliers, mm", [step.rms_m * 1e3 for step in history], _OUTSIDE),
+        ("inliers, % of the points", [100 * step.inliers / max(step.points, 1) for step in history], _INSIDE),
+    ]
+    for axes, (label, values, colour) in zip(figure.subplots(1, 2), panels, strict=True):
+        axes.plot(iteration, values, color=colour, marker="o", markersize=3.5, linewidth=1.2)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+        _dress(axes, "iteration", label)
+        axes.grid(color="0.9", linewidth=0.6)
+    return _png(figure)
+
+
+def _histogram(axes: Axes, samples: Sequence[tuple[str, NDArray[np.floating], str]], limits: tuple[float, float]) -> None:
+    edges = np.linspace(*limits, _BINS + 1)
+    for _, values, colour in samples:
+        counts, _ = np.histogram(values, edges)
+        axes.stairs(counts, edges, fill=True, color=colour, alpha=0.35)
+        axes.stairs(counts, edges, color=colour, linewidth=1.2)
+    axes.axvline(0, color="0.3", linewidth=0.8)
+    axes.set_xlim(limits)
+    _dress(axes, "reference minus epoch, mm (missing rock is positive)", f"pixels per {edges[1] - edges[0]:.3g} mm")
+
+
+def _noise_range(values: NDArray[np.floating]) -> tuple[float, float]:
+    """Median and SCALE_SIGMAS of the NMAD on either side, mm."""
+    found = statistics(values)
+    centre, half = (found.median, SCALE_SIGMAS * found.nmad) if found.count else (0.0, 0.0)
+    return centre - (half or 1.0), centre + (half or 1.0)
+
+
+def _whole_range(samples: Sequence[tuple[str, NDArray[np.floating], str]]) -> tuple[float, float]:
+    values = [values for _, values, _ in samples if len(values)]
+    low = min((float(part.min()) for part in values), default=-1.0)
+    high = max((float(part.max()) for part in values), default=1.0)
+    margin = 0.02 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
+def _in_words(found: DifferenceStatistics) -> str:
+    """Statistics of values in mm."""
+    if not found.count:
+        return "no data"
+    return (
+        f"median {_signed(found.median, 1)}, StD {found.standard_deviation:.1f}, "
+        f"RMSE {found.rmse:.1f}, NMAD {found.nmad:.1f} mm\n{found.count:,} pixels"
+    )
+
+
+def _map_figure(grid: Grid, title: str, right_in: float = _RIGHT_IN) -> tuple[Figure, Axes]:
+    """A figure whose axes have the aspect of the grid, in wall-frame metres."""
+    aspect = grid.height / grid.width
+    width = min(_MAP_WIDTH_IN, _MAP_HEIGHT_IN / aspect)
+    height = width * aspect
+    full_width, full_height = _LEFT_IN + width + right_in, _BOTTOM_IN + height + _TOP_IN
+    figure = Figure(figsize=(full_width, full_height), dpi=_DPI)
+    axes = figure.add_axes((_LEFT_IN / full_width, _BOTTOM_IN / full_height, width / full_width, height / full_height))
+    axes.set_title(title, fontsize=11, loc="left")
+    _dress(axes, "x along the wall, m", "y up the wall, m")
+    return figure, axes
+
+
+def _dress(axes: Axes, x_label: str, y_label: str) -> None:
+    axes.set_xlabel(x_label, fontsize=9)
+    axes.set_ylabel(y_label, fontsize=9)
+    axes.tick_params(labelsize=8)
+
+
+def _colour_bar(figure: Figure, axes: Axes, image: Any, sigma_mm: float) -> None:
+    box = axes.get_position()
+    place = figure.add_axes((box.x1 + 0.15 / figure.get_figwidth(), box.y0, 0.16 / figure.get_figwidth(), box.height))
+    ticks = sigma_mm * np.arange(-SCALE_SIGMAS, SCALE_SIGMAS + 1, 2)
+    bar = figure.colorbar(image, cax=place, extend="both", ticks=ticks)
+    digits = max(0, int(np.ceil(-np.log10(sigma_mm))) + 1)
+    bar.ax.set_yticklabels([_signed(tick, digits) for tick in ticks], fontsize=8)
+    bar.set_label(f"reference minus epoch, mm; a tick is 2 $\\sigma$, $\\sigma$ = {sigma_mm:.3g} mm", fontsize=9)
+
+
+def _signed(value: float, digits: int) -> str:
+    """A number with its sign, a true minus, and no sign on a zero."""
+    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if round(value, digits) else f"{0:.{digits}f}"
+
+
+def _no_data_legend(axes: Axes, values: NDArray[np.floating], colour: str, outline: str = "") -> None:
+    handles = [Patch(facecolor=colour, edgecolor="0.3", linewidth=0.5, label="no data")] if np.isnan(values).any() else []
+    if outline:
+        handles.append(Patch(facecolor="none", edgecolor="black", linewidth=0.8, label=outline))
+    if handles:
+        axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=8, frameon=False, borderpad=0.1)
+
+
+def _pooling(grid: Grid) -> int:
+    """How many pixels of the raster, each way, become one of the picture."""
+    return max(1, int(np.ceil(max(grid.width, grid.height) / _WIDEST_PX)))
+
+
+def _extent(grid: Grid, shape: tuple[int, ...]) -> tuple[float, float, float, float]:
+    """Left, right, bottom, top of a pooled raster, wall frame, m."""
+    pixel = grid.gsd * _pooling(grid)
+    return grid.x_min, grid.x_min + shape[1] * pixel, grid.y_max - shape[0] * pixel, grid.y_max
+
+
+def _cells(raster: NDArray[Any], factor: int) -> NDArray[Any]:
+    """View a raster as (h, factor, w, factor); what does not fill a cell at the right and the bottom is left out."""
+    height, width = (max(size // factor, 1) for size in raster.shape)
+    rows, columns = min(factor, raster.shape[0]), min(factor, raster.shape[1])
+    return raster[: height * rows, : width * columns].reshape(height, rows, width, columns)
+
+
+def _mean_pooled(raster: NDArray[np.floating], factor: int) -> NDArray[np.float32]:
+    """Means over cells, of what is not NaN in them."""
+    if factor == 1:
+        return raster.astype(np.float32)
+    cells = _cells(raster, factor)
+    known = ~np.isnan(cells)
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, cells, 0).sum(axis=(1, 3))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def _max_pooled(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
+    return np.asarray(_cells(mask, factor).any(axis=(1, 3)))
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
+    return buffer.getvalue()
