@@ -104,8 +104,9 @@ def _claim(out: Path, identity: dict[str, Any], resume: bool) -> None:
 def _finish(out: Path, identity: dict[str, Any], site: Site, progress: Progress, *, complete: bool) -> RunSummary:
     """Write what covers all epochs: annotations.json, report.html and run.json."""
     records = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob(f"epoch_*/{EPOCH_RECORD}"))]
-    write_json(out / "annotations.json", merge([record.pop("annotations") for record in records[1:]]))
-    report = write_run_report(out, identity, site, records)
+    report = write_run_report(out, identity, site, records, complete=complete)
+    annotations = [record.pop("annotations") for record in records]
+    write_json(out / "annotations.json", merge(annotations))
     run = {
         **identity,
         "complete": complete,
