@@ -84,7 +84,7 @@ def mend(vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[n
 
     vertices: (n, 3), m, left as they are (some fall out of use); faces: (m, 3); label: (m,) of the faces;
     rank: (n,) 0 for vertices that have to stay, 1 for original ones, 2 for those on the cut; of two vertices the one of
-    higher rank gives way.
+    higher rank gives way where it can.
     """
     cut, gain = rank == 2, np.zeros(int(label.max(initial=0)) + 1)
     suspects = np.flatnonzero(_at(cut, faces))
@@ -157,8 +157,8 @@ def _slivers(vertices: FloatArray, faces: IntArray, cut: BoolArray) -> IndexArra
 def _collapse(
     vertices: FloatArray, faces: IntArray, rank: NDArray[np.int8], cut: BoolArray, bad: IndexArray, limit: float
 ) -> BoolArray:
-    """Collapse the shortest edges of the bad faces, in place; returns which faces have vanished."""
-    start, end = _shortest_edges(vertices, faces[bad], rank, limit)
+    """Collapse short edges of the bad faces, in place; returns which faces have vanished."""
+    start, end = _collapsible_edges(vertices, faces[bad], rank, limit)
     edges = _with_faces(faces, start, end, len(vertices))
     edges = edges.only(_keeps_manifold(faces, edges))
     edges = edges.only(_turns_no_face(vertices, faces, edges))
@@ -174,19 +174,20 @@ def _collapse(
     return vanished
 
 
-def _shortest_edges(vertices: FloatArray, faces: IntArray, rank: NDArray[np.int8], limit: float) -> tuple[IndexArray, IndexArray]:
-    """Start (gives way) and end of the shortest edge of each face, shortest first, no edge twice, none above the limit."""
-    ends = np.roll(faces, -1, axis=1)
-    length = np.linalg.norm(vertices[ends] - vertices[faces], axis=2)
-    length[np.maximum(rank[faces], rank[ends]) == 0] = np.inf
-    rows, side = np.arange(len(faces)), length.argmin(axis=1)
-    short = length[rows, side] <= limit
-    start, end = faces[rows, side][short].astype(np.intp), ends[rows, side][short].astype(np.intp)
-    swap = (rank[end] > rank[start]) | ((rank[end] == rank[start]) & (end > start))
-    start, end = np.where(swap, end, start), np.where(swap, start, end)
-    _, example = np.unique(start << 32 | end, return_index=True)
-    example = example[np.argsort(length[rows, side][short][example], kind="stable")]
-    return start[example], end[example]
+def _collapsible_edges(
+    vertices: FloatArray, faces: IntArray, rank: NDArray[np.int8], limit: float
+) -> tuple[IndexArray, IndexArray]:
+    """Start (gives way) and end of the sides of the faces up to the limit, both ways round; the best first, no edge twice.
+
+    Better is an edge whose start has no lower rank than its end, then a shorter one.
+    """
+    first, second = faces.ravel().astype(np.intp), np.roll(faces, -1, axis=1).ravel().astype(np.intp)
+    edges = np.unique(np.concatenate([first << 32 | second, second << 32 | first]))
+    start, end = edges >> 32, edges & 0xFFFFFFFF
+    length = np.sqrt(_square(vertices[end] - vertices[start]))
+    order = np.lexsort((length, rank[start] < rank[end]))
+    order = order[(length[order] <= limit) & (rank[start[order]] > 0)]
+    return start[order], end[order]
 
 
 def _with_faces(faces: IntArray, start: IndexArray, end: IndexArray, count: int) -> _Edges:
@@ -260,7 +261,7 @@ def _flip(vertices: FloatArray, faces: IntArray, label: IntArray, bad: IndexArra
     second = np.stack([far, end, apex], axis=1)
     before = np.minimum(smallest_height(vertices[faces[bad]]), smallest_height(vertices[faces[other]]))
     after = np.minimum(smallest_height(vertices[first]), smallest_height(vertices[second]))
-    chosen = (count == 1) & (after > 2 * before) & ~_joined(faces, apex, far, len(vertices))
+    chosen = (count == 1) & (after > 1.5 * before) & ~_joined(faces, apex, far, len(vertices))
     chosen &= _agree(vertices, faces[other], first) & _agree(vertices, faces[other], second)
     edges = edges.only(chosen)
     free = _independent(faces, edges, len(vertices))
