@@ -34,12 +34,13 @@ class Effect(Config, ABC):
 
     A subclass declares `name` (the catalogue's, as a Literal field, so that it stands in configs), `sensor` and `stage`, its
     parameters through `parameter`, and `evaluate(state, random)`. At the parameters' null values `apply` is the identity, bit
-    for bit. Signs: recorded = true + effect.
+    for bit. Signs: recorded = true + effect. Within a stage effects act by rising `order`; equal ones in the config's order.
     """
 
     name: str
     sensor: ClassVar[Literal["tls", "stereo"]]
     stage: ClassVar[Stage]
+    order: ClassVar[int] = 0
 
     @property
     def is_null(self) -> bool:
@@ -57,21 +58,29 @@ class Effect(Config, ABC):
 
 
 def apply_stage(effects: Sequence[Effect], stage: Stage, state: StateT, random: KeyedRandom) -> StateT:
-    """Apply the effects of one stage, in the order given; each draws from its own child of `random`."""
-    for position, effect in enumerate(effects):
-        if effect.stage == stage:
-            state = effect.apply(state, random.child(effect.name, position))
+    """Apply the effects of one stage by rising `order`; each draws from a child of `random` named by its place in `effects`."""
+    chosen = [(position, effect) for position, effect in enumerate(effects) if effect.stage == stage]
+    for position, effect in sorted(chosen, key=lambda entry: entry[1].order):
+        state = effect.apply(state, random.child(effect.name, position))
     return state
 
 
 def parameter(
-    meaning: str, *, unit: str, source: str, null: float | None = 0.0, default: float | None = None, **bounds: float
+    meaning: str,
+    *,
+    unit: str,
+    source: str,
+    null: float | None = 0.0,
+    default: float | None = None,
+    typical: float | None = None,
+    **bounds: float,
 ) -> Any:
     """A parameter of an effect: its meaning, unit, source, the value at which the effect is off, and bounds (ge, gt, le, lt).
 
-    A `null` of None marks a parameter that does not switch the effect off (a period or a phase); it needs a `default`.
+    A `null` of None marks a parameter that does not switch the effect off (a period or a phase); it needs a `default`. The
+    gallery shows the effect at its parameters' `typical` values (by default the `default`).
     """
     value = null if default is None else default
-    extra: dict[str, Any] = {"unit": unit, "null": null, "source": source}
+    extra: dict[str, Any] = {"unit": unit, "null": null, "source": source, "typical": default if typical is None else typical}
     limits: dict[str, Any] = dict(bounds)
     return Field(default=value, description=f"{meaning} [{unit}]", json_schema_extra=extra, **limits)
