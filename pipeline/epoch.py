@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.closest_points import ReferenceSurface
 from pipeline.config import SimulationConfig
 from pipeline.difference import BlockStatistics, SurfaceRaster, block_statistics, difference, raster_grid, surface_raster
 from pipeline.mesh import mesh_observation
 from pipeline.progress import Progress
-from pipeline.closest_points import ReferenceSurface
 from pipeline.register import Registration, register_to
 from pipeline.site import Site
 from scene.blocks import place_blocks
@@ -21,6 +21,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray, TriangleMesh
 from scene.raycast import RayCaster
 from sensors.observation import Observation
+from sensors.placement import check_in_front
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,8 @@ def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom,
     """Observe the untouched wall, reconstruct and rasterise it; `random` is the run's."""
     with progress.stage("epoch 0: observe"):
         caster = RayCaster(site.mesh)
+        for where, viewpoint in site.viewpoints.items():
+            check_in_front(caster, viewpoint, where)
         observation = site.sensor.observe(caster, random.child("epoch", 0, "observe"))
     with progress.stage("epoch 0: mesh"):
         surface = mesh_observation(observation, config.surface)

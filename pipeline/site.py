@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pipeline.config import SensorName, SimulationConfig
 from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
+from scene.mesh import FloatArray, TriangleMesh
 from scene.wall import build_wall
 from sensors.observation import Sensor
 from sensors.placement import Target
@@ -19,7 +19,8 @@ from sensors.tls import LaserScanner
 class Site:
     """The untouched wall (wall frame), its frame, and the sensor that observes it.
 
-    name: of the wall; repairs: what was mended in an imported mesh.
+    name: of the wall; repairs: what was mended in an imported mesh; viewpoints: where the sensor's eyes are, by their place in
+    the config, wall frame.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Site:
     mesh: TriangleMesh
     frame: WallFrame
     sensor: Sensor
+    viewpoints: dict[str, FloatArray]
 
 
 def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Site:
@@ -41,10 +43,11 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         frame = WallFrame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
         mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
         pair = StereoPair(cameras, frame, config.stereo_model(), config.depth_map, config.products.truth_channels)
-        return Site(wall.name, wall.repairs, mesh, frame, pair)
+        eyes = {f"cameras, {side}": frame.to_wall(getattr(cameras, side).position) for side in ("left", "right")}
+        return Site(wall.name, wall.repairs, mesh, frame, pair, eyes)
     station = config.station.place(target)
     frame = WallFrame.fit(wall.mesh.vertices, station[0])
     mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
     truth = config.products.truth_channels
     scanner = LaserScanner.aimed(station, frame, mesh.vertices, config.scanner, config.tls_model(), truth=truth)
-    return Site(wall.name, wall.repairs, mesh, frame, scanner)
+    return Site(wall.name, wall.repairs, mesh, frame, scanner, {"station": scanner.position})

@@ -163,17 +163,6 @@ def areas(mesh: TriangleMesh) -> FloatArray:
     return _by_parts(mesh, lambda corners: np.sqrt(np.sum(_area_vectors(corners) ** 2, axis=1)), float)
 
 
-def facing_area(mesh: TriangleMesh, towards: FloatArray) -> float:
-    """Area that faces the point `towards` less the area that faces away, each triangle by the cosine of its incidence, m2."""
-
-    def facing(corners: FloatArray) -> FloatArray:
-        line = towards - corners[:, 0]
-        line /= np.sqrt(np.sum(line**2, axis=1, keepdims=True))
-        return np.einsum("ni,ni->n", _area_vectors(corners), line)
-
-    return float(np.sum(_by_parts(mesh, facing, float)))
-
-
 def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]], kind: type) -> NDArray[Any]:
     """(m,) `evaluate` of the (k, 3, 3) corners of the triangles, some at a time to save memory."""
     result: NDArray[Any] = np.empty(len(mesh.faces), kind)

@@ -11,10 +11,10 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
-from scene.cleaning import clean, facing_area, flipped
+from scene.cleaning import clean, flipped
 from scene.config import Config
 from scene.errors import InputError, nearest
-from scene.mesh import FloatArray, TriangleMesh
+from scene.mesh import TriangleMesh
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
@@ -29,6 +29,7 @@ class ImportedWall(Config):
 
     mesh: Path = Field(description="mesh file (ply, obj, stl, off, glb, ...), in the survey's coordinates")
     unit: Literal["m", "cm", "mm", "ft"] = Field("m", description="of the file's coordinates")
+    flipped: bool = Field(False, description="the file's triangles are clockwise seen from the sensors' side")
     albedo: float | None = Field(
         None, ge=0.0, le=1.0, description="of the whole wall; the luminance of the vertex colours if not given"
     )
@@ -42,6 +43,8 @@ class ImportedWall(Config):
         self._check_extent(mesh)
         origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres: taken off and added again without loss
         mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where)
+        if self.flipped:
+            mesh = flipped(mesh, np.ones(len(mesh.faces), bool))
         if self.albedo is not None:
             mesh = replace(mesh, vertex_albedo=np.full(len(mesh.vertices), self.albedo, np.float32))
         return mesh.with_vertices(mesh.vertices + origin), repairs
@@ -58,13 +61,6 @@ class ImportedWall(Config):
                 allowed=f"{_SMALLEST_M} m to {_LARGEST_M:.0f} m",
                 remedy=remedy,
             )
-
-
-def oriented(mesh: TriangleMesh, towards: FloatArray) -> TriangleMesh:
-    """The mesh wound so that most of its area faces the point `towards` ((3,), the mesh's frame, m)."""
-    if facing_area(mesh, np.asarray(towards)) >= 0:
-        return mesh
-    return flipped(mesh, np.ones(len(mesh.faces), bool))
 
 
 def _read(path: Path) -> TriangleMesh:

@@ -11,6 +11,7 @@ from pydantic import Field
 from scene.config import Config
 from scene.errors import InputError
 from scene.mesh import FloatArray, TriangleMesh
+from scene.raycast import RayCaster
 from sensors.camera import Camera, CameraPair, Matrix3, Vector3
 
 VERTICAL = np.array([0.0, 0.0, 1.0])
@@ -105,3 +106,22 @@ class StationConfig(Config):
             forward = -target.outward
         forward /= np.linalg.norm(forward)
         return position, np.stack([forward, np.cross(VERTICAL, forward), VERTICAL], axis=1)
+
+
+def check_in_front(scene: RayCaster, position: FloatArray, where: str) -> None:
+    """Raise InputError where a sensor at `position` ((3,), the scene's frame) sees the rock mostly from inside or from behind.
+
+    Looks at some thousands of the mesh's vertices and counts the sides of the faces that it meets first.
+    """
+    vertices = scene.mesh.vertices[:: max(len(scene.mesh.vertices) // 4096, 1)]
+    sight = vertices - position
+    _, face = scene.cast(position, sight)
+    corners = scene.mesh.vertices[scene.mesh.faces[face[face >= 0]]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    behind = int(np.sum(np.einsum("ij,ij->i", normal, sight[face >= 0]) > 0))
+    if 2 * behind > len(corners):
+        raise InputError(
+            f"{behind:,} of {len(corners):,} lines of sight meet the rock from behind: the sensor stands in or behind it",
+            where=where,
+            remedy="move it in front of the wall; if a mesh's triangles are wound the wrong way round, set wall.flipped: true",
+        )

@@ -36,6 +36,13 @@ SMALL: dict[str, Any] = {
     "scanner": {"azimuth_step_rad": 0.0015, "zenith_step_rad": 0.0015},
     "difference": {"gsd_m": 0.03},
 }
+FACING_AWAY = {
+    "width": 1840,
+    "height": 1228,
+    "f_px": 2500.0,
+    "position_m": [0.0, -20.0, 2.0],
+    "rotation": [[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]],
+}
 SENSORS: tuple[SensorName, ...] = ("stereo", "tls")
 TIMED = {"run.json"}
 """Files that hold wall times, and so differ from run to run."""
@@ -100,8 +107,10 @@ def test_annotations_load_in_pycocotools_and_lie_on_the_niches(finished: tuple[S
         difference = raster.read(1)
     annotations = data_set.loadAnns(data_set.getAnnIds())
     assert sorted(annotation["block"] for annotation in annotations) == [1, 2, 3, 4, 5]
+    volume = {block["label"]: block["volume_m3"] for block in json.loads((out / "epoch_001/blocks.json").read_text())}
     for annotation in annotations:
-        assert np.nanmedian(difference[data_set.annToMask(annotation) == 1]) > 0.02
+        depth = difference[data_set.annToMask(annotation) == 1]
+        assert depth.sum() * 0.03**2 == pytest.approx(volume[annotation["block"]], rel=0.35, abs=0.003)
 
 
 def test_points_and_surfaces_load_elsewhere_and_carry_the_truth(finished: tuple[SensorName, Path]) -> None:
@@ -211,8 +220,8 @@ def test_a_run_is_not_resumed_with_another_config(finished: tuple[SensorName, Pa
 @pytest.mark.parametrize(
     ("sensor", "changes", "message"),
     [
-        ("tls", {"station": {"position_m": [4.0, 30.0, 2.0]}}, "not in or behind it"),
-        ("stereo", {"cameras": {"distance_m": 20.0, "base_m": 5.0, "height_m": 500.0}}, "seen by both cameras"),
+        ("tls", {"station": {"position_m": [4.0, 30.0, 2.0]}}, "stands in or behind it"),
+        ("stereo", {"cameras": {"left": {**FACING_AWAY, "position_m": [5.0, -20.0, 2.0]}, "right": FACING_AWAY}}, "both cameras"),
         ("tls", {"rockfall": {"count": 5, "size_m": 20.0}}, "larger than the wall"),
         ("tls", {"rockfall": {"count": 3000, "size_m": 0.5}}, "no room"),
         ("tls", {"difference": {"gsd_m": 1e-5}}, "GB"),

@@ -20,6 +20,7 @@ from scene.raycast import DEFAULT_ALBEDO, RayCaster
 from sensors.effects import TLS_EFFECTS
 from sensors.model import TlsModel
 from sensors.observation import Observation
+from sensors.placement import check_in_front
 from sensors.pulses import Pulses
 from sensors.tls import LaserScanner, Pattern, ScannerConfig
 
@@ -196,7 +197,13 @@ def test_ranges_outside_the_instruments_reach_are_not_recorded() -> None:
 
 
 def test_a_scanner_behind_the_rock_is_refused() -> None:
-    with pytest.raises(InputError, match="not in or behind it"):
+    check_in_front(RayCaster(heightfield(30.0, 20.0, 0.5)), POSITION, "station")
+    with pytest.raises(InputError, match="in or behind it"):
+        check_in_front(RayCaster(heightfield(30.0, 20.0, 0.5)), POSITION * [1, 1, -1], "station")
+    ball = sphere(np.zeros(3), 5.0, 3)
+    with pytest.raises(InputError, match="in or behind it"):
+        check_in_front(RayCaster(ball), np.array([1.0, 0.0, 0.0]), "station")
+    with pytest.raises(InputError, match="no pulse returned"):
         scan(plane(np.array([0, 0, -1.0]), np.zeros(3)))
 
 
