@@ -1,10 +1,26 @@
-"""The stereo pair's matched pixels on their way through the chain."""
+"""The stereo pair's image rows and matched pixels on their way through the chain."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
-from scene.backend import mi
+import numpy as np
+
+from scene.backend import dr, mi
+from scene.mesh import FloatArray
+
+
+@dataclass(frozen=True)
+class ImageRows:
+    """n pixels of one camera as it exposes them, lazy device arrays (n,), px of the full-resolution frame.
+
+    v: the row; du: recorded minus ideal column.
+    """
+
+    camera: Literal["left", "right"]
+    v: mi.Float64
+    du: mi.Float64
 
 
 @dataclass(frozen=True)
@@ -12,7 +28,9 @@ class Matches:
     """n cells of the left depth map as lazy device arrays, all (n,); image quantities in px of the full-resolution frame.
 
     index: the cell's number, row by row (keys its random numbers); u, v: the cell's centre in the left image; disparity: of the
-    rectified pair; matched: whether the cell has a match; width, height: of the frame.
+    rectified pair; matched: whether the cell has a match; block, true_depth (m, along the real left camera's axis), albedo: of
+    the surface that the left camera sees there, albedo None for a wall that has none. width, height: of the frame; reduction:
+    frame px per cell, so that one cell is one px of the image that is matched.
     """
 
     index: mi.UInt32
@@ -20,5 +38,51 @@ class Matches:
     v: mi.Float64
     disparity: mi.Float64
     matched: mi.Bool
+    block: mi.Int32
+    true_depth: mi.Float64
+    albedo: mi.Float32 | None
     width: int
     height: int
+    reduction: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the depth map."""
+        return self.height // self.reduction, self.width // self.reduction
+
+    def raster(self) -> FloatArray:
+        """(rows, columns) disparities, px, NaN where there is no match, for effects that look at a cell's neighbours."""
+        self._evaluate()
+        return np.where(self.matched.numpy(), self.disparity.numpy(), np.nan).reshape(self.shape)
+
+    def albedo_raster(self) -> FloatArray | None:
+        """(rows, columns) albedo, NaN where there is no match; None for a wall without albedo."""
+        if self.albedo is None:
+            return None
+        self._evaluate()
+        return np.where(self.matched.numpy(), self.albedo.numpy(), np.nan).reshape(self.shape)
+
+    def with_raster(self, disparity: FloatArray) -> Matches:
+        """The same cells with these (rows, columns) disparities, px, matched where they are not NaN."""
+        values = np.ascontiguousarray(disparity, dtype=np.float64).ravel()
+        return replace(self, disparity=mi.Float64(values), matched=mi.Bool(~np.isnan(values)))
+
+    def _evaluate(self) -> None:
+        """Everything that comes out of the ray tracing at once, so that no later evaluation traces the rays again."""
+        dr.eval(self.disparity, self.matched, self.block, self.true_depth, self.albedo)
+
+
+def bridged(disparity: FloatArray, reach: float) -> FloatArray:
+    """Unmatched runs of at most `reach` cells between two matched ones of a row take the background of the two.
+
+    disparity: (rows, columns), NaN where unmatched; the background is the smaller disparity. Runs at a row's end stay unmatched.
+    """
+    rows, columns = disparity.shape
+    matched, column = ~np.isnan(disparity), np.arange(columns, dtype=np.int32)
+    before = np.maximum.accumulate(np.where(matched, column, -1), axis=1)
+    after = np.minimum.accumulate(np.where(matched, column, columns)[:, ::-1], axis=1)[:, ::-1]
+    fill = ~matched & (before >= 0) & (after < columns) & (after - before - 1 <= reach)
+    row = np.broadcast_to(np.arange(rows)[:, None], disparity.shape)[fill]
+    result = disparity.copy()
+    result[fill] = np.minimum(disparity[row, before[fill]], disparity[row, after[fill]])
+    return result

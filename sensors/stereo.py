@@ -2,7 +2,8 @@
 
 1  The real pair is the calibrated (nominal) one with the camera effects added.
 2  A ray goes through the centre of each cell of the left depth map, in the real left camera; what it hits is projected into the
-   real right camera and must be visible from there.
+   real right camera and must be visible from there. Where an exposure displaces image rows, the ray of a left pixel is that of
+   the undisplaced one, and the right pixel is recorded displaced.
 3  Both pixels are undistorted and rectified with the nominal calibration: their disparity, plus the matching's effects, is what
    a matcher would report.
 4  The disparity is reprojected with the nominal calibration: the recorded point.
@@ -25,7 +26,7 @@ from scene.raycast import Hits, RayCaster
 from sensors.camera import Camera, CameraPair
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Effect, Stage, apply_stage
-from sensors.matches import Matches
+from sensors.matches import ImageRows, Matches
 from sensors.model import StereoModel
 from sensors.observation import Observation, packed
 from sensors.rectify import Rectification, rectify
@@ -54,16 +55,18 @@ class StereoPair:
         nominal = self.cameras.in_wall_frame(self.frame)
         real = self._real(effects, random).in_wall_frame(self.frame)
         index, u, v = self._cells()
-        hits, point = _view(scene, real.left, u, v)
+        hits, point = _view(scene, real.left, u - _exposed(effects, "left", v, random), v)
         matched, right_u, right_v = _visible(scene, real.right, hits, point)
+        right_u += _exposed(effects, "right", right_v, random)
         geometry = rectify(nominal)
         left_u, left_v = _rectified(nominal.left, geometry.left, u, v, geometry.f, geometry.u_left, geometry.v)
         rectified_u, _ = _rectified(nominal.right, geometry.right, right_u, right_v, geometry.f, geometry.u_right, geometry.v)
-        matches = Matches(index, u, v, left_u - rectified_u, matched, nominal.left.width, nominal.left.height)
+        seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
+        size = nominal.left.width, nominal.left.height, REDUCTION[self.quality]
+        matches = Matches(index, u, v, left_u - rectified_u, matched, *seen, *size)
         for stage in (Stage.MATCH, Stage.FILL):
             matches = apply_stage(effects, stage, matches, random)
-        camera_point = reproject(geometry, left_u, left_v, matches.disparity)
-        return self._observation(scene, hits, matches, camera_point, nominal.left)
+        return self._observation(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -81,14 +84,12 @@ class StereoPair:
         row, column = index // columns, index % columns
         return index, (mi.Float64(column) + 0.5) * step, (mi.Float64(row) + 0.5) * step
 
-    def _observation(
-        self, scene: RayCaster, hits: Hits, matches: Matches, camera_point: mi.Array3f64, left: Camera
-    ) -> Observation:
+    def _observation(self, matches: Matches, camera_point: mi.Array3f64, left: Camera) -> Observation:
         valid = matches.matched & (camera_point.z > 0)
         depth = dr.select(valid, camera_point.z, np.nan)
         point = dr.select(valid, rotated(left.rotation, camera_point) + vector(left.position), np.nan)
-        block = dr.select(valid, hits.block, WALL)
-        truth = {"true_depth_m": dr.select(valid, hits.distance, np.nan)} if self.truth else {}
+        block = dr.select(valid, matches.block, WALL)
+        truth = {"true_depth_m": dr.select(valid, matches.true_depth, np.nan)} if self.truth else {}
         points = packed(point)
         dr.eval(points, depth, block, truth, valid)
         if dr.none(valid):
@@ -117,6 +118,11 @@ def reproject(geometry: Rectification, u: Any, v: Any, disparity: Any) -> mi.Arr
     f, u_left, v_0, infinity, base = opaque(geometry.f, geometry.u_left, geometry.v, geometry.offset, geometry.base_m)
     z = f * base / (disparity - infinity)
     return rotated(geometry.left.T, mi.Array3f64((u - u_left) / f * z, (v - v_0) / f * z, z))
+
+
+def _exposed(effects: tuple[Effect, ...], camera: Literal["left", "right"], v: mi.Float64, random: KeyedRandom) -> mi.Float64:
+    """Recorded minus ideal column of pixels in the rows `v` of one camera, px."""
+    return apply_stage(effects, Stage.EXPOSE, ImageRows(camera, v, mi.Float64(0.0)), random).du
 
 
 def _view(scene: RayCaster, camera: Camera, u: mi.Float64, v: mi.Float64) -> tuple[Hits, mi.Array3f64]:

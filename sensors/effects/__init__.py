@@ -10,23 +10,67 @@ from scene.errors import nearest
 from sensors.effects.affinity_skew import AffinitySkew
 from sensors.effects.angle_noise import AngleNoise
 from sensors.effects.base import Effect
+from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.camera_kappa import CameraKappa
 from sensors.effects.camera_omega import CameraOmega
 from sensors.effects.camera_phi import CameraPhi
 from sensors.effects.camera_shift import CameraShift
+from sensors.effects.collimation import Collimation
+from sensors.effects.detection_limit import DetectionLimit
+from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.focal_length import FocalLength
+from sensors.effects.horizontal_eccentricity import HorizontalEccentricity
+from sensors.effects.occlusion_fill import OcclusionFill
 from sensors.effects.parallax_noise import ParallaxNoise
+from sensors.effects.pixel_locking import PixelLocking
+from sensors.effects.precipitation import Precipitation
 from sensors.effects.principal_point_x import PrincipalPointX
 from sensors.effects.principal_point_y import PrincipalPointY
 from sensors.effects.radial_distortion import RadialDistortion
+from sensors.effects.range_cyclic import RangeCyclic
+from sensors.effects.range_incidence_bias import RangeIncidenceBias
+from sensors.effects.range_intensity_bias import RangeIntensityBias
 from sensors.effects.range_noise import RangeNoise
+from sensors.effects.range_noise_incidence import RangeNoiseIncidence
+from sensors.effects.range_noise_intensity import RangeNoiseIntensity
 from sensors.effects.range_noise_proportional import RangeNoiseProportional
 from sensors.effects.range_offset import RangeOffset
+from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.range_scale import RangeScale
 from sensors.effects.regularization_noise import RegularizationNoise
+from sensors.effects.row_jitter import RowJitter
+from sensors.effects.smoothing import Smoothing
 from sensors.effects.tangential_distortion import TangentialDistortion
+from sensors.effects.texture_noise import TextureNoise
+from sensors.effects.tilt_drift import TiltDrift
+from sensors.effects.trunnion_tilt import TrunnionTilt
+from sensors.effects.vertical_eccentricity import VerticalEccentricity
+from sensors.effects.vertical_index import VerticalIndex
+from sensors.effects.wobble import Wobble
 
-TLS_EFFECTS: tuple[type[Effect], ...] = (RangeOffset, RangeScale, RangeNoise, RangeNoiseProportional, AngleNoise)
+TLS_EFFECTS: tuple[type[Effect], ...] = (
+    RangeOffset,
+    RangeScale,
+    RangeCyclic,
+    RangeIntensityBias,
+    RangeIncidenceBias,
+    RangeQuantization,
+    RangeNoise,
+    RangeNoiseProportional,
+    RangeNoiseIncidence,
+    RangeNoiseIntensity,
+    AngleNoise,
+    VerticalIndex,
+    Collimation,
+    TrunnionTilt,
+    HorizontalEccentricity,
+    VerticalEccentricity,
+    Wobble,
+    TiltDrift,
+    BeamDivergence,
+    DetectionLimit,
+    Precipitation,
+)
 
 STEREO_EFFECTS: tuple[type[Effect], ...] = (
     FocalLength,
@@ -41,6 +85,12 @@ STEREO_EFFECTS: tuple[type[Effect], ...] = (
     CameraShift,
     ParallaxNoise,
     RegularizationNoise,
+    PixelLocking,
+    EdgeFattening,
+    Smoothing,
+    OcclusionFill,
+    TextureNoise,
+    RowJitter,
 )
 
 
@@ -69,22 +119,44 @@ __all__ = [
     "TLS_EFFECTS",
     "AffinitySkew",
     "AngleNoise",
+    "BeamDivergence",
     "CameraKappa",
     "CameraOmega",
     "CameraPhi",
     "CameraShift",
+    "Collimation",
+    "DetectionLimit",
+    "EdgeFattening",
     "Effect",
     "FocalLength",
+    "HorizontalEccentricity",
+    "OcclusionFill",
     "ParallaxNoise",
+    "PixelLocking",
+    "Precipitation",
     "PrincipalPointX",
     "PrincipalPointY",
     "RadialDistortion",
+    "RangeCyclic",
+    "RangeIncidenceBias",
+    "RangeIntensityBias",
     "RangeNoise",
+    "RangeNoiseIncidence",
+    "RangeNoiseIntensity",
     "RangeNoiseProportional",
     "RangeOffset",
+    "RangeQuantization",
     "RangeScale",
     "RegularizationNoise",
+    "RowJitter",
+    "Smoothing",
     "StereoEffect",
     "TangentialDistortion",
+    "TextureNoise",
+    "TiltDrift",
     "TlsEffect",
+    "TrunnionTilt",
+    "VerticalEccentricity",
+    "VerticalIndex",
+    "Wobble",
 ]

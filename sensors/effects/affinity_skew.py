@@ -17,7 +17,7 @@ class AffinitySkew(Effect):
     stage = Stage.CAMERA
     camera: Side = "both"
     b1_px: float = parameter(
-        "real minus calibrated affinity", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4
+        "real minus calibrated affinity", unit="px", source="Metashape user manual, appendix D", typical=1.0, ge=-1e4, le=1e4
     )
     b2_px: float = parameter("real minus calibrated skew", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4)
 

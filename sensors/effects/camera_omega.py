@@ -16,7 +16,7 @@ class CameraOmega(Effect):
     sensor = "stereo"
     stage = Stage.CAMERA
     camera: Side = "both"
-    angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", ge=-1, le=1)
+    angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=1.7e-4, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
         return state.rotated(self.camera, axis=0, angle_rad=self.angle_rad)

@@ -18,7 +18,9 @@ class CameraShift(Effect):
     sensor = "stereo"
     stage = Stage.CAMERA
     camera: Side = "both"
-    x_m: float = parameter("real minus nominal perspective centre, world x", unit="m", source="photogrammetry", ge=-10, le=10)
+    x_m: float = parameter(
+        "real minus nominal perspective centre, world x", unit="m", source="photogrammetry", typical=0.01, ge=-10, le=10
+    )
     y_m: float = parameter("real minus nominal perspective centre, world y", unit="m", source="photogrammetry", ge=-10, le=10)
     z_m: float = parameter("real minus nominal perspective centre, world z", unit="m", source="photogrammetry", ge=-10, le=10)
 

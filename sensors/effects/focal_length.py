@@ -17,7 +17,12 @@ class FocalLength(Effect):
     stage = Stage.CAMERA
     camera: Side = "both"
     delta_px: float = parameter(
-        "real minus calibrated principal distance", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4
+        "real minus calibrated principal distance",
+        unit="px",
+        source="Metashape user manual, appendix D",
+        typical=2.5,
+        ge=-1e4,
+        le=1e4,
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:

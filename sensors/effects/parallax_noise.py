@@ -17,7 +17,8 @@ class ParallaxNoise(Effect):
     name: Literal["parallax_noise"] = "parallax_noise"
     sensor = "stereo"
     stage = Stage.MATCH
-    sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", ge=0, le=1000)
+    order = 40
+    sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.3, ge=0, le=1000)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         noise = mi.Float64(random.normals(state.index).x)

@@ -20,7 +20,9 @@ class RadialDistortion(Effect):
     sensor = "stereo"
     stage = Stage.CAMERA
     camera: Side = "both"
-    k1: float = parameter("real minus calibrated k1", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
+    k1: float = parameter(
+        "real minus calibrated k1", unit="1", source="Metashape user manual, appendix D", typical=5e-4, ge=-100, le=100
+    )
     k2: float = parameter("real minus calibrated k2", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
     k3: float = parameter("real minus calibrated k3", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
     k4: float = parameter("real minus calibrated k4", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)

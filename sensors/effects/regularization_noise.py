@@ -23,7 +23,8 @@ class RegularizationNoise(Effect):
     name: Literal["regularization_noise"] = "regularization_noise"
     sensor = "stereo"
     stage = Stage.MATCH
-    sigma_px: float = parameter("standard deviation at the nodes", unit="px", source="empirical", ge=0, le=1000)
+    order = 30
+    sigma_px: float = parameter("standard deviation at the nodes", unit="px", source="empirical", typical=0.2, ge=0, le=1000)
     step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=32.0, gt=0)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:

@@ -17,7 +17,12 @@ class TangentialDistortion(Effect):
     stage = Stage.CAMERA
     camera: Side = "both"
     p1: float = parameter(
-        "real minus calibrated p1, Metashape's order", unit="1", source="Metashape user manual, appendix D", ge=-10, le=10
+        "real minus calibrated p1, Metashape's order",
+        unit="1",
+        source="Metashape user manual, appendix D",
+        typical=1e-4,
+        ge=-10,
+        le=10,
     )
     p2: float = parameter(
         "real minus calibrated p2, Metashape's order", unit="1", source="Metashape user manual, appendix D", ge=-10, le=10

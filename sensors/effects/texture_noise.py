@@ -1,0 +1,64 @@
+"""Matching noise that grows where the rock has little texture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import correlate1d
+
+from scene.backend import mi
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.base import Effect, Stage, parameter
+from sensors.matches import Matches
+
+WINDOW = 5
+"""Side of the window whose gradients add up, cells."""
+
+WHITE = 255.0
+"""Grey value of albedo 1."""
+
+LARGEST_SIGMA_PX = 1.0
+"""Where there is no texture the matcher's smoothness holds the disparity: sigma_d ends here."""
+
+
+class TextureNoise(Effect):
+    """sigma_d^2 = k sigma_I^2 / sum gx^2, at most 1 px^2: the Cramer-Rao bound of matching a window by its texture.
+
+    gx: horizontal gradient of the image, grey values per px of the full-resolution frame, summed over 5 x 5 cells; for the
+    simulated matcher the image is 255 x albedo (no shading, no texture finer than the wall's triangles). sigma_I: 1 grey value
+    of 255. k = 2 is the bound for two equally noisy images; a finer texture than the albedo's makes it smaller.
+    """
+
+    name: Literal["texture_noise"] = "texture_noise"
+    sensor = "stereo"
+    stage = Stage.MATCH
+    order = 50
+    coefficient: float = parameter("k", unit="1", source="Cramer-Rao bound", typical=2.0, ge=0, le=1e6)
+
+    def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
+        albedo = state.albedo_raster()
+        if albedo is None:
+            raise InputError(
+                "the wall has no albedo, so there is no texture", where=f"effect {self.name}", remedy="give the wall an albedo"
+            )
+        information = texture(WHITE * albedo, state.reduction)
+        with np.errstate(divide="ignore"):
+            sigma = np.minimum(np.sqrt(self.coefficient / information), LARGEST_SIGMA_PX)
+        noise = mi.Float64(random.normals(state.index).x)
+        return replace(state, disparity=state.disparity + mi.Float64(sigma.ravel()) * noise)
+
+
+def texture(image: FloatArray, reduction: int) -> FloatArray:
+    """(rows, columns) sum of squared horizontal gradients over the window, in (grey values per px of the frame)^2.
+
+    image: grey values, NaN where unknown; gradients that need an unknown value count as 0. reduction: frame px per cell.
+    """
+    gradient = np.zeros_like(image)
+    gradient[:, 1:-1] = (image[:, 2:] - image[:, :-2]) / (2 * reduction)
+    squared = np.square(np.nan_to_num(gradient))
+    ones = np.ones(WINDOW)
+    return correlate1d(correlate1d(squared, ones, axis=0, mode="constant"), ones, axis=1, mode="constant")
