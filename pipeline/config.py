@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, field_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from pipeline.annotate import AnnotationConfig
 from pipeline.difference import DifferenceConfig
@@ -14,6 +14,7 @@ from pipeline.formats.cameras import PairConfig, read_cameras_yaml
 from pipeline.formats.metashape import read_metashape
 from pipeline.mesh import SurfaceConfig
 from pipeline.overrides import apply_overrides
+from pipeline.presets import is_path, with_preset
 from pipeline.register import IcpConfig
 from pipeline.tiles import TileConfig
 from scene.blocks import RockfallConfig
@@ -107,6 +108,11 @@ class SimulationConfig(Config):
     tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")
     products: ProductsConfig = ProductsConfig()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _with_preset(cls, values: Any) -> Any:
+        return with_preset(values) if isinstance(values, dict) else values
+
     @field_validator("sensor", mode="before")
     @classmethod
     def _listed(cls, value: Any) -> Any:
@@ -160,7 +166,7 @@ def load_config(path: Path, overrides: Sequence[str], sensor: SensorName, seed: 
     if seed is not None:
         values["seed"] = seed
     config = parse(SimulationConfig, values, str(path))
-    if config.sensor and sensor not in {model.sensor for model in config.sensor}:
+    if values.get("sensor") and sensor not in {model.sensor for model in config.sensor}:
         raise InputError(
             f"the only sensor model is of '{config.sensor[0].sensor}', and --sensor is {sensor}",
             where=f"{path}: sensor",
@@ -181,4 +187,9 @@ def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
             result[section] = {**result[section], key: absolute(result[section][key])}
     for key in ("cameras", "sensor"):
         result = {**result, key: absolute(result[key])} if isinstance(result.get(key), str) else result
+    scanner = result.get("scanner")
+    if isinstance(scanner, str) and is_path(scanner):
+        result["scanner"] = absolute(scanner)
+    elif isinstance(scanner, dict) and isinstance(scanner.get("preset"), str) and is_path(scanner["preset"]):
+        result["scanner"] = {**scanner, "preset": absolute(scanner["preset"])}
     return result

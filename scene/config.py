@@ -63,6 +63,8 @@ def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
     if item["type"] == "missing":
         return f"'{key}' is missing"
     message = item["msg"].removeprefix("Value error, ")
+    if not key:  # of the whole, which is not worth repeating
+        return message
     return f"'{key}': {message[0].lower()}{message[1:]}, got {item['input']!r}"
 
 
