@@ -35,17 +35,17 @@ class KeyedRandom:
         """A fresh NumPy generator, at the start of this key's stream each time it is asked for."""
         return np.random.Generator(np.random.Philox(key=self.key))
 
-    def normals(self, index: mi.UInt32, field: int = 0) -> mi.Array4f:
+    def normals(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
         """Four independent standard normal numbers per element, on the device.
 
-        index: (n,) element numbers; field: which quadruple of the element (0, 1, ...). Returns a Dr.Jit Array4f of (n,) each.
+        index: (n,) element numbers; field: a second number of the key, one or (n,). Returns a Dr.Jit Array4f of (n,) each.
         """
         return self._philox(index, field).next_float32x4_normal()
 
-    def uniforms(self, index: mi.UInt32, field: int = 0) -> mi.Array4f:
+    def uniforms(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
         """Four independent numbers in [0, 1) per element, on the device; arguments as in `normals`."""
         return self._philox(index, field).next_float32x4()
 
-    def _philox(self, index: mi.UInt32, field: int) -> mi.Philox4x32:
+    def _philox(self, index: mi.UInt32, field: int | mi.UInt32) -> mi.Philox4x32:
         # The key is opaque, so that one compiled kernel serves every seed and purpose.
         return mi.Philox4x32(seed=dr.opaque(mi.UInt64, self.key), counter_0=index, counter_1=mi.UInt32(field))

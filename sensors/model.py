@@ -28,7 +28,7 @@ from sensors.effects import (
     TangentialDistortion,
     TlsEffect,
 )
-from sensors.effects.base import Effect
+from sensors.effects.base import Effect, Stage
 
 
 class TlsNoise(Config):
@@ -45,6 +45,12 @@ class TlsModel(Config):
     sensor: Literal["tls"] = "tls"
     noise: TlsNoise = TlsNoise()
     effects: tuple[TlsEffect, ...] = Field((), description="effects of the catalogue beyond the base noise")
+
+    @model_validator(mode="after")
+    def _one_beam(self) -> TlsModel:
+        if sum(effect.stage == Stage.FOOTPRINT for effect in self.effects) > 1:
+            raise ValueError("a scanner has one beam: name beam_divergence once")
+        return self
 
     def chain(self) -> tuple[Effect, ...]:
         """The base noise and the effects, as one list of effects."""

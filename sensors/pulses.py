@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from scene.backend import dr, mi
+from scene.keyed_random import KeyedRandom
 
 REFERENCE_RANGE_M = 100.0
 """Received power is relative to a target of albedo 1, hit squarely, at this range."""
@@ -14,13 +16,19 @@ REFERENCE_RANGE_M = 100.0
 class Pulses:
     """n pulses as lazy device arrays, all (n,), scanner frame; angles in rad, lengths in m.
 
-    index: the pulse's number in the whole pattern (keys its random numbers); line: its scan line; azimuth, zenith: the nominal
-    direction, which is the one recorded; aim_azimuth, aim_zenith: the direction in which the pulse really leaves. Once traced:
-    true_range and range_m (recorded so far), cos_incidence, albedo, power (relative), block, returned.
+    line: scan line, counted from the scan's first; share: of the scan's duration that has passed, 0 at the first pulse, 1 at the
+    last; line_key, pulse_key: numbers of line and pulse on the instrument's own grid of steps, which key the pulse's random
+    numbers, so that a window scanned alone draws those of the same window in a larger scan; azimuth, zenith: the nominal
+    direction, which is the one recorded; aim_azimuth, aim_zenith: the direction in which the pulse really leaves.
+
+    Once traced: true_range, of the return that the beam yields without any error, and range_m, recorded so far; cos_incidence,
+    albedo, power (relative), block, returned; minimum_range, the nearest that the instrument records (scalar).
     """
 
-    index: mi.UInt32
     line: mi.UInt32
+    share: mi.Float64
+    line_key: mi.UInt32
+    pulse_key: mi.UInt32
     azimuth: mi.Float64
     zenith: mi.Float64
     aim_azimuth: mi.Float64
@@ -32,6 +40,28 @@ class Pulses:
     power: mi.Float32 | None = None
     block: mi.Int32 | None = None
     returned: mi.Bool | None = None
+    minimum_range: mi.Float64 | None = None
+
+    def normals(self, random: KeyedRandom) -> mi.Array4f:
+        """Four independent standard normal numbers per pulse; other four for every child of `random`."""
+        return random.normals(self.pulse_key, self.line_key)
+
+    def uniforms(self, random: KeyedRandom) -> mi.Array4f:
+        """Four independent numbers in [0, 1) per pulse."""
+        return random.uniforms(self.pulse_key, self.line_key)
+
+    def with_angle_error(self, azimuth: Any = 0.0, zenith: Any = 0.0) -> Pulses:
+        """Recorded minus emitted direction grows by `azimuth` and `zenith`, rad: it leaves by as much on the other side."""
+        return replace(self, aim_azimuth=self.aim_azimuth - azimuth, aim_zenith=self.aim_zenith - zenith)
+
+    def with_range_error(self, error: mi.Float64) -> Pulses:
+        """Recorded minus true range grows by `error`, m."""
+        return replace(self, range_m=self.range_m + error)
+
+    def evaluated(self) -> Pulses:
+        """The same pulses, computed: for an effect that needs numbers of the whole scan; what follows starts from memory."""
+        dr.eval([value for field in fields(self) if (value := getattr(self, field.name)) is not None])
+        return self
 
 
 def direction(azimuth: mi.Float64, zenith: mi.Float64) -> mi.Array3f64:
@@ -39,3 +69,11 @@ def direction(azimuth: mi.Float64, zenith: mi.Float64) -> mi.Array3f64:
     sin_azimuth, cos_azimuth = dr.sincos(azimuth)
     sin_zenith, cos_zenith = dr.sincos(zenith)
     return mi.Array3f64(sin_zenith * cos_azimuth, sin_zenith * sin_azimuth, cos_zenith)
+
+
+def tangents(azimuth: mi.Float64, zenith: mi.Float64) -> tuple[mi.Array3f64, mi.Array3f64]:
+    """3 x (n,) unit vectors across `direction`, towards rising azimuth and rising zenith."""
+    sin_azimuth, cos_azimuth = dr.sincos(azimuth)
+    sin_zenith, cos_zenith = dr.sincos(zenith)
+    rising_zenith = mi.Array3f64(cos_zenith * cos_azimuth, cos_zenith * sin_azimuth, -sin_zenith)
+    return mi.Array3f64(-sin_azimuth, cos_azimuth, mi.Float64(0.0)), rising_zenith

@@ -18,9 +18,10 @@ from scene.raycast import RayCaster
 from sensors.camera import axis_rotation
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Stage, apply_stage
+from sensors.footprint import Beam, Echo
 from sensors.model import TlsModel
 from sensors.observation import Observation, packed
-from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction
+from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction, tangents
 
 Window = tuple[float, float]
 
@@ -124,8 +125,9 @@ class LaserScanner:
         """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith)."""
         effects = self.model.chain()
         pulses = apply_stage(effects, Stage.AIM, self._emit(), random)
-        pulses = self._trace(scene, pulses)
-        for stage in (Stage.FOOTPRINT, Stage.RANGE, Stage.POWER, Stage.RETURN):
+        beam = apply_stage(effects, Stage.FOOTPRINT, Beam(), random)
+        pulses = self._trace(scene, pulses, beam)
+        for stage in (Stage.RANGE, Stage.POWER, Stage.RETURN):
             pulses = apply_stage(effects, stage, pulses, random)
         return self._record(pulses)
 
@@ -138,26 +140,44 @@ class LaserScanner:
             pattern.azimuth_start, pattern.azimuth_step, pattern.zenith_start, pattern.zenith_step
         )
         azimuth, zenith = start_azimuth + step_azimuth * mi.Float64(line), start_zenith + step_zenith * mi.Float64(pulse)
-        return Pulses(index, line, azimuth, zenith, aim_azimuth=azimuth, aim_zenith=zenith)
+        return Pulses(
+            line=line,
+            share=mi.Float64(index) / dr.opaque(mi.Float64, max(pattern.lines * pattern.pulses - 1, 1)),
+            line_key=line + _grid_number(pattern.azimuth_start, pattern.azimuth_step),
+            pulse_key=pulse + _grid_number(pattern.zenith_start, pattern.zenith_step),
+            azimuth=azimuth,
+            zenith=zenith,
+            aim_azimuth=azimuth,
+            aim_zenith=zenith,
+        )
 
-    def _trace(self, scene: RayCaster, pulses: Pulses) -> Pulses:
-        """Ray-trace the emitted directions; power by the lidar range equation, rho cos i / R^2, relative."""
-        aim = rotated(self.rotation, direction(pulses.aim_azimuth, pulses.aim_zenith))
-        hits = scene.intersect(vector(self.position), aim)
-        cos_incidence = -dr.dot(hits.normal, mi.Vector3f(aim))
+    def _trace(self, scene: RayCaster, pulses: Pulses, beam: Beam) -> Pulses:
+        """Ray-trace the emitted beams, sub-ray by sub-ray."""
+        azimuth, zenith = pulses.aim_azimuth, pulses.aim_zenith
+        axis = rotated(self.rotation, direction(azimuth, zenith))
+        across = [rotated(self.rotation, vectors) for vectors in tangents(azimuth, zenith)]
+        echo = beam.received([self._echo(scene, ray) for ray in beam.sub_rays_about(axis, *across)])
+        return replace(
+            pulses,
+            true_range=echo.range_m,
+            range_m=echo.range_m,
+            cos_incidence=echo.cos_incidence,
+            albedo=echo.albedo,
+            power=echo.power,
+            block=echo.block,
+            returned=echo.returned,
+            minimum_range=dr.opaque(mi.Float64, self.config.minimum_range_m),
+        )
+
+    def _echo(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
+        """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2, relative."""
+        hits = scene.intersect(vector(self.position), ray)
+        cos_incidence = -dr.dot(hits.normal, mi.Vector3f(ray))
         power = hits.albedo * cos_incidence * dr.square(REFERENCE_RANGE_M / mi.Float32(hits.distance))
         nearest, farthest = opaque(self.config.minimum_range_m, self.config.maximum_range_m)
         in_reach = (hits.distance >= nearest) & (hits.distance <= farthest)
-        return replace(
-            pulses,
-            true_range=hits.distance,
-            range_m=hits.distance,
-            cos_incidence=cos_incidence,
-            albedo=hits.albedo,
-            power=power,
-            block=hits.block,
-            returned=hits.valid & (cos_incidence > 0) & in_reach,
-        )
+        returned = hits.valid & (cos_incidence > 0) & in_reach
+        return Echo(hits.distance, cos_incidence, hits.albedo, power, hits.block, returned)
 
     def _record(self, pulses: Pulses) -> Observation:
         """Points from the nominal direction and the recorded range."""
@@ -172,9 +192,7 @@ class LaserScanner:
         dr.eval(points, range_m, power, block, truth, returned)
         if dr.none(returned):
             raise InputError(
-                "no pulse returned from the wall's front",
-                where="station",
-                remedy="check that the scanner stands in front of the rock, not in or behind it, and the scanning window",
+                "no pulse returned", where="station, scanner", remedy="check position, rotation, window, range limits and effects"
             )
         shape = self.pattern.lines, self.pattern.pulses
         return Observation(
@@ -187,6 +205,15 @@ class LaserScanner:
             pulse_interval_s=1.0 / self.config.pulse_rate_hz,
             truth={name: channel.numpy().reshape(shape) for name, channel in truth.items()},
         )
+
+
+def _grid_number(start: float, step: float) -> mi.UInt32:
+    """Number of a pattern's first line or pulse on the grid of multiples of `step`; one more for every step further.
+
+    A start between two multiples belongs to the lower one up to a share that no simple fraction meets, so that rounding errors
+    do not decide.
+    """
+    return dr.opaque(mi.UInt32, int(np.floor(start / step + 0.381966)) % 2**32)
 
 
 def _extent(vertices: FloatArray, position: FloatArray, rotation: FloatArray) -> tuple[Window, Window]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Literal, TypeVar
@@ -19,7 +20,7 @@ class Stage(IntEnum):
     """Where in a sensor's chain an effect acts; the chain runs in this order, whatever the order in a config."""
 
     AIM = 1  # TLS: from the pattern's direction to the emitted one
-    FOOTPRINT = 2  # TLS: sub-rays of the beam
+    FOOTPRINT = 2  # TLS: the beam's sub-rays
     RANGE = 3  # TLS: the recorded range
     POWER = 4  # TLS: the received power
     RETURN = 5  # TLS: returns kept, lost, first or last
@@ -49,7 +50,7 @@ class Effect(Config, ABC):
         return all(value == extra["null"] for value, extra in values if isinstance(extra, dict) and extra.get("null") is not None)
 
     def apply(self, state: StateT, random: KeyedRandom) -> StateT:
-        """The state (`Pulses`, `CameraPair` or `Matches`) after this effect; `random` is the effect's own source."""
+        """The state (`Pulses`, `Beam`, `CameraPair` or `Matches`) after this effect; `random` is the effect's own source."""
         return state if self.is_null else self.evaluate(state, random)
 
     @abstractmethod
@@ -58,10 +59,15 @@ class Effect(Config, ABC):
 
 
 def apply_stage(effects: Sequence[Effect], stage: Stage, state: StateT, random: KeyedRandom) -> StateT:
-    """Apply the effects of one stage by rising `order`; each draws from a child of `random` named by its place in `effects`."""
-    chosen = [(position, effect) for position, effect in enumerate(effects) if effect.stage == stage]
-    for position, effect in sorted(chosen, key=lambda entry: entry[1].order):
-        state = effect.apply(state, random.child(effect.name, position))
+    """Apply the effects of one stage by rising `order`.
+
+    Each draws from a child of `random` named by its name and its number among the effects of that name, so that the other effects
+    of a config do not change its random numbers.
+    """
+    numbers: Counter[str] = Counter()
+    for effect in sorted((effect for effect in effects if effect.stage == stage), key=lambda effect: effect.order):
+        state = effect.apply(state, random.child(effect.name, numbers[effect.name]))
+        numbers[effect.name] += 1
     return state
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 from scene.backend import dr, mi
@@ -17,8 +16,7 @@ class RangeNoise(Effect):
     name: Literal["range_noise"] = "range_noise"
     sensor = "tls"
     stage = Stage.RANGE
-    sigma_m: float = parameter("standard deviation of the range", unit="m", source="datasheets", ge=0, le=10)
+    sigma_m: float = parameter("standard deviation of the range", unit="m", source="datasheets", typical=0.003, ge=0, le=10)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        noise = random.normals(state.index).x
-        return replace(state, range_m=state.range_m + dr.opaque(mi.Float64, self.sigma_m) * mi.Float64(noise))
+        return state.with_range_error(dr.opaque(mi.Float64, self.sigma_m) * mi.Float64(state.normals(random).x))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 from scene.backend import dr, mi
@@ -17,8 +16,8 @@ class RangeNoiseProportional(Effect):
     name: Literal["range_noise_proportional"] = "range_noise_proportional"
     sensor = "tls"
     stage = Stage.RANGE
-    ppm: float = parameter("standard deviation per range", unit="ppm", source="datasheets", ge=0, le=1e5)
+    ppm: float = parameter("standard deviation per range", unit="ppm", source="datasheets", typical=20.0, ge=0, le=1e5)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         sigma = dr.opaque(mi.Float64, self.ppm * 1e-6) * state.true_range
-        return replace(state, range_m=state.range_m + sigma * mi.Float64(random.normals(state.index).x))
+        return state.with_range_error(sigma * mi.Float64(state.normals(random).x))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 from scene.backend import dr, mi
@@ -17,7 +16,7 @@ class RangeOffset(Effect):
     name: Literal["range_offset"] = "range_offset"
     sensor = "tls"
     stage = Stage.RANGE
-    offset_m: float = parameter("recorded minus true range", unit="m", source="Lichti 2007, A0", ge=-100, le=100)
+    offset_m: float = parameter("recorded minus true range", unit="m", source="Lichti 2007, A0", typical=0.003, ge=-100, le=100)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        return replace(state, range_m=state.range_m + dr.opaque(mi.Float64, self.offset_m))
+        return state.with_range_error(dr.opaque(mi.Float64, self.offset_m))

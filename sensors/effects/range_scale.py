@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 from scene.backend import dr, mi
@@ -17,7 +16,9 @@ class RangeScale(Effect):
     name: Literal["range_scale"] = "range_scale"
     sensor = "tls"
     stage = Stage.RANGE
-    scale_ppm: float = parameter("recorded over true range, less one", unit="ppm", source="Lichti 2007, A1", ge=-1e5, le=1e5)
+    scale_ppm: float = parameter(
+        "recorded over true range, less one", unit="ppm", source="Lichti 2007, A1", typical=20.0, ge=-1e5, le=1e5
+    )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        return replace(state, range_m=state.range_m + dr.opaque(mi.Float64, self.scale_ppm * 1e-6) * state.true_range)
+        return state.with_range_error(dr.opaque(mi.Float64, self.scale_ppm * 1e-6) * state.true_range)

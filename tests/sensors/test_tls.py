@@ -154,7 +154,7 @@ def test_systematic_range_effects_add_their_equation(entry: dict[str, Any], erro
 
 @pytest.mark.parametrize("effect", TLS_EFFECTS, ids=lambda kind: kind.__name__)
 def test_an_effect_at_its_null_is_the_identity(effect: type) -> None:
-    pulses = Pulses(*[None] * 6)
+    pulses = Pulses(*[None] * 8)
     assert effect().is_null
     assert effect().apply(pulses, None) is pulses
 

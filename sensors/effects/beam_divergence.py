@@ -1,0 +1,52 @@
+"""The beam has a footprint: sub-rays that share its energy."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from scene.keyed_random import KeyedRandom
+from sensors.effects.base import Effect, Stage, parameter
+from sensors.footprint import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
+
+
+class BeamDivergence(Effect):
+    """A Gaussian beam of full divergence D (1/e^2), as sub-rays; which of a pulse's returns is recorded, and where (`footprint`).
+
+    Ranging by pulse: echoes closer than c tau / 2 run into one return at their centroid, weighted by power (mixed pixels); the
+    first return is recorded, the strongest, or the mean of all. Ranging by phase: all echoes add as phasors; the mode does not
+    matter. On a tilted plane the footprint is D R / cos i long, and the mean is the axis's range to second order in D. The block
+    label is that of the strongest echo in the return.
+    """
+
+    name: Literal["beam_divergence"] = "beam_divergence"
+    sensor = "tls"
+    stage = Stage.FOOTPRINT
+    divergence_rad: float = parameter(
+        "full divergence, 1/e^2", unit="rad", source="datasheets (mind their conventions)", typical=3e-4, ge=0, le=0.1
+    )
+    mode: Mode = Field("strongest", description="which of several returns is recorded: first, strongest, mean")
+    sub_rays: Literal[1, 7, 19, 37, 61, 91] = Field(19, description="sub-rays of a pulse")
+    pulse_width_s: float = parameter(
+        "pulse width tau: echoes closer than c tau / 2 are one return",
+        unit="s",
+        source="datasheets",
+        null=None,
+        default=3e-9,
+        gt=0,
+        le=1,
+    )
+    ranging: Ranging = Field("pulse", description="how the range is measured: pulse, phase")
+    modulation_wavelength_m: float = parameter(
+        "ranging by phase: the finest measuring wave", unit="m", source="Lichti 2007", null=None, default=1.2, ge=1e-3, le=1e4
+    )
+
+    def evaluate(self, state: Beam, random: KeyedRandom) -> Beam:
+        return Beam(
+            divergence_rad=self.divergence_rad,
+            sub_rays=self.sub_rays,
+            mode=self.mode,
+            separation_m=SPEED_OF_LIGHT_M_S * self.pulse_width_s / 2,
+            modulation_wavelength_m=self.modulation_wavelength_m if self.ranging == "phase" else None,
+        )

@@ -1,0 +1,30 @@
+"""Echoes too weak to be detected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from scene.backend import dr, mi
+from scene.keyed_random import KeyedRandom
+from sensors.effects.base import Effect, Stage, parameter
+from sensors.pulses import Pulses
+
+
+class DetectionLimit(Effect):
+    """No return where rho cos i / R^2 < minimum, relative to albedo 1, squarely hit, at 100 m (lidar range equation)."""
+
+    name: Literal["detection_limit"] = "detection_limit"
+    sensor = "tls"
+    stage = Stage.RETURN
+    minimum_power: float = parameter(
+        "smallest received power that is detected",
+        unit="1, relative to albedo 1 at 100 m",
+        source="range equation",
+        typical=0.1,
+        ge=0,
+        le=1e12,
+    )
+
+    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        return replace(state, returned=state.returned & (state.power >= dr.opaque(mi.Float32, self.minimum_power)))

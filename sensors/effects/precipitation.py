@@ -1,0 +1,46 @@
+"""Rain, snow or dust in the air."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from scene.backend import dr, mi
+from scene.keyed_random import KeyedRandom
+from scene.mesh import WALL
+from sensors.device import opaque
+from sensors.effects.base import Effect, Stage, parameter
+from sensors.pulses import Pulses
+
+
+class Precipitation(Effect):
+    """A return is lost with probability 1 - exp(-2 beta R); a share of the lost ones returns early, from a drop.
+
+    The drop's range r has the density exp(-2 beta r), normalised from the instrument's minimum range to R. An early return keeps
+    the pulse's range errors and its power (a drop's brightness is not modelled) and belongs to no block; pulses that hit nothing
+    do not return from drops.
+    """
+
+    name: Literal["precipitation"] = "precipitation"
+    sensor = "tls"
+    stage = Stage.RETURN
+    rate_per_m: float = parameter("extinction coefficient beta", unit="1/m", source="rain, dust, snow", typical=1e-4, ge=0, le=10)
+    early_share: float = parameter(
+        "share of the lost returns that a drop gives back", unit="1", source="empirical", null=None, default=0.1, ge=0, le=1
+    )
+
+    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        double_rate, early_share = opaque(2 * self.rate_per_m, self.early_share)
+        nearest: mi.Float64 = state.minimum_range
+        true_range: mi.Float64 = state.true_range
+        chance = mi.Array3f64(*(mi.Float64(number) for number in list(state.uniforms(random))[:3]))
+        lost = state.returned & (chance.x >= dr.exp(-double_rate * true_range))
+        early = lost & (chance.y < early_share)
+        within = 1 - dr.exp(-double_rate * (true_range - nearest))
+        drop = nearest - dr.log(1 - chance.z * within) / double_rate
+        return replace(
+            state,
+            range_m=dr.select(early, state.range_m + (drop - true_range), state.range_m),
+            block=dr.select(early, WALL, state.block),
+            returned=state.returned & (~lost | early),
+        )

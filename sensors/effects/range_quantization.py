@@ -1,0 +1,25 @@
+"""The smallest step in which ranges are counted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from scene.backend import dr, mi
+from scene.keyed_random import KeyedRandom
+from sensors.effects.base import Effect, Stage, parameter
+from sensors.pulses import Pulses
+
+
+class RangeQuantization(Effect):
+    """R to the nearest multiple of the step, after all other range effects: the counter reads what was timed, noise included."""
+
+    name: Literal["range_quantization"] = "range_quantization"
+    sensor = "tls"
+    stage = Stage.RANGE
+    order = 1
+    step_m: float = parameter("step of the recorded range", unit="m", source="datasheets", typical=0.001, ge=0, le=100)
+
+    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        step = dr.opaque(mi.Float64, self.step_m)
+        return replace(state, range_m=step * dr.round(state.range_m / step))
