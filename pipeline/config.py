@@ -14,6 +14,7 @@ from pipeline.formats.cameras import PairConfig, read_cameras_yaml
 from pipeline.formats.metashape import read_metashape
 from pipeline.mesh import SurfaceConfig
 from pipeline.overrides import apply_overrides
+from pipeline.planning.detectability import PlanningConfig
 from pipeline.presets import is_path, with_preset
 from pipeline.register import IcpConfig
 from pipeline.tiles import TileConfig
@@ -107,6 +108,7 @@ class SimulationConfig(Config):
     annotation: AnnotationConfig = AnnotationConfig()
     tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")
     products: ProductsConfig = ProductsConfig()
+    planning: PlanningConfig = PlanningConfig()
 
     @model_validator(mode="before")
     @classmethod
@@ -137,6 +139,10 @@ class SimulationConfig(Config):
             raise ValueError("holds two models of one sensor")
         return models
 
+    def sensor_names(self) -> tuple[SensorName, ...]:
+        """The sensors that the config has a model of; both where it has none, as then all is default."""
+        return tuple(model.sensor for model in self.sensor) or ("stereo", "tls")
+
     def stereo_model(self) -> StereoModel:
         return next((model for model in self.sensor if isinstance(model, StereoModel)), StereoModel())
 
@@ -148,11 +154,11 @@ class SimulationConfig(Config):
         return self.cameras.place(target) if isinstance(self.cameras, RigConfig) else self.cameras.pair()
 
 
-def load_config(path: Path, overrides: Sequence[str], sensor: SensorName, seed: int | None) -> SimulationConfig:
+def load_config(path: Path, overrides: Sequence[str], sensor: SensorName | None, seed: int | None) -> SimulationConfig:
     """Read a config file, apply `--set` overrides and the seed; paths in the file are relative to its folder.
 
     A bare sensor model (model.yaml, model_after.yaml: its `sensor` is a word) is a config of which all else is default. Raises
-    InputError for whatever is wrong, and where the config's only models are of another sensor than `sensor`.
+    InputError for whatever is wrong, and where the config's only models are of another sensor than `sensor` (None: any).
     """
     values = load_yaml(path)
     values = {} if values is None else values
@@ -166,7 +172,7 @@ def load_config(path: Path, overrides: Sequence[str], sensor: SensorName, seed: 
     if seed is not None:
         values["seed"] = seed
     config = parse(SimulationConfig, values, str(path))
-    if values.get("sensor") and sensor not in {model.sensor for model in config.sensor}:
+    if values.get("sensor") and sensor is not None and sensor not in {model.sensor for model in config.sensor}:
         raise InputError(
             f"the only sensor model is of '{config.sensor[0].sensor}', and --sensor is {sensor}",
             where=f"{path}: sensor",
