@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from scene.backend import dr, mi
 from scene.mesh import FloatArray
 
@@ -19,3 +21,8 @@ def vector(values: FloatArray) -> mi.Array3f64:
 def rotated(matrix: FloatArray, vectors: mi.Array3f64) -> mi.Array3f64:
     """`matrix` ((3, 3) NumPy) times the 3 x (n,) device vectors."""
     return mi.Array3f64(*(dr.dot(vector(row), vectors) for row in matrix))
+
+
+def bounded(value: Any, low: Any, high: Any) -> Any:
+    """`value` between `low` and `high`, a device array of any type (dr.clip's minimum aborts in LLVM 15)."""
+    return dr.select(value < low, low, dr.select(value > high, high, value))

@@ -1,0 +1,156 @@
+"""The stereo sensor with real matching: photographs of the rock, matched by OpenCV, in place of simulated disparities.
+
+1  The real pair (nominal calibration plus camera effects) photographs the scene, rendered by ray casting in Mitsuba: textured
+   rock, sun and shadows, sky, sensor noise, 8 bits, one pixel per cell of the depth map. Effects on image rows displace them.
+2  Both pictures are resampled with the nominal calibration to rows that are epipolar lines.
+3  Semi-global matching in tiles with a left-right check, then least-squares matching against the pixel locking.
+4  The disparities are read at the depth map's cells and reprojected with the nominal calibration, as simulated ones are.
+Effects on the matching do not apply: the matcher makes its own errors. The depth range that is searched is that of the visible
+surface and a margin, as a photogrammetric package knows it from its tie points. A vertical parallax, where real and nominal
+calibration differ, disturbs the matching as it would in reality.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from scene.backend import dr, mi
+from scene.errors import InputError
+from scene.illumination import IlluminationConfig
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from scene.texture import RockTexture
+from sensors.camera import Camera, CameraPair
+from sensors.device import vector
+from sensors.effects.base import Effect, Stage, apply_stage
+from sensors.exposure import ExposureConfig, Photograph, Radiance, Studio, expose, full_scale
+from sensors.matches import Matches
+from sensors.matching import MatchingConfig, SearchRange, match
+from sensors.observation import Observation
+from sensors.rectified import Disparity, RectifiedGrid
+from sensors.rectify import Rectification, rectify
+from sensors.refinement import refine
+from sensors.stereo import REDUCTION, StereoPair, _exposed, _rectified, _view, reproject
+
+STEP_PX = 1.0
+"""Difference of neighbouring disparities beyond which a cell between them takes the nearest one instead of a mean."""
+
+
+@dataclass(frozen=True)
+class MatchedStereoPair:
+    """A calibrated pair whose photographs are matched. pair: cameras, wall frame, model and quality; texture: the rock's.
+
+    Raises InputError at once where the model names an effect on the matching.
+    """
+
+    pair: StereoPair
+    texture: RockTexture
+    illumination: IlluminationConfig
+    exposure: ExposureConfig
+    matching: MatchingConfig
+
+    def __post_init__(self) -> None:
+        named = [effect.name for effect in self.pair.model.effects if effect.stage == Stage.MATCH and not effect.is_null]
+        if named:
+            raise InputError(
+                f"acts on simulated matching, and the matcher is real: {', '.join(named)}",
+                where="sensor.effects",
+                remedy="leave it out, or take matcher: simulated",
+            )
+
+    def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
+        """One depth map, as `StereoPair.observe` returns it; `block` and the truth are what the left pixel really sees."""
+        effects = self.pair.model.chain(random)
+        nominal = self.pair.cameras.in_wall_frame(self.pair.frame)
+        real = self.pair._real(effects, random).in_wall_frame(self.pair.frame)
+        geometry, step = rectify(nominal), REDUCTION[self.pair.quality]
+        index, u, v = self.pair._cells()
+        hits, point = _view(scene, real.left, u - _exposed(effects, "left", v, random), v)
+        true_z = _depth(point, nominal.left, geometry)
+        dr.eval(hits, true_z)
+        search_m = _range(true_z, hits.valid)
+        photographs = self.photograph(scene, real, effects, random)
+        grid = RectifiedGrid.cover(nominal, geometry, step)
+        disparity = self.matched(photographs, grid, search_m)
+        left_u, left_v = _rectified(nominal.left, geometry.left, u, v, geometry.f, geometry.u_left, geometry.v)
+        found = _sampled(disparity, *grid.cells(left_u, left_v))
+        full_px = (mi.Float64(found) + grid.disparity_offset) * step
+        seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
+        matches = Matches(index, u, v, full_px, ~dr.isnan(found), *seen, nominal.left.width, nominal.left.height, step)
+        matches = apply_stage(effects, Stage.FILL, matches, random)
+        return self.pair._observation(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
+
+    def photograph(
+        self, scene: RayCaster, real: CameraPair, effects: tuple[Effect, ...], random: KeyedRandom
+    ) -> tuple[Photograph, Photograph]:
+        """The left and the right photograph by the real cameras (wall frame), exposed alike."""
+        step = REDUCTION[self.pair.quality]
+        distance = np.linalg.norm(scene.mesh.bounds.mean(axis=0) - real.left.position)
+        light = self.illumination.in_wall_frame(self.pair.frame)
+        studio = Studio(scene, light, self.texture, float(distance * step / self.pair.cameras.left.f_px))
+
+        def picture(side: Literal["left", "right"], camera: Camera) -> Radiance:
+            return studio.radiance(camera, step, self.exposure.samples_per_side, lambda v: _exposed(effects, side, v, random))
+
+        pictures = picture("left", real.left), picture("right", real.right)
+        white = full_scale(*pictures)
+        left, right = (
+            expose(one, white, step, self.exposure, random.child("photograph", side))
+            for one, side in zip(pictures, ("left", "right"), strict=True)
+        )
+        return left, right
+
+    def matched(
+        self, photographs: tuple[Photograph, Photograph], grid: RectifiedGrid, depths_m: tuple[float, float]
+    ) -> Disparity:
+        """(h, w) disparities of the left rectified grid, cells, without the grid's offset; depths_m: nearest and farthest."""
+        margin, geometry, config = self.matching.depth_margin_m, grid.geometry, self.matching
+        reach = max(depths_m[0] - margin, depths_m[0] / 2), depths_m[1] + margin
+        far, near = (
+            (geometry.f * geometry.base_m / z + geometry.offset) / grid.step - grid.disparity_offset for z in reach[::-1]
+        )
+        left, right = grid.left(photographs[0].image), grid.right(photographs[1].image)
+        coarse = match(left, right, SearchRange.between(far, near), config)
+        return coarse if config.refinement is None else refine(left, right, coarse, config.refinement)
+
+
+def _depth(point: mi.Array3f64, left: Camera, geometry: Rectification) -> mi.Float64:
+    """(n,) depth of 3 x (n,) points (wall frame) along the rectified left camera's axis, m."""
+    axis: FloatArray = left.rotation @ geometry.left.T[:, 2]
+    return dr.dot(vector(axis), point - vector(left.position))
+
+
+def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
+    """Nearest and farthest depth, m. Raises InputError where nothing is seen."""
+    values = depth.numpy()[valid.numpy()]
+    values = values[values > 0]
+    if values.size == 0:
+        raise InputError(
+            "no part of the wall is seen by the left camera",
+            where="cameras",
+            remedy="check positions and rotations (camera to world; x right, y down, z forward)",
+        )
+    return float(values.min()), float(values.max())
+
+
+def _sampled(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
+    """(n,) disparities at fractional columns and rows: bilinear on one surface, the nearest cell's at a depth step."""
+    height, width = disparity.shape
+    values = mi.Float32(disparity.ravel())
+    columns, rows = dr.opaque(mi.Int32, width), dr.opaque(mi.Int32, height)
+    left, top = mi.Int32(dr.floor(column)), mi.Int32(dr.floor(row))
+    inside = (left >= 0) & (top >= 0) & (left + 1 < columns) & (top + 1 < rows)
+    across, down = mi.Float32(column - left), mi.Float32(row - top)
+    corner = top * columns + left
+    a, b, c, d = (dr.gather(mi.Float32, values, corner + offset, inside) for offset in (0, 1, columns, columns + 1))
+    mean = dr.lerp(dr.lerp(a, b, across), dr.lerp(c, d, across), down)
+    upper, lower = dr.select(across < 0.5, a, b), dr.select(across < 0.5, c, d)
+    nearest = dr.select(down < 0.5, upper, lower)
+    smooth = dr.full(mi.Bool, True, dr.width(mean))
+    for cell in (a, b, c, d):
+        smooth &= dr.abs(cell - mean) < STEP_PX
+    return dr.select(inside, dr.select(smooth, mean, nearest), np.nan)
