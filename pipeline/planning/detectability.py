@@ -7,12 +7,14 @@ otherwise). Two epochs are compared over the floor of the niche, along its norma
     detected where   D > LoD = z (se^ + reg),   se^ = sqrt(s1^2/n1 + s2^2/n2),   z = 1.96
 
 1  Points. The sensor's rays meet the surface in a lattice with steps a and b, so that a patch of w_a x w_b holds N = N_a N_b
-   points, N_a = floor(w_a/a) or one more; the latter with probability frac(w_a/a), for a place that owes nothing to the lattice. The
-   mean is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. Fewer than `minimum_points` make no test.
-2  Shadow. Seen along a direction with the tangents t_a, t_b against the normal, the niche's rim hides h t_a and h t_b of its floor;
-   several viewpoints hide on both sides: w_a = s - h (max(0, t_a...) - min(0, t_a...)). Both epochs are compared over what is left.
-3  Noise. A point's error along the normal has a white part of variance w^2 and, for stereo, a smooth part c^2, of which the patch's
-   mean keeps c_m^2 and shows c^2 - c_m^2 as spread. With sigma^2 = w^2 + c^2 - c_m^2 and the registration's error ~ N(0, reg^2):
+   points, N_a = floor(w_a/a) or one more; the latter with probability frac(w_a/a), for a place that owes nothing to the lattice.
+   The mean is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. Fewer than `minimum_points` make no test.
+2  Shadow. Seen along a direction with the tangents t_a, t_b against the normal, the niche's rim hides h t_a and h t_b of its
+   floor; several viewpoints hide on both sides: w_a = s - h (max(0, t_a...) - min(0, t_a...)). Both epochs are compared over what
+   is left.
+3  Noise. A point's error along the normal has a white part of variance w^2 and, for stereo, a smooth part c^2, of which the
+   patch's mean keeps c_m^2 and shows c^2 - c_m^2 as spread. With sigma^2 = w^2 + c^2 - c_m^2 and the registration's error
+   ~ N(0, reg^2):
        D ~ N(h, tau^2),  tau^2 = 2 w^2/N + 2 c_m^2 + reg^2,      se^2 = 2 sigma^2/N
 4  Test. s1, s2 are estimates from the same points, so (D - z reg)/se^ times se/tau is noncentral t with nu = 2 (N - 1) and
    delta = (h - z reg)/tau:
@@ -66,9 +68,9 @@ class PlanningConfig(Config):
 class Sampling:
     """What a sensor puts on n places of a surface; all (n,) or numbers.
 
-    step_a, step_b: of the lattice of points on the surface, along two perpendicular directions, m; shadow_a, shadow_b: hidden width
-    of a niche's floor over its depth; white: standard deviation of a point along the normal, m; smooth: of a smooth error whose
-    nodes are grain_a, grain_b apart, averaged over places, m.
+    step_a, step_b: of the lattice of points on the surface, along two perpendicular directions, m; shadow_a, shadow_b: hidden
+    width of a niche's floor over its depth; white: standard deviation of a point along the normal, m; smooth: of a smooth error
+    whose nodes are grain_a, grain_b apart, averaged over places, m.
     """
 
     step_a: FloatArray

@@ -6,7 +6,8 @@ Equal arguments give equal bytes. Colours can be told apart by colour-blind read
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,6 +29,8 @@ _DPI = 150
 _MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.6, 9.0
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.7, 1.25, 0.6, 0.4
 _OUTSIDE, _INSIDE = "#0072B2", "#D55E00"
+_FAMILY = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+"""Okabe and Ito's colours for families of curves."""
 _NO_DATA, _NO_DATA_HILLSHADE = "#b5b5b5", "#c9dced"
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
 """Towards the light: from the upper left, 45 degrees above the wall's plane."""
@@ -35,6 +38,7 @@ _BINS = 120
 _COLOURS = colormaps["RdBu_r"].resampled(49)
 """In steps of a quarter of a sigma, which cannot be told apart by eye and make a smaller file."""
 _GREYS = colormaps["gray"].resampled(64)
+_SEQUENTIAL = colormaps["viridis"].resampled(48)
 
 
 class Iteration(Protocol):
@@ -46,6 +50,17 @@ class Iteration(Protocol):
     def inliers(self) -> int: ...
     @property
     def points(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class CurvePanel:
+    """One family of curves. x: (k,); curves: by name, shares in 0 .. 1, (k,); at: where the set-up is."""
+
+    label: str
+    x: NDArray[np.floating]
+    at: float
+    curves: Mapping[str, NDArray[np.floating]]
+    logarithmic: bool = False
 
 
 def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "") -> bytes:
@@ -76,6 +91,43 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
         axes.contour(inside, levels=[0.5], colors="black", linewidths=0.6, origin="upper", extent=extent)
     _colour_bar(figure, axes, image, sigma_m * 1e3)
     _no_data_legend(axes, values, _NO_DATA, "outline: block" if inside.any() else "")
+    return _png(figure)
+
+
+def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str = "") -> bytes:
+    """Any quantity (h, w) over the wall, NaN without data, in the unit of `label`; colours span its 1 to 99 % quantiles."""
+    pooled = _mean_pooled(values, _pooling(grid))
+    known = pooled[np.isfinite(pooled)]
+    low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
+    margin = max(1e-3 * abs(low), 1e-12) if high - low <= 1e-6 * abs(high) else 0.0
+    figure, axes = _map_figure(grid, title)
+    axes.set_facecolor(_NO_DATA)
+    extent = _extent(grid, pooled.shape)
+    image = axes.imshow(pooled, cmap=_SEQUENTIAL, vmin=low - margin, vmax=high + margin, extent=extent, interpolation="nearest")
+    bar = figure.colorbar(
+        image, cax=_beside(figure, axes), extend="both" if known.size and np.ptp(known) > high - low else "neither"
+    )
+    bar.ax.tick_params(labelsize=8)
+    bar.set_label(label, fontsize=9)
+    _no_data_legend(axes, pooled, _NO_DATA)
+    return _png(figure)
+
+
+def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -> bytes:
+    """Families of curves side by side, all in per cent; a dashed line marks where the set-up is."""
+    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.0), dpi=_DPI, layout="constrained")
+    figure.suptitle(title, fontsize=11)
+    row = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
+    for axes, panel in zip(row, panels, strict=True):
+        for colour, (name, values) in zip(_FAMILY * len(panel.curves), panel.curves.items(), strict=False):
+            axes.plot(panel.x, 100 * np.asarray(values), color=colour, linewidth=1.5, label=name)
+        axes.axvline(panel.at, color="0.3", linewidth=0.8, linestyle="--", label="this set-up")
+        axes.set_xscale("log" if panel.logarithmic else "linear")
+        axes.set_ylim(-2, 102)
+        _dress(axes, panel.label, y_label)
+        axes.label_outer()
+        axes.grid(color="0.9", linewidth=0.6)
+    figure.legend(*row[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9, frameon=False)
     return _png(figure)
 
 
@@ -169,11 +221,15 @@ def _dress(axes: Axes, x_label: str, y_label: str) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _colour_bar(figure: Figure, axes: Axes, image: Any, sigma_mm: float) -> None:
+def _beside(figure: Figure, axes: Axes) -> Axes:
+    """The place of a colour bar at the right of a map."""
     box = axes.get_position()
-    place = figure.add_axes((box.x1 + 0.15 / figure.get_figwidth(), box.y0, 0.16 / figure.get_figwidth(), box.height))
+    return figure.add_axes((box.x1 + 0.15 / figure.get_figwidth(), box.y0, 0.16 / figure.get_figwidth(), box.height))
+
+
+def _colour_bar(figure: Figure, axes: Axes, image: Any, sigma_mm: float) -> None:
     ticks = sigma_mm * np.arange(-SCALE_SIGMAS, SCALE_SIGMAS + 1, 2)
-    bar = figure.colorbar(image, cax=place, extend="both", ticks=ticks)
+    bar = figure.colorbar(image, cax=_beside(figure, axes), extend="both", ticks=ticks)
     digits = max(0, int(np.ceil(-np.log10(sigma_mm))) + 1)
     bar.ax.set_yticklabels([_signed(tick, digits) for tick in ticks], fontsize=8)
     bar.set_label(f"reference minus epoch, mm; a tick is 2 $\\sigma$, $\\sigma$ = {sigma_mm:.3g} mm", fontsize=9)

@@ -111,12 +111,14 @@ class RunReport:
 def write_report(path: Path, report: RunReport) -> None:
     """Write report.html, whole or not at all; equal arguments give equal bytes. Raises InputError where it cannot be written."""
     config = yaml.safe_dump(dict(report.config), sort_keys=False, allow_unicode=True)
-    page = _template().render(report=report, config=config, scale_sigmas=SCALE_SIGMAS, unfolded_rows=_UNFOLDED_ROWS)
+    values = {"report": report, "config": config, "scale_sigmas": SCALE_SIGMAS, "unfolded_rows": _UNFOLDED_ROWS}
+    page = template("page.html.jinja").render(values)
     write_text(path, page)
 
 
 @cache
-def _template() -> jinja2.Template:
+def template(name: str) -> jinja2.Template:
+    """A template of this folder, with the filters that reports share; `{% include "style.css" %}` gives it their look."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -125,7 +127,7 @@ def _template() -> jinja2.Template:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters |= {"mm": _mm, "metres": _metres, "volume": _volume, "percent": _percent, "picture": _picture}
-    return environment.get_template("page.html.jinja")
+    return environment.get_template(name)
 
 
 def _picture(png: bytes) -> str:

@@ -1,0 +1,43 @@
+"""`scarpsim inspect`: what a planned set-up promises, before anything is simulated."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from pipeline.cli.parser import at_least, one_of
+
+SUMMARY = "map what a planned set-up promises: precision, spacing, blind spots, smallest block"
+EXAMPLE = """  scarpsim inspect my_site.yaml
+  scarpsim inspect my_site.yaml --sensor tls --set station.distance_m=100 --set planning.block_size_m=[0.2] --out plans/100m"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="config file, as `scarpsim init` writes it")
+    parser.add_argument(
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="the one to inspect (default: those of the config)"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for maps and report (default: a new one under runs/)")
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of a wall made by rule (default: the config's)")
+    parser.add_argument(
+        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
+    )
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from pipeline.cli.simulate import new_folder
+    from pipeline.config import load_config
+    from pipeline.planning.inspect import inspect, write_plans
+    from pipeline.report.plan import summary
+
+    config = load_config(arguments.config, arguments.overrides, arguments.sensor, arguments.seed)
+    sensors = [arguments.sensor] if arguments.sensor else config.sensor_names()
+    plans = inspect(config, sensors)
+    report = write_plans(arguments.out or new_folder(Path("runs"), "inspect"), config, plans)
+    if arguments.json:
+        print(json.dumps({"report": str(report), "plans": [plan.to_dict() for plan in plans]}, indent=2))
+    else:
+        print("\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]))
+    return 0

@@ -1,0 +1,48 @@
+"""The folder that `scarpsim inspect` fills: maps as GeoTIFF, plan.json and report.html."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import SensorName, SimulationConfig
+from pipeline.formats.atomic import write_json
+from pipeline.formats.geotiff import write_geotiff
+from pipeline.planning.maps import Plan, plan
+from pipeline.provenance import versions
+from pipeline.report.plan import write_plan_report
+from pipeline.site import prepare_site
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+
+PLAN_FILE = "plan.json"
+
+
+def inspect(config: SimulationConfig, sensors: Sequence[SensorName]) -> list[Plan]:
+    """What each sensor promises on the config's wall; nothing is simulated."""
+    return [plan(config, prepare_site(config, sensor, KeyedRandom(config.seed))) for sensor in sensors]
+
+
+def write_plans(out: Path, config: SimulationConfig, plans: Sequence[Plan]) -> Path:
+    """Write maps (<sensor>_<map>.tif, SI, wall frame), plan.json and report.html; returns the report's path.
+
+    Raises InputError where the folder is in use.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
+    for each in plans:
+        for found in each.maps:
+            path = out / f"{each.sensor}_{found.name}.tif"
+            write_geotiff(path, each.raster.image(found.values), each.raster.grid, description=found.title)
+    record: dict[str, Any] = {
+        "schema": 1,
+        "seed": config.seed,
+        "plans": [each.to_dict() for each in plans],
+        "config": config.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    write_json(out / PLAN_FILE, record)
+    report = out / "report.html"
+    write_plan_report(report, plans, config.model_dump(mode="json"))
+    return report

@@ -1,0 +1,299 @@
+"""The maps and figures of a planned set-up: one sensor in front of one wall, before anything is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.config import SimulationConfig
+from pipeline.planning import stereo_geometry as stereo
+from pipeline.planning import tls_geometry as tls
+from pipeline.planning.detectability import PlanningConfig, Sampling, detection_probability, smallest_block
+from pipeline.planning.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
+from pipeline.site import Site
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from sensors.rectify import rectify
+from sensors.stereo import REDUCTION, StereoPair
+from sensors.tls import LaserScanner
+
+_MIDDLE_SHARE = 0.1
+"""The middle of the wall are the places within this share of its smaller side from the middle of its extent."""
+_CURVE_POINTS = 80
+
+
+@dataclass(frozen=True)
+class PlanMap:
+    """One quantity over the wall. name: of its file, with the SI unit; title, unit, factor: to show it, unit = factor * SI;
+    values: (n,) of the raster's places, NaN where it has no meaning."""
+
+    name: str
+    title: str
+    values: FloatArray
+    unit: str = ""
+    factor: float = 1.0
+
+    def summary(self, middle: BoolArray) -> dict[str, float | None]:
+        """Median in the middle of the wall, and median and 5 and 95 % quantiles over all of it, SI; None where there are none."""
+        values, centre = self.values[np.isfinite(self.values)], self.values[middle & np.isfinite(self.values)]
+        low, median, high = np.quantile(values, [0.05, 0.5, 0.95]).tolist() if values.size else (None, None, None)
+        return {
+            "middle": float(np.median(centre)) if centre.size else None,
+            "median": median,
+            "quantile_5": low,
+            "quantile_95": high,
+        }
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Detection probability against one quantity, all else as in the middle of the wall. x, at: (k,) and the set-up's own value,
+    in the label's unit; probability: by the block's side, m, (k,)."""
+
+    label: str
+    x: FloatArray
+    at: float
+    probability: dict[float, FloatArray]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sensor promises on a wall. figures: single numbers, SI, by name; curves: detection probability; ignored: effects of
+    the model that a plan does not count."""
+
+    sensor: str
+    wall: str
+    raster: WallRaster
+    maps: list[PlanMap]
+    figures: dict[str, float]
+    curves: list[Curve]
+    ignored: list[str]
+    config: PlanningConfig
+
+    def middle(self) -> BoolArray:
+        """(n,) the places in the middle of the wall."""
+        points = self.raster.places.points[:, :2]
+        low, high = points.min(axis=0), points.max(axis=0)
+        return np.hypot(*(points - (low + high) / 2).T) <= _MIDDLE_SHARE * (high - low).min()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the maps' pixels, for JSON."""
+        middle = self.middle()
+        return {
+            "sensor": self.sensor,
+            "wall": self.wall,
+            "figures": self.figures,
+            "maps": {each.name: each.summary(middle) for each in self.maps},
+            "curves": [
+                {
+                    "against": curve.label,
+                    "x": curve.x.tolist(),
+                    "set_up": curve.at,
+                    "probability": {f"{size:g}": values.tolist() for size, values in curve.probability.items()},
+                }
+                for curve in self.curves
+            ],
+            "effects_not_counted": self.ignored,
+            "planning": self.config.model_dump(),
+        }
+
+
+def plan(config: SimulationConfig, site: Site) -> Plan:
+    """Map what the sensor of `site` promises; raises InputError where it sees nothing of the wall."""
+    caster = RayCaster(site.mesh)
+    raster = wall_raster(caster, config.planning.gsd_m)
+    if isinstance(site.sensor, StereoPair):
+        return _stereo_plan(site.name, site.sensor, caster, raster, config.planning)
+    if isinstance(site.sensor, LaserScanner):
+        return _tls_plan(site.name, site.sensor, caster, raster, config.planning)
+    raise TypeError(f"no plan for a {type(site.sensor).__name__}")
+
+
+def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRaster, config: PlanningConfig) -> Plan:
+    places, nominal = raster.places, pair.cameras.in_wall_frame(pair.frame)
+    found = stereo.stereo_geometry(pair, places, config.image_sigma_px)
+    left = found.in_left & seen_from(caster, places, nominal.left.position)
+    right = found.in_right & seen_from(caster, places, nominal.right.position)
+    both = left & right
+    _require_seen(both, "no part of the wall is seen by both cameras", "cameras")
+    sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
+    orientation = np.sqrt(np.einsum("nii->ni", found.orientation_covariance))
+    maps = [
+        PlanMap("views", "Cameras that see the wall", left.astype(float) + right, "cameras"),
+        _map("gsd_m", "GSD of the frame, on the surface", found.gsd_m, both, "mm", 1e3),
+        _map("cell_m", "GSD of the depth map, on the surface", found.cell_m, both, "mm", 1e3),
+        _map("base_to_distance", "Base over distance", found.base_to_distance, both),
+        _map("convergence_rad", "Convergence angle", found.convergence_rad, both, "deg", np.degrees(1)),
+        _map("incidence_rad", "Angle of incidence, the larger of both", found.incidence_rad, both, "deg", np.degrees(1)),
+        *(
+            _map(f"sigma_{axis}_m", f"Standard deviation in {axis}", sigma[:, row], both, "mm", 1e3)
+            for row, axis in enumerate("xyz")
+        ),
+        _map("normal_sigma_m", "Standard deviation along the surface's normal", found.normal_sigma_m, both, "mm", 1e3),
+        *_if_any(_map("orientation_sigma_z_m", "Standard deviation in z by the orientation", orientation[:, 2], both, "mm", 1e3)),
+        *_detection_maps(found.sampling, both, config),
+    ]
+    noise = stereo.DisparityNoise.of(pair.model.chain(KeyedRandom(0)))
+    in_both = found.in_left & found.in_right
+    figures = {
+        "seen_by_both": float(both.mean()),
+        "seen_by_one": float((left ^ right).mean()),
+        "seen_by_none": float((~left & ~right).mean()),
+        "overlap": float(in_both.sum() / max((found.in_left | found.in_right).sum(), 1)),
+        "base_m": nominal.base_m,
+        "disparity_sigma_px": float(np.hypot(noise.white, noise.smooth)),
+        "normal_case_sigma_z_m": _normal_case(pair, found.distance_m[both], noise),
+    }
+    views = _middle_views(raster, both, (nominal.left.position + nominal.right.position) / 2, nominal.left.rotation[:, 1])
+
+    def sampling_of(virtual: Places) -> tuple[Sampling, BoolArray]:
+        geometry = stereo.stereo_geometry(pair, virtual, config.image_sigma_px)
+        return geometry.sampling, geometry.in_left & geometry.in_right
+
+    curves = _curves(sampling_of, views, config, ("depth map's cell, px of the frame", float(REDUCTION[pair.quality])))
+    ignored = _ignored(effect.name for effect in pair.model.effects if effect.name not in stereo.COUNTED)
+    return Plan("stereo", wall, raster, maps, figures, curves, ignored, config)
+
+
+def _tls_plan(wall: str, scanner: LaserScanner, caster: RayCaster, raster: WallRaster, config: PlanningConfig) -> Plan:
+    places = raster.places
+    found = tls.tls_geometry(scanner, places)
+    in_sight = seen_from(caster, places, scanner.position)
+    seen = in_sight & found.reached
+    _require_seen(seen, "no part of the wall is seen by the scanner", "station")
+    sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
+    maps = [
+        PlanMap("views", "Scanners that see the wall", seen.astype(float), "scanners"),
+        _map("range_m", "Range", found.range_m, seen, "m"),
+        _map("incidence_rad", "Angle of incidence", found.incidence_rad, seen, "deg", np.degrees(1)),
+        _map("spacing_line_m", "Point spacing from line to line (azimuth)", found.spacing_line_m, seen, "mm", 1e3),
+        _map("spacing_pulse_m", "Point spacing along a line (zenith)", found.spacing_pulse_m, seen, "mm", 1e3),
+        *_if_any(_map("footprint_m", "Footprint's diameter, across the beam", found.footprint_m, seen, "mm", 1e3)),
+        *_if_any(_map("footprint_long_m", "Footprint's longest extent on the surface", found.footprint_long_m, seen, "mm", 1e3)),
+        _map("range_sigma_m", "Standard deviation along the beam", found.range_sigma_m, seen, "mm", 1e3),
+        _map("azimuth_sigma_m", "Standard deviation across the beam, azimuth", found.azimuth_sigma_m, seen, "mm", 1e3),
+        _map("zenith_sigma_m", "Standard deviation across the beam, zenith", found.zenith_sigma_m, seen, "mm", 1e3),
+        *(
+            _map(f"sigma_{axis}_m", f"Standard deviation in {axis}", sigma[:, row], seen, "mm", 1e3)
+            for row, axis in enumerate("xyz")
+        ),
+        _map("normal_sigma_m", "Standard deviation along the surface's normal", found.normal_sigma_m, seen, "mm", 1e3),
+        _map("power", "Received power over that of albedo 1 at 100 m", found.power, seen),
+        *_detection_maps(found.sampling, seen, config),
+    ]
+    figures = {
+        "seen": float(seen.mean()),
+        "hidden": float((~in_sight).mean()),
+        "beyond_window_or_reach": float((in_sight & ~seen).mean()),
+        "pulses": float(scanner.pattern.lines * scanner.pattern.pulses),
+        "seconds_to_scan": scanner.pattern.lines * scanner.pattern.pulses / scanner.config.pulse_rate_hz,
+    }
+
+    def sampling_of(virtual: Places) -> tuple[Sampling, BoolArray]:
+        geometry = tls.tls_geometry(scanner, virtual)
+        return geometry.sampling, geometry.reached
+
+    step = float(np.sqrt(scanner.pattern.azimuth_step * scanner.pattern.zenith_step))
+    views = _middle_views(raster, seen, scanner.position, scanner.rotation[:, 2])
+    curves = _curves(sampling_of, views, config, ("angular step, mrad", step * 1e3))
+    ignored = _ignored(effect.name for effect in scanner.model.effects if effect.name not in tls.COUNTED)
+    return Plan("tls", wall, raster, maps, figures, curves, ignored, config)
+
+
+def _ignored(names: Any) -> list[str]:
+    return sorted(set(names))
+
+
+def _require_seen(seen: BoolArray, problem: str, where: str) -> None:
+    if not seen.any():
+        raise InputError(problem, where=where, remedy="check positions, rotations and window, and which side faces the wall")
+
+
+def _map(name: str, title: str, values: FloatArray, seen: BoolArray, unit: str = "", factor: float = 1.0) -> PlanMap:
+    return PlanMap(name, title, np.where(seen, values, np.nan), unit, factor)
+
+
+def _if_any(found: PlanMap) -> list[PlanMap]:
+    """A map in a list, or none where it is zero all over because the model has no such thing."""
+    return [found] if np.nanmax(found.values) > 0 else []
+
+
+def _detection_maps(sampling: Sampling, seen: BoolArray, config: PlanningConfig) -> list[PlanMap]:
+    title = f"Smallest block seen in {config.probability:.0%} of cases"
+    maps = [_map("smallest_block_m", title, smallest_block(sampling, config), seen, "cm", 100.0)]
+    for size in config.block_size_m:
+        probability = np.where(seen, detection_probability(sampling, size, config), 0.0)
+        maps.append(
+            PlanMap(f"probability_{size * 1e3:.0f}mm", f"Probability to see a block of {size:g} m", probability, "%", 100.0)
+        )
+    return maps
+
+
+def _normal_case(pair: StereoPair, distance: FloatArray, noise: stereo.DisparityNoise) -> float:
+    """sigma_Z = Z^2 / (c B) sigma_p at the median distance, m, as a check by a rule of thumb."""
+    return float(np.median(distance) ** 2 / (rectify(pair.cameras).f * pair.cameras.base_m) * np.hypot(noise.white, noise.smooth))
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Squarely or obliquely hit planes in the direction of the middle of the wall. upright: (3,) the axis by which they turn."""
+
+    viewpoint: FloatArray
+    towards: FloatArray
+    upright: FloatArray
+    range_m: float
+    incidence_rad: float
+    albedo: float
+
+    def places(self, range_m: FloatArray, incidence_rad: FloatArray) -> Places:
+        """Planes at these ranges and angles of incidence, (k,) each."""
+        back = -np.broadcast_to(self.towards, (len(range_m), 3))
+        sideways = np.cross(self.upright, self.towards)
+        sideways = sideways / np.linalg.norm(sideways)
+        normals = np.cos(incidence_rad)[:, None] * back + np.sin(incidence_rad)[:, None] * sideways
+        return Places(self.viewpoint + range_m[:, None] * self.towards, normals, np.full(len(range_m), self.albedo))
+
+
+def _middle_views(raster: WallRaster, seen: BoolArray, viewpoint: FloatArray, upright: FloatArray) -> _Views:
+    """The middle of the wall: median range and incidence of the tenth of the seen places that are nearest to it."""
+    points = raster.places.points[seen]
+    middle = (raster.places.points.min(axis=0) + raster.places.points.max(axis=0)) / 2
+    near = np.argsort(np.hypot(*(points - middle)[:, :2].T), kind="stable")[: max(len(points) // 10, 1)]
+    sight = points[near] - viewpoint
+    distance = np.linalg.norm(sight, axis=1)
+    cosine = -np.einsum("ni,ni->n", sight, raster.places.normals[seen][near]) / distance
+    towards = sight.mean(axis=0) / np.linalg.norm(sight.mean(axis=0))
+    incidence, albedo = float(np.arccos(np.clip(np.median(cosine), -1, 1))), float(np.median(raster.places.albedo[seen][near]))
+    return _Views(viewpoint, towards, upright, float(np.median(distance)), incidence, albedo)
+
+
+def _curves(
+    sampling_of: Callable[[Places], tuple[Sampling, BoolArray]], view: _Views, config: PlanningConfig, step: tuple[str, float]
+) -> list[Curve]:
+    """Detection probability against range, step and incidence. step: label of the step's axis and the set-up's value there."""
+    ranges = np.geomspace(view.range_m / 5, view.range_m * 5, _CURVE_POINTS)
+    angles = np.linspace(0, np.radians(85), _CURVE_POINTS)
+    steps = np.geomspace(0.1, 10, _CURVE_POINTS)
+    flat = np.ones(_CURVE_POINTS)
+
+    def curve(label: str, x: FloatArray, at: float, places: Places, scale: FloatArray = flat) -> Curve:
+        sampling, reached = sampling_of(places)
+        stretched = replace(sampling, step_a=sampling.step_a * scale, step_b=sampling.step_b * scale)
+        sizes = config.block_size_m
+        return Curve(
+            label, x, at, {size: np.where(reached, detection_probability(stretched, size, config), 0.0) for size in sizes}
+        )
+
+    at_range = view.places(ranges, flat * view.incidence_rad)
+    here = view.places(flat * view.range_m, flat * view.incidence_rad)
+    tilted = view.places(flat * view.range_m, angles)
+    return [
+        curve("range, m", ranges, view.range_m, at_range),
+        curve(step[0], steps * step[1], step[1], here, steps),
+        curve("angle of incidence, deg", np.degrees(angles), float(np.degrees(view.incidence_rad)), tilted),
+    ]
