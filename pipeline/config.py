@@ -10,8 +10,8 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from pipeline.annotate import AnnotationConfig
 from pipeline.difference import DifferenceConfig
+from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import PairConfig, read_cameras_yaml
-from pipeline.formats.metashape import read_metashape
 from pipeline.mesh import SurfaceConfig
 from pipeline.overrides import apply_overrides
 from pipeline.planning.detectability import PlanningConfig
@@ -21,9 +21,13 @@ from pipeline.tiles import TileConfig
 from scene.blocks import RockfallConfig
 from scene.config import Config, load_yaml, parse
 from scene.errors import InputError, nearest
+from scene.illumination import IlluminationConfig
 from scene.procedural import ProceduralWall
+from scene.texture import TextureConfig
 from scene.wall import WallConfig
 from sensors.camera import CameraPair
+from sensors.exposure import ExposureConfig
+from sensors.matching import MatchingConfig
 from sensors.model import StereoModel, TlsModel
 from sensors.placement import RigConfig, StationConfig, Target
 from sensors.stereo import Quality
@@ -33,35 +37,18 @@ SensorName = Literal["stereo", "tls"]
 
 
 class CamerasFile(Config):
-    """A stereo pair out of a file: the project's cameras.yaml, or Metashape's camera XML."""
+    """A stereo pair out of a file: the project's cameras.yaml, Metashape's camera XML or COLMAP's text model."""
 
-    file: Path = Field(description="cameras.yaml or a Metashape camera XML")
+    file: Path = Field(description="cameras.yaml, a Metashape camera XML, or the folder of a COLMAP text model")
     left: str | None = Field(
-        None, description="label of the left camera in the XML; none: the only pair, told by where they stand"
+        None, description="label or image name of the left camera; none: of the only pair, told by where they stand"
     )
-    right: str | None = Field(None, description="label of the right camera in the XML")
+    right: str | None = Field(None, description="label or image name of the right camera")
 
     def pair(self) -> CameraPair:
         """The cameras, world frame."""
-        if self.file.suffix.lower() != ".xml":
-            return read_cameras_yaml(self.file)
-        found = read_metashape(self.file)
-        labels = [self.left, self.right] if self.left and self.right else list(found.cameras)
-        where = f"{self.file}"
-        for label in labels:
-            if label not in found.cameras:
-                why = "is not aligned" if label in found.unaligned else "is not in the file"
-                raise InputError(f"camera '{label}' {why}", where=where, allowed=", ".join(found.cameras))
-        if len(labels) != 2:
-            raise InputError(
-                f"holds {len(labels)} aligned cameras, a pair is two",
-                where=where,
-                allowed=", ".join(labels),
-                remedy="name them as cameras.left and cameras.right",
-            )
-        first, second = (found.cameras[label] for label in labels)
-        swapped = not self.left and first.rotation[:, 0] @ (second.position - first.position) < 0
-        return CameraPair(second, first) if swapped else CameraPair(first, second)
+        found = read_oriented(self.file)
+        return read_cameras_yaml(self.file) if found is None else stereo_pair(found, self.left, self.right, str(self.file))
 
 
 def _camera_kind(values: Any) -> str:
@@ -100,6 +87,15 @@ class SimulationConfig(Config):
     sensor: tuple[SensorModel, ...] = Field((), description="sensor models (noise and effects), at most one of each sensor")
     cameras: CamerasConfig = RigConfig()
     depth_map: Quality = Field("medium", description="depth map at 1/2 (high), 1/4 (medium), 1/8 (low) of the frame")
+    matcher: Literal["simulated", "sgbm"] = Field(
+        "simulated",
+        description="stereo: disparities by ray tracing plus noise (simulated), or photographs rendered and matched (sgbm), whose "
+        "errors are their own: the model's parallax and regularization noise then play no part",
+    )
+    illumination: IlluminationConfig = Field(IlluminationConfig(), description="light on the rock (matcher: sgbm)")
+    texture: TextureConfig = Field(TextureConfig(), description="texture of the rock (matcher: sgbm)")
+    exposure: ExposureConfig = Field(ExposureConfig(), description="from light to grey values (matcher: sgbm)")
+    matching: MatchingConfig = Field(MatchingConfig(), description="the real matcher (matcher: sgbm)")
     scanner: ScannerConfig = ScannerConfig()
     station: StationConfig = StationConfig()
     surface: SurfaceConfig = SurfaceConfig()

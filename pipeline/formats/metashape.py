@@ -1,18 +1,21 @@
-"""Cameras from Agisoft Metashape's XML (File > Export > Export Cameras).
+"""Cameras and calibrations in Agisoft Metashape's XML, whose camera model is ours.
 
-A sensor may hold two calibrations: the one of class "adjusted" counts; missing tags are 0. A camera without a transform is not
-aligned. A transform is row-major, camera to chunk; the component's or else the chunk's transform (s, R, t) leads on:
-x_world = s R x_chunk + t.
+Camera XML (File > Export > Export Cameras): a sensor may hold two calibrations, the one of class "adjusted" counts; missing tags
+are 0. A camera without a transform is not aligned. A transform is row-major, camera to chunk; the similarity (s, R, t) of the
+camera's component, or where that has none of the chunk, leads on: x_world = s R x_chunk + t.
+Calibration XML (Tools > Camera Calibration > Save): one interior orientation.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.formats.atomic import write_bytes
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from sensors.camera import Camera
@@ -31,39 +34,93 @@ class MetashapeCameras:
 def read_metashape(path: Path) -> MetashapeCameras:
     """Read all frame cameras of a Metashape camera XML.
 
-    Raises InputError where the file is no such XML or a sensor is not a frame camera with a calibration.
+    Raises InputError where the file is no such XML, a sensor of an aligned camera is not a frame camera with a calibration, and
+    where two cameras have one label.
     """
     chunk = _chunk(path)
-    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iter("sensor")}
-    to_world = {component.get("id", ""): _similarity(component, path) for component in chunk.iter("component")}
+    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors//sensor")}
     default = _similarity(chunk, path)
-    cameras, unaligned = {}, []
-    for element in chunk.iter("camera"):
+    to_world = {
+        component.get("id", ""): default if component.find("transform") is None else _similarity(component, path)
+        for component in chunk.iterfind("components//component")
+    }
+    cameras: dict[str, Camera] = {}
+    unaligned = []
+    for element in chunk.iterfind("cameras//camera"):
         label, transform = element.get("label", element.get("id", "")), element.findtext("transform")
         if transform is None:
             unaligned.append(label)
             continue
-        pose = to_world.get(element.get("component_id", ""), default) @ _numbers(
-            transform, 16, f"{path}: camera {label}"
-        ).reshape(4, 4)
+        if label in cameras:
+            raise InputError(f"two cameras are labelled '{label}'", where=str(path), remedy="rename one of them in Metashape")
         sensor = sensors.get(element.get("sensor_id", ""))
         if sensor is None:
             raise InputError(f"camera '{label}' names no sensor of the file", where=str(path))
-        cameras[label] = _camera(sensor, pose, f"{path}: sensor {sensor.get('label', sensor.get('id'))}")
+        in_chunk = _numbers(transform, 16, f"{path}: camera {label}").reshape(4, 4)
+        pose = to_world.get(element.get("component_id", ""), default) @ in_chunk
+        cameras[label] = _sensor_camera(sensor, pose, f"{path}: sensor {sensor.get('label', sensor.get('id'))}")
     return MetashapeCameras(cameras, tuple(unaligned))
 
 
-def _chunk(path: Path) -> ElementTree.Element:
+def write_metashape(path: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write a camera XML that Metashape imports (File > Import > Import Cameras): cameras by label, in one metric component."""
+    document = ElementTree.Element("document", version="2.0.0")
+    chunk = ElementTree.SubElement(document, "chunk", label="scarpsim", enabled="true")
+    sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(cameras)))
+    components = ElementTree.SubElement(chunk, "components", next_id="1", active_id="0")
+    elements = ElementTree.SubElement(chunk, "cameras", next_id=str(len(cameras)), next_group_id="0")
+    transform = ElementTree.SubElement(ElementTree.SubElement(components, "component", id="0", label="Component 1"), "transform")
+    _texts(transform, {"rotation": np.eye(3), "translation": np.zeros(3), "scale": np.ones(1)})
+    for number, (label, camera) in enumerate(cameras.items()):
+        sensor = ElementTree.SubElement(sensors, "sensor", id=str(number), label=label, type="frame")
+        size = {"width": str(camera.width), "height": str(camera.height)}
+        ElementTree.SubElement(sensor, "resolution", size)
+        calibration = ElementTree.SubElement(sensor, "calibration", {"type": "frame", "class": "adjusted"})
+        ElementTree.SubElement(calibration, "resolution", size)
+        _write_interior(calibration, camera)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.rotation, camera.position
+        identity = {"id": str(number), "sensor_id": str(number), "component_id": "0", "label": label, "enabled": "true"}
+        _texts(ElementTree.SubElement(elements, "camera", identity), {"transform": pose})
+    _write(path, document)
+
+
+def read_calibration(path: Path) -> Camera:
+    """Read a calibration XML; the camera stands at the origin."""
+    root = read_root(path)
+    if root.tag != "calibration":
+        raise InputError(f"is no calibration XML of Metashape (its root is <{root.tag}>)", where=str(path))
+    if (projection := root.findtext("projection", "frame")) != "frame":
+        raise InputError(f"has the projection '{projection}'", where=str(path), allowed="frame")
+    width, height = (_whole(root.findtext(tag, "0"), str(path)) for tag in ("width", "height"))
+    return _camera(root, (width, height), np.eye(4), str(path))
+
+
+def write_calibration(path: Path, camera: Camera) -> None:
+    """Write the interior orientation of a camera as a calibration XML."""
+    root = ElementTree.Element("calibration")
+    for tag, text in (("projection", "frame"), ("width", str(camera.width)), ("height", str(camera.height))):
+        ElementTree.SubElement(root, tag).text = text
+    _write_interior(root, camera)
+    _write(path, root)
+
+
+def read_root(path: Path) -> ElementTree.Element:
+    """The root of an XML file; raises InputError for a file that is none, or that declares entities."""
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise InputError("declares entities, which Metashape never does", where=str(path))
     try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise InputError(f"is not valid XML ({error})", where=str(path)) from None
+
+
+def _chunk(path: Path) -> ElementTree.Element:
+    root = read_root(path)
     chunk = root.find("chunk") if root.tag == "document" else None
     if chunk is None:
         raise InputError("is no Metashape camera XML", where=str(path), remedy="export it with File > Export > Export Cameras")
@@ -78,25 +135,62 @@ def _similarity(element: ElementTree.Element, path: Path) -> FloatArray:
         return matrix
     where = f"{path}: transform"
     scale = float(_numbers(transform.findtext("scale", "1"), 1, where)[0])
+    if scale <= 0:
+        raise InputError(f"has the scale {scale:g}", where=where, allowed="greater than 0")
     matrix[:3, :3] = scale * _numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1"), 9, where).reshape(3, 3)
     matrix[:3, 3] = _numbers(transform.findtext("translation", "0 0 0"), 3, where)
     return matrix
 
 
-def _camera(sensor: ElementTree.Element, pose: FloatArray, where: str) -> Camera:
-    if sensor.get("type", "frame") != "frame":
-        raise InputError(f"has the model '{sensor.get('type')}'", where=where, allowed="frame")
+def _sensor_camera(sensor: ElementTree.Element, pose: FloatArray, where: str) -> Camera:
+    """The camera of a sensor; pose: (4, 4) camera to world, which may hold a scale."""
     calibrations = sensor.findall("calibration")
     adjusted = [calibration for calibration in calibrations if calibration.get("class") == "adjusted"] or calibrations
     resolution = sensor.find("resolution")
-    if resolution is None or not adjusted or adjusted[0].findtext("f") is None:
-        raise InputError("has no resolution or no calibration with f", where=where)
-    width, height = int(resolution.get("width", "0")), int(resolution.get("height", "0"))
-    interior = {name: float(_numbers(adjusted[0].findtext(tag, "0"), 1, where)[0]) for tag, name in _TAGS.items()}
-    left, _, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation: takes out the similarity's scale
+    if resolution is None or not adjusted:
+        raise InputError("has no resolution or no calibration", where=where, remedy="align the cameras before the export")
+    for kind in (sensor.get("type", "frame"), adjusted[0].get("type", "frame")):
+        if kind != "frame":
+            raise InputError(f"has the model '{kind}'", where=where, allowed="frame")
+    width, height = (_whole(resolution.get(side, "0"), where) for side in ("width", "height"))
+    return _camera(adjusted[0], (width, height), pose, where)
+
+
+def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: FloatArray, where: str) -> Camera:
+    interior = {name: float(_numbers(calibration.findtext(tag, "0"), 1, where)[0]) for tag, name in _TAGS.items()}
+    if interior["f_px"] <= 0 or min(size) <= 0:
+        raise InputError("has no frame size or no f", where=where, allowed="width, height and f greater than 0")
+    left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation: takes out the similarity's scale
+    if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:
+        raise InputError("a camera's transform is no rotation with one scale", where=where)
+    width, height = size
     camera = Camera(width, height, **interior, position=pose[:3, 3], rotation=left @ right)
     camera.check_invertible()
     return camera
+
+
+def _write_interior(element: ElementTree.Element, camera: Camera) -> None:
+    """The calibration's tags; those that are zero are left out, as Metashape does."""
+    values = {tag: float(getattr(camera, name)) for tag, name in _TAGS.items()}
+    _texts(element, {tag: np.array([value]) for tag, value in values.items() if value != 0})
+
+
+def _texts(parent: ElementTree.Element, values: Mapping[str, FloatArray]) -> None:
+    """Children with numbers in row-major order, with all the digits that they have."""
+    for tag, array in values.items():
+        ElementTree.SubElement(parent, tag).text = " ".join(repr(float(number)) for number in array.ravel())
+
+
+def _write(path: Path, root: ElementTree.Element) -> None:
+    ElementTree.indent(root)
+    write_bytes(path, ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n")
+
+
+def _whole(text: str, where: str) -> int:
+    value = float(_numbers(text, 1, where)[0])
+    if value != int(value):
+        raise InputError(f"expected a whole number of pixels, got '{text}'", where=where)
+    return int(value)
 
 
 def _numbers(text: str, count: int, where: str) -> FloatArray:
