@@ -9,9 +9,11 @@ from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, TriangleMesh
 from scene.wall import build_wall
+from sensors.camera import CameraPair
 from sensors.observation import Sensor
 from sensors.placement import Target
 from sensors.stereo import StereoPair
+from sensors.stereo_matched import MatchedStereoPair
 from sensors.tls import LaserScanner
 
 
@@ -42,7 +44,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         cameras = config.camera_pair(target)
         frame = WallFrame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
         mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
-        pair = StereoPair(cameras, frame, config.stereo_model(), config.depth_map, config.products.truth_channels)
+        pair = _stereo(config, cameras, frame, random)
         eyes = {f"cameras, {side}": frame.to_wall(getattr(cameras, side).position) for side in ("left", "right")}
         return Site(wall.name, wall.repairs, mesh, frame, pair, eyes)
     station = config.station.place(target)
@@ -51,3 +53,12 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
     truth = config.products.truth_channels
     scanner = LaserScanner.aimed(station, frame, mesh.vertices, config.scanner, config.tls_model(), truth=truth)
     return Site(wall.name, wall.repairs, mesh, frame, scanner, {"station": scanner.position})
+
+
+def _stereo(config: SimulationConfig, cameras: CameraPair, frame: WallFrame, random: KeyedRandom) -> Sensor:
+    """The pair with the config's matcher; the rock's texture stays the same from epoch to epoch."""
+    pair = StereoPair(cameras, frame, config.stereo_model(), config.depth_map, config.products.truth_channels)
+    if config.matcher == "simulated":
+        return pair
+    texture = config.texture.texture(random.child("texture"))
+    return MatchedStereoPair(pair, texture, config.illumination, config.exposure, config.matching)

@@ -35,7 +35,7 @@ class MatchingConfig(Config):
     p2: float = Field(32.0, gt=0, description="penalty of a larger step, per pixel of the window; more than p1")
     uniqueness_percent: int = Field(5, ge=0, le=100, description="by how much the best match must beat the second best [%]")
     mode: Literal["sgbm", "hh", "3way"] = Field("sgbm", description="paths of the aggregation: 5 (sgbm), 8 (hh), 3 (3way)")
-    left_right_tolerance_px: int = Field(1, ge=-1, description="largest disagreement of the two directions; -1: unchecked [px]")
+    left_right_tolerance_px: int = Field(1, ge=1, description="largest disagreement of the two directions of matching [px]")
     speckle_px: int = Field(60, ge=0, description="smooth regions with at most so many pixels are dropped")
     depth_margin_m: float = Field(1.0, ge=0, description="how far the search goes before and behind the visible surface [m]")
     tile_px: int = Field(1024, ge=64, description="side of the tiles that are matched one by one [px]")

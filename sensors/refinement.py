@@ -14,6 +14,9 @@ from scene.config import Config
 from sensors.device import bounded
 from sensors.rectified import Disparity, Picture
 
+PREFILTER_PX = 1.0
+"""Standard deviation of the Gaussian that both pictures are filtered with first: what is too fine to be interpolated would bias
+the match towards whole pixels (Pan 2013, Optics and Lasers in Engineering 51)."""
 SLOPE_SCALE_PX = 4.0
 """Standard deviation of the Gaussian window over which the disparity's slope is taken."""
 STEEPEST = 1.0
@@ -53,7 +56,8 @@ def refine(left: Picture, right: Picture, disparity: Disparity, config: Refineme
     cell = np.flatnonzero(~np.isnan(disparity))
     slopes = [mi.Float32(slope.ravel()[cell]) for slope in _slopes(disparity)]
     start = mi.Float32(disparity.ravel()[cell])
-    pictures, found, kept = _Pictures.on_device(left, right), mi.Float32(start), mi.Bool(True)
+    smooth = (cv2.GaussianBlur(picture, (0, 0), PREFILTER_PX) for picture in (left, right))
+    pictures, found, kept = _Pictures.on_device(*smooth), mi.Float32(start), mi.Bool(True)
     row, column = mi.Int32((cell // left.shape[1]).astype(np.int32)), mi.Int32((cell % left.shape[1]).astype(np.int32))
     sigma, correlation = (dr.opaque(mi.Float32, value) for value in (config.largest_sigma_px, config.least_correlation))
     for _ in range(config.steps):

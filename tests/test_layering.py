@@ -11,7 +11,18 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LONGEST_FILE = 500
-OF_SCENE_FOR_SENSORS = {"backend", "config", "errors", "frame", "grid", "keyed_random", "mesh", "raycast"}
+OF_SCENE_FOR_SENSORS = {
+    "backend",
+    "config",
+    "errors",
+    "frame",
+    "grid",
+    "illumination",
+    "keyed_random",
+    "mesh",
+    "raycast",
+    "texture",
+}
 """The modules of `scene` that a sensor may know: what it looks at, not how walls and blocks are made."""
 HEAVY = ("numpy", "scipy", "mitsuba", "drjit", "pydantic", "matplotlib", "open3d", "cv2", "rich")
 
