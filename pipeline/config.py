@@ -22,14 +22,10 @@ from scene.blocks import RockfallConfig
 from scene.config import Config, load_yaml, parse
 from scene.errors import InputError, nearest
 from scene.illumination import IlluminationConfig
-from scene.illumination import IlluminationConfig
 from scene.procedural import ProceduralWall
-from scene.texture import TextureConfig
 from scene.texture import TextureConfig
 from scene.wall import WallConfig
 from sensors.camera import CameraPair
-from sensors.exposure import ExposureConfig
-from sensors.matching import MatchingConfig
 from sensors.exposure import ExposureConfig
 from sensors.matching import MatchingConfig
 from sensors.model import StereoModel, TlsModel
@@ -93,17 +89,8 @@ class SimulationConfig(Config):
     depth_map: Quality = Field("medium", description="depth map at 1/2 (high), 1/4 (medium), 1/8 (low) of the frame")
     matcher: Literal["simulated", "sgbm"] = Field(
         "simulated",
-        description="stereo: disparities by ray tracing plus noise (simulated), or photographs rendered and matched (sgbm), whose "
-        "errors are their own: the model's parallax and regularization noise then play no part",
-    )
-    illumination: IlluminationConfig = Field(IlluminationConfig(), description="light on the rock (matcher: sgbm)")
-    texture: TextureConfig = Field(TextureConfig(), description="texture of the rock (matcher: sgbm)")
-    exposure: ExposureConfig = Field(ExposureConfig(), description="from light to grey values (matcher: sgbm)")
-    matching: MatchingConfig = Field(MatchingConfig(), description="the real matcher (matcher: sgbm)")
-    matcher: Literal["simulated", "sgbm"] = Field(
-        "simulated",
-        description="stereo: disparities by ray tracing plus noise (simulated), or photographs rendered and matched (sgbm), whose "
-        "errors are their own: the model's parallax and regularization noise then play no part",
+        description="stereo: disparities by ray tracing plus noise (simulated), or photographs rendered and matched (sgbm), "
+        "whose errors are their own: the model's parallax and regularization noise then play no part",
     )
     illumination: IlluminationConfig = Field(IlluminationConfig(), description="light on the rock (matcher: sgbm)")
     texture: TextureConfig = Field(TextureConfig(), description="texture of the rock (matcher: sgbm)")
