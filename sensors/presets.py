@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from scene.config import Config
+from sensors.effects import BeamDivergence
 from sensors.model import TlsModel, TlsNoise
 from sensors.tls import ScannerConfig
 
@@ -114,11 +115,17 @@ class ScannerPreset(Config):
         return ScannerConfig(**self.scanner_values())
 
     def model(self) -> TlsModel:
-        """The sensor model: noise from the precision figures alone; what the preset does not know has the default."""
+        """The sensor model: noise from the precision figures alone, and the beam; what is not known has the default."""
         known = self._range_noise()
         if self.angle_precision_arcsec is not None:
             known["angle_sigma_rad"] = float(np.radians(self.angle_precision_arcsec.value / 3600))
-        return TlsModel(noise=TlsNoise(**known))
+        return TlsModel(noise=TlsNoise(**known), effects=self._beam())
+
+    def _beam(self) -> tuple[BeamDivergence, ...]:
+        if self.divergence_mrad is None:
+            return ()
+        width = {} if self.pulse_width_ns is None else {"pulse_width_s": self.pulse_width_ns.value * 1e-9}
+        return (BeamDivergence(divergence_rad=self.divergence_mrad.full_angle * 1e-3, ranging=self.ranging, **width),)
 
     def _range_noise(self) -> dict[str, float]:
         """sigma^2 = sigma_0^2 + (p R)^2 through the figures; one figure alone is sigma_0, and so is the first of two falling."""

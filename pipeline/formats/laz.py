@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 import os
 import struct
 from collections.abc import Mapping
@@ -24,8 +25,8 @@ _CHUNK = 1_000_000
 _COUNTS = 65535
 _LARGEST = 2**31 - 1
 _USER, _FULL_SCALE_RECORD = "scarpsim", 1
-_ONE_RETURN = 0x11
-"""Return 1 of 1, in the two half-bytes of point format 6."""
+_MOST_RETURNS = 15
+_SCAN_ANGLE_STEP = math.radians(0.006)
 EXACT_INTENSITY = "intensity_relative"
 """An extra dimension of this name is read as the intensity, in place of the 16-bit field."""
 
@@ -36,6 +37,9 @@ def write_laz(
     *,
     intensity: NDArray[np.floating] | None = None,
     gps_time: FloatArray | None = None,
+    return_number: NDArray[np.integer] | None = None,
+    number_of_returns: NDArray[np.integer] | None = None,
+    scan_angle_rad: FloatArray | None = None,
     extra: Mapping[str, NDArray[Any]] | None = None,
     scale_m: float = 1e-6,
     date: datetime.date = datetime.date(2000, 1, 1),
@@ -43,12 +47,16 @@ def write_laz(
     """Write a point cloud as LAZ, or as LAS where `path` ends in .las; equal arguments give equal bytes.
 
     points: (n, 3), m, finite; intensity: (n,) relative received power, at least 0, stored in 16 bits (see `_full_scale`);
-    gps_time: (n,), s; extra: named (n,) channels, stored as extra dimensions in the type they have.
+    gps_time: (n,), s; return_number, number_of_returns: (n,), 1 to 15, none: 1 of 1; scan_angle_rad: (n,) angle of the emitted
+    direction from straight down, as LAS has it (for a scanner pi - zenith), stored in steps of 0.006 degrees; extra: named (n,)
+    channels, stored as extra dimensions in the type they have.
     Coordinates are stored as int32 multiples of `scale_m` from an offset in whole metres at the middle of the cloud; a cloud
     wider than 4295 m takes the next power of ten. Raises InputError where the file cannot be written.
     """
     extra = dict(extra or {})
+    bits = _return_bits(return_number, number_of_returns)
     channels = extra if gps_time is None else {"gps_time": gps_time, **extra}
+    channels = channels if scan_angle_rad is None else {"scan_angle": np.rint(scan_angle_rad / _SCAN_ANGLE_STEP), **channels}
     header = _header(points, extra, scale_m, date)
     full_scale = _full_scale(intensity)
     if intensity is not None:
@@ -58,6 +66,7 @@ def write_laz(
             rows = slice(start, start + _CHUNK)
             record = laspy.ScaleAwarePointRecord.zeros(len(points[rows]), header=header)
             _fill(record.array, header, points[rows])
+            record.array["bit_fields"] = bits if bits.ndim == 0 else bits[rows]
             for name, channel in channels.items():
                 record.array[name] = channel[rows]
             if intensity is not None:
@@ -69,7 +78,9 @@ def read_laz(path: Path) -> PointCloud:
     """Read a LAS or LAZ file of any version.
 
     Intensity is relative received power: of files of ours on the scale they hold, of others as counts / 65535. Intensity and
-    GPS time that are zero throughout count as not recorded. Raises InputError for a missing, truncated or foreign file.
+    GPS time that are zero throughout count as not recorded. Where there are several returns of a pulse, or scan angles, the extra
+    channels `return_number` and `number_of_returns`, or `scan_angle_rad` (from straight down), hold them. Raises InputError for a
+    missing, truncated or foreign file.
     """
     try:
         _check_extent(path)
@@ -81,7 +92,7 @@ def read_laz(path: Path) -> PointCloud:
     if len(las.points) < las.header.point_count:
         problem = f"holds {len(las.points):,} of the {las.header.point_count:,} points it announces"
         raise InputError(problem, where=str(path), remedy="export it again")
-    extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names}
+    extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names} | _standard_channels(las)
     counts = las.points.array["intensity"]
     intensity = counts.astype(np.float32) * np.float32(_stored_full_scale(las.header) / _COUNTS) if counts.any() else None
     timed = "gps_time" in las.point_format.dimension_names and np.any(las.points.array["gps_time"])
@@ -91,6 +102,17 @@ def read_laz(path: Path) -> PointCloud:
         gps_time=np.array(las.points.array["gps_time"]) if timed else None,
         extra=extra,
     )
+
+
+def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
+    """Returns and scan angles, where any were recorded; point formats below 6 hold angles in degrees."""
+    channels = {}
+    count = np.asarray(las["number_of_returns"], dtype=np.uint8)
+    if np.any(count > 1):
+        channels = {"return_number": np.asarray(las["return_number"], dtype=np.uint8), "number_of_returns": count}
+    name, step = ("scan_angle", _SCAN_ANGLE_STEP) if las.point_format.id >= 6 else ("scan_angle_rank", math.radians(1.0))
+    angle = np.asarray(las[name])
+    return channels | ({"scan_angle_rad": angle * step} if np.any(angle) else {})
 
 
 def _check_extent(path: Path) -> None:
@@ -144,7 +166,14 @@ def _fill(record: NDArray[np.void], header: laspy.LasHeader, points: FloatArray)
     counts = np.rint((points - header.offsets) / header.scales)
     for axis, name in enumerate("XYZ"):
         record[name] = counts[:, axis]
-    record["bit_fields"] = _ONE_RETURN
+
+
+def _return_bits(number: NDArray[np.integer] | None, count: NDArray[np.integer] | None) -> NDArray[np.uint8]:
+    """Return number and number of returns in the two half-bytes of point format 6, (n,) or one for all points."""
+    first, last = (np.asarray(1 if given is None else given) for given in (number, count))
+    if first.size and (first.min() < 1 or np.any(first > last) or last.max() > _MOST_RETURNS):
+        raise ValueError(f"return numbers run from 1 to the number of returns, at most {_MOST_RETURNS}")
+    return (first + last * (_MOST_RETURNS + 1)).astype(np.uint8)
 
 
 def _full_scale(intensity: NDArray[np.floating] | None) -> float:

@@ -14,6 +14,7 @@ from pipeline.config import SimulationConfig, load_config
 from pipeline.presets import read_preset
 from scene.config import parse
 from scene.errors import InputError
+from sensors.effects import BeamDivergence
 from sensors.model import TlsNoise
 from sensors.presets import Divergence, ScannerPreset
 from sensors.tls import ScannerConfig
@@ -65,6 +66,16 @@ def test_two_precisions_give_the_growth_of_the_noise_with_range() -> None:
     noise = read_preset("leica_p40").model().noise
     at = {range_m: np.hypot(noise.range_sigma_m, noise.range_ppm * 1e-6 * range_m) for range_m in (10.0, 50.0)}
     assert at == {10.0: pytest.approx(0.4e-3, rel=1e-12), 50.0: pytest.approx(0.5e-3, rel=1e-12)}
+
+
+def test_the_beam_comes_as_an_effect_in_the_effects_own_convention() -> None:
+    """0.3 mrad of half angle at 1/e^2 are 0.6 mrad of full angle; a pulse of 5 ns; without a divergence there is no effect."""
+    assert [effect.model_dump() for effect in read_preset("zf_5016").model().effects] == [
+        BeamDivergence(divergence_rad=0.6e-3, ranging="phase").model_dump()
+    ]
+    (pulsed,) = read_preset("riegl_vz400").model().effects
+    assert pulsed == BeamDivergence(divergence_rad=0.3e-3, pulse_width_s=5e-9)
+    assert read_preset("leica_p50").model().effects == ()
 
 
 def preset(**figures: Any) -> ScannerPreset:

@@ -1,0 +1,52 @@
+"""Point clouds of any format, told by the file's suffix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.formats.laz import read_laz
+from pipeline.formats.ply import read_ply_points
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.xyz import read_xyz
+from scene.errors import InputError
+
+SUFFIXES = (".laz", ".las", ".ply", ".e57", ".xyz", ".txt")
+
+
+def read_points(path: Path) -> PointCloud:
+    """Read a point cloud; the points of an E57 file are put into the file's frame by the poses in it.
+
+    An E57 file of several scans gives one cloud, with the number of the scan as extra channel `scan`. Raises InputError for a
+    format that is not known and whatever is wrong in the file.
+    """
+    match path.suffix.lower():
+        case ".laz" | ".las":
+            return read_laz(path)
+        case ".ply":
+            return read_ply_points(path)
+        case ".xyz" | ".txt":
+            return read_xyz(path)
+        case ".e57":
+            return _read_e57(path)
+    raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=" ".join(SUFFIXES))
+
+
+def _read_e57(path: Path) -> PointCloud:
+    from pipeline.formats.e57 import read_e57  # the library takes a tenth of a second to load
+
+    clouds = [scan.placed for scan in read_e57(path)]
+    if len(clouds) == 1:
+        return clouds[0]
+    shared = set.intersection(*(set(cloud.extra) for cloud in clouds))
+    extra = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in clouds[0].extra if name in shared}
+    extra["scan"] = np.repeat(np.arange(len(clouds)), [len(cloud.points) for cloud in clouds])
+    intensities = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
+    times = [cloud.gps_time for cloud in clouds if cloud.gps_time is not None]
+    return PointCloud(
+        points=np.concatenate([cloud.points for cloud in clouds]),
+        intensity=np.concatenate(intensities) if len(intensities) == len(clouds) else None,
+        gps_time=np.concatenate(times) if len(times) == len(clouds) else None,
+        extra=extra,
+    )
