@@ -69,6 +69,7 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
 
 def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
     """Look at `mesh` (wall frame) along -z at every pixel centre of `grid`; labels come from its `vertex_block`."""
+    dr.flush_malloc_cache()  # what the observation took: a surface of millions of triangles is the peak of an epoch's memory
     return cast_raster(RayCaster(mesh), grid)
 
 

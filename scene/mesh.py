@@ -13,6 +13,9 @@ IntArray = NDArray[np.int32]
 WALL = 0
 """The block label of a face or a point that belongs to no block; blocks count from 1."""
 
+_CHUNK = 1 << 18
+"""Faces worked on at a time, which bounds the memory of intermediates."""
+
 
 @dataclass(frozen=True)
 class TriangleMesh:
@@ -39,9 +42,14 @@ class TriangleMesh:
 
     def vertex_normals(self) -> FloatArray:
         """(n, 3) unit normals, outside: the sum of the adjacent faces' normals weighted by area; NaN for an unused vertex."""
-        corners = [self.vertices[self.faces[:, corner]] for corner in range(3)]
-        area = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-        vertex, count = self.faces.ravel(), len(self.vertices)
-        total = np.stack([np.bincount(vertex, np.repeat(area[:, axis], 3), count) for axis in range(3)], axis=1)
+        total = np.zeros((3, len(self.vertices)))
+        for start in range(0, len(self.faces), _CHUNK):
+            faces = self.faces[start : start + _CHUNK]
+            first, second, third = (self.vertices[faces[:, corner]] for corner in range(3))
+            area = np.repeat(np.cross(second - first, third - first).T, 3, axis=1)
+            low = int(faces.min())  # faces near one another in memory share vertices that are
+            part = slice(low, int(faces.max()) + 1)
+            for axis in range(3):
+                total[axis, part] += np.bincount(faces.ravel() - low, area[axis], part.stop - low)
         with np.errstate(invalid="ignore"):
-            return total / np.linalg.norm(total, axis=1, keepdims=True)
+            return (total / np.linalg.norm(total, axis=0)).T
