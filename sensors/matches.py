@@ -1,4 +1,9 @@
-"""The stereo pair's image rows and matched pixels on their way through the chain."""
+"""The stereo pair's image rows and matched pixels on their way through the chain.
+
+Effects on the matching act in this order, whatever a config's: the true disparities are fattened at their edges, then smoothed;
+regularization, parallax and texture noise are added; last come the locking, which acts on the fraction that the matcher finds,
+and, at its own stage, the filling of half-occluded strips.
+"""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Stage(IntEnum):
     RETURN = 5  # TLS: returns kept, lost, first or last
     CAMERA = 11  # stereo: the real pair against the nominal one
     EXPOSE = 12  # stereo: image rows
-    MATCH = 13  # stereo: disparity
+    MATCH = 13  # stereo: disparity, in the order that sensors/matches.py gives
     FILL = 14  # stereo: cells without a match
 
 
