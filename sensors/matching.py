@@ -85,7 +85,6 @@ def match(left: Picture, right: Picture, search: SearchRange, config: MatchingCo
     left: (h, w), right: (h, any) grey values, NaN outside the images. The left-right check is OpenCV's: from the same costs, the
     best left cell of every right cell must agree. Tiles run in OpenCV's number of threads; the result does not depend on it.
     """
-    seen = ~np.isnan(left)
     canvas_left, canvas_right = _aligned(left, right, search)
     raw = np.full(left.shape, -SUBPIXELS, dtype=np.int16)
 
@@ -95,10 +94,16 @@ def match(left: Picture, right: Picture, search: SearchRange, config: MatchingCo
     with ThreadPoolExecutor(max(1, cv2.getNumThreads())) as pool:
         for _ in pool.map(fill, _tiles(left.shape, config.tile_px)):
             pass
-    raw[~seen] = -SUBPIXELS
-    if config.speckle_px:
-        cv2.filterSpeckles(raw, -SUBPIXELS, config.speckle_px, SPECKLE_STEP_PX * SUBPIXELS)
-    return np.where(raw < 0, np.float32(np.nan), raw.astype(np.float32) / SUBPIXELS + search.least)
+    return np.where((raw < 0) | np.isnan(left), np.float32(np.nan), raw.astype(np.float32) / SUBPIXELS + search.least)
+
+
+def without_speckles(disparity: Disparity, speckle_px: int) -> Disparity:
+    """The disparities without connected smooth regions of at most `speckle_px` cells: stray matches, as the sky gives them."""
+    known = ~np.isnan(disparity)
+    least = np.float32(np.floor(disparity[known].min())) if known.any() else np.float32(0)
+    steps = np.where(known, np.rint((disparity - least) * SUBPIXELS), -SUBPIXELS).astype(np.int16)
+    cv2.filterSpeckles(steps, -SUBPIXELS, speckle_px, SPECKLE_STEP_PX * SUBPIXELS)
+    return np.where(steps < 0, np.float32(np.nan), disparity)
 
 
 def _aligned(left: Picture, right: Picture, search: SearchRange) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -29,7 +29,7 @@ from sensors.device import vector
 from sensors.effects.base import Effect, Stage, apply_stage
 from sensors.exposure import ExposureConfig, Photograph, Radiance, Studio, expose, full_scale
 from sensors.matches import Matches
-from sensors.matching import MatchingConfig, SearchRange, match
+from sensors.matching import MatchingConfig, SearchRange, match, without_speckles
 from sensors.observation import Observation
 from sensors.rectified import Disparity, RectifiedGrid
 from sensors.rectify import Rectification, rectify
@@ -115,7 +115,8 @@ class MatchedStereoPair:
         )
         left, right = grid.left(photographs[0].image), grid.right(photographs[1].image)
         coarse = match(left, right, SearchRange.between(far, near), config)
-        return coarse if config.refinement is None else refine(left, right, coarse, config.refinement)
+        fine = coarse if config.refinement is None else refine(left, right, coarse, config.refinement)
+        return without_speckles(fine, config.speckle_px)
 
 
 def _depth(point: mi.Array3f64, left: Camera, geometry: Rectification) -> mi.Float64:
