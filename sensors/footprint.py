@@ -155,14 +155,15 @@ def _in_phase(echoes: Sequence[Echo], wavelength_m: float) -> Echo:
     """
     centroid = _merged(echoes, [echo.returned for echo in echoes])
     wave = dr.opaque(mi.Float64, 4 * np.pi / wavelength_m)
-    real, imaginary = mi.Float32(0), mi.Float32(0)
+    real, imaginary = mi.Float64(0), mi.Float64(0)
     for echo in echoes:
-        sine, cosine = dr.sincos(mi.Float32(dr.select(echo.returned, wave * (echo.range_m - centroid.range_m), 0.0)))
-        power = dr.select(echo.returned, echo.power, mi.Float32(0))
+        sine, cosine = dr.sincos(dr.select(echo.returned, wave * (echo.range_m - centroid.range_m), 0.0))
+        power = mi.Float64(dr.select(echo.returned, echo.power, mi.Float32(0)))
         real, imaginary = real + power * cosine, imaginary + power * sine
-    magnitude = dr.sqrt(dr.square(real) + dr.square(imaginary)) / len(echoes)
-    phase = mi.Float64(dr.atan2(imaginary, real))  # in float32: dr.atan2 aborts in LLVM 15 on float64
-    return replace(centroid, range_m=centroid.range_m + phase / wave, power=magnitude)
+    magnitude = dr.sqrt(dr.square(real) + dr.square(imaginary))
+    quarter = dr.asin(imaginary / magnitude)  # dr.atan2 aborts in LLVM 15
+    phase = dr.select(real >= 0, quarter, dr.select(imaginary < 0, -np.pi, np.pi) - quarter)
+    return replace(centroid, range_m=centroid.range_m + phase / wave, power=mi.Float32(magnitude / len(echoes)))
 
 
 def _nearer(first: mi.Float64, second: mi.Float64) -> mi.Float64:
