@@ -8,19 +8,22 @@ otherwise). Two epochs are compared over the floor of the niche, along its norma
 
 1  Points. The sensor's rays meet the surface in a lattice with steps a and b, so that a patch of w_a x w_b holds N = N_a N_b
    points, N_a = floor(w_a/a) or one more; the latter with probability frac(w_a/a), for a place that owes nothing to the lattice.
-   The mean is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. Fewer than `minimum_points` make no test.
+   The mean is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. Seen obliquely, the lattice falls elsewhere on the
+   floor than on the face of the block, so that the two epochs' numbers N_1 and N_2 are independent. Fewer than
+   `minimum_points` in one of them make no test.
 2  Shadow. Seen along a direction with the tangents t_a, t_b against the normal, the niche's rim hides h t_a and h t_b of its
    floor; several viewpoints hide on both sides: w_a = s - h (max(0, t_a...) - min(0, t_a...)). Both epochs are compared over what
    is left.
 3  Noise. A point's error along the normal has a white part of variance w^2 and, for stereo, a smooth part c^2, of which the
    patch's mean keeps c_m^2 and shows c^2 - c_m^2 as spread. With sigma^2 = w^2 + c^2 - c_m^2 and the registration's error
    ~ N(0, reg^2):
-       D ~ N(h, tau^2),  tau^2 = 2 w^2/N + 2 c_m^2 + reg^2,      se^2 = 2 sigma^2/N
-4  Test. s1, s2 are estimates from the same points, so (D - z reg)/se^ times se/tau is noncentral t with nu = 2 (N - 1) and
-   delta = (h - z reg)/tau:
-       P(detected | N) = P(T_nu(delta) > q),  q = z se/tau  ~  1 - Phi((q (1 - 1/(4 nu)) - delta) / sqrt(1 + q^2/(2 nu)))
-   (Abramowitz & Stegun 26.7.10). For white noise alone this is exactly the noncentral t, and for many points Phi((h - LoD)/se).
-5  P(detected) = sum over the four cases of (N_a, N_b).
+       D ~ N(h, tau^2),  tau^2 = w^2/N_1 + w^2/N_2 + 2 c_m^2 + reg^2,      se^2 = sigma^2/N_1 + sigma^2/N_2
+4  Test. s1, s2 are estimates from the same points, so (D - z reg)/se^ times se/tau is noncentral t with
+   nu = (1/N_1 + 1/N_2)^2 / (1/(N_1^2 (N_1 - 1)) + 1/(N_2^2 (N_2 - 1))) (Welch, Satterthwaite) and delta = (h - z reg)/tau:
+       P(detected | N_1, N_2) = P(T_nu(delta) > q),  q = z se/tau  ~  1 - Phi((q (1 - 1/(4 nu)) - delta) / sqrt(1 + q^2/(2 nu)))
+   (Abramowitz & Stegun 26.7.10, within 0.005 from nu = 4). For white noise and N_1 = N_2 the noncentral t is exact, and for many
+   points P is Phi((h - LoD)/se).
+5  P(detected) = sum over the cases of (N_a, N_b) in both epochs.
 
 Limits: the wall is a plane over the block, as steep as its normal at that place; roughness that is not the same in both epochs is
 not counted, nor are points of the niche's side walls, which help; a niche whose floor is hidden altogether counts as not seen.
@@ -29,7 +32,6 @@ The block lies along the lattice; a turned one has the same mean number of point
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -41,14 +43,14 @@ from scipy.special import ndtr
 from scene.config import Config
 from scene.mesh import FloatArray
 
-_SMALLEST_M, _LARGEST_M, _HALVINGS = 1e-3, 30.0, 16
-"""The search of the smallest block: ln(30000) / 2^16 leaves 0.02 %."""
+_SMALLEST_M, _LARGEST_M, _HALVINGS = 1e-3, 30.0, 13
+"""The search of the smallest block: ln(30000) / 2^13 leaves 0.13 %."""
 
 
 class PlanningConfig(Config):
     """What `scarpsim inspect` maps, and when a block counts as seen."""
 
-    gsd_m: float | None = Field(None, gt=0, description="side of a map's pixel; none: some 200,000 pixels for the wall [m]")
+    gsd_m: float | None = Field(None, gt=0, description="side of a map's pixel; none: some 100,000 pixels for the wall [m]")
     image_sigma_px: float = Field(
         0.0, ge=0, description="stereo: noise of each image coordinate beyond the sensor model's, as of measured points [px]"
     )
@@ -111,11 +113,11 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
     kept = sampling.smooth**2 * _kept(width_a / sampling.grain_a) * _kept(width_b / sampling.grain_b)
     spread = sampling.white**2 + np.maximum(sampling.smooth**2 - kept, 0.0)
     total = np.zeros(np.broadcast(width_a, width_b, sampling.white).shape)
-    for count_a, share_a in _counts(width_a / sampling.step_a):
-        for count_b, share_b in _counts(width_b / sampling.step_b):
-            points = count_a * count_b
-            found = _exceeds(depth, points, sampling.white**2, spread, kept, config)
-            total += share_a * share_b * np.where(points >= config.minimum_points, found, 0.0)
+    counts = _counts(width_a / sampling.step_a, width_b / sampling.step_b)
+    for before, share_before in counts:
+        for after, share_after in counts:
+            found = _exceeds(depth, (before, after), sampling.white**2, spread, kept, config)
+            total += share_before * share_after * np.where(np.minimum(before, after) >= config.minimum_points, found, 0.0)
     return total
 
 
@@ -130,21 +132,28 @@ def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
     return np.where(possible, np.exp(high), np.nan)
 
 
-def _counts(expected: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """The two possible numbers of lattice lines in a width of `expected` steps, each with its probability."""
-    fewer = np.floor(expected)
-    yield fewer, 1 - (expected - fewer)
-    yield fewer + 1, expected - fewer
+def _counts(steps_a: FloatArray, steps_b: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """The four possible numbers of lattice points in a patch of steps_a x steps_b steps, each with its probability."""
+    (fewer_a, rest_a), (fewer_b, rest_b) = ((np.floor(steps), steps % 1.0) for steps in (steps_a, steps_b))
+    lines_a, lines_b = ([(fewer, 1 - rest), (fewer + 1, rest)] for fewer, rest in ((fewer_a, rest_a), (fewer_b, rest_b)))
+    return [(a * b, share_a * share_b) for a, share_a in lines_a for b, share_b in lines_b]
 
 
 def _exceeds(
-    depth: FloatArray, points: FloatArray, white: FloatArray, spread: FloatArray, kept: FloatArray, config: PlanningConfig
+    depth: FloatArray,
+    points: tuple[FloatArray, FloatArray],
+    white: FloatArray,
+    spread: FloatArray,
+    kept: FloatArray,
+    config: PlanningConfig,
 ) -> FloatArray:
-    """P(detected | N), steps 3 and 4 of the module; white, spread, kept are variances, m2."""
-    z, registration, number = config.critical_value, config.registration_sigma_m, np.maximum(points, 2)
-    tau = np.maximum(np.sqrt(2 * white / number + 2 * kept + registration**2), 1e-12)  # without noise a step function
-    q = z * np.sqrt(2 * spread / number) / tau
-    freedom = 2 * (number - 1)
+    """P(detected | N_1, N_2), steps 3 and 4 of the module; white, spread, kept are variances, m2."""
+    z, registration = config.critical_value, config.registration_sigma_m
+    first, second = (np.maximum(number, 2.0) for number in points)
+    inverse = 1 / first + 1 / second
+    freedom = inverse**2 / (1 / (first**2 * (first - 1)) + 1 / (second**2 * (second - 1)))
+    tau = np.maximum(np.sqrt(white * inverse + 2 * kept + registration**2), 1e-12)  # without noise a step function
+    q = z * np.sqrt(spread * inverse) / tau
     delta = (depth - z * registration) / tau
     return ndtr((delta - q * (1 - 1 / (4 * freedom))) / np.sqrt(1 + q**2 / (2 * freedom)))
 

@@ -1,0 +1,124 @@
+"""The detection probability by simulation, the check of the closed form: niches in a flat wall, observed by the real sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.planning.detectability import PlanningConfig, detection_probability
+from pipeline.planning.stereo_geometry import stereo_geometry
+from pipeline.planning.surface import BoolArray, Places
+from pipeline.planning.tls_geometry import tls_geometry
+from scene.blocks import RockfallConfig, place_blocks
+from scene.carve import carve
+from scene.distributions import Gaussian
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray, IntArray, TriangleMesh
+from scene.raycast import RayCaster
+from sensors.model import StereoModel, TlsModel
+from sensors.stereo import StereoPair
+from sensors.tls import LaserScanner
+
+_ON_SURFACE_M = 1e-4
+
+
+@dataclass(frozen=True)
+class Trials:
+    """k blocks. predicted: (k,) detection probability of each; detected: (k,) whether the simulated points exceeded their LoD."""
+
+    predicted: FloatArray
+    detected: BoolArray
+
+    def score(self) -> float:
+        """Observed minus expected detections over the standard deviation of a sum of independent draws (Poisson binomial)."""
+        variance = (self.predicted * (1 - self.predicted)).sum()
+        return float((self.detected.sum() - self.predicted.sum()) / np.sqrt(max(variance, 1e-12)))
+
+
+def detection_trials(
+    sensor: LaserScanner | StereoPair,
+    wall: TriangleMesh,
+    side_m: float,
+    config: PlanningConfig,
+    random: KeyedRandom,
+    count: int = 40,
+    apart_m: float = 0.1,
+) -> Trials:
+    """Carve `count` cubes, half in the rock, `apart_m` from each other, out of the flat wall z = 0 (wall frame), observe before
+    and after with `sensor`, and test each niche's floor as `detectability` says.
+
+    A noiseless twin of the sensor tells which cells look at the floor's part that every viewpoint sees.
+    """
+    blocks = place_blocks(_cubes(side_m, count, apart_m), wall, random.child("blocks"))
+    centres = blocks.position_m * [1.0, 1.0, 0.0]
+    low, high = _visible_floor(sensor, centres, side_m)
+    casters = RayCaster(wall), RayCaster(carve(wall, blocks).mesh)
+
+    def sample(number: int, depth: float) -> FloatArray:
+        caster = casters[number]
+        truth = _quiet(sensor).observe(caster, random.child("quiet")).points.reshape(-1, 3)
+        seen = sensor.observe(caster, random.child("epoch", number)).points.reshape(-1, 3)
+        return _statistics(seen, _block_of(truth, depth, low, high), len(centres))
+
+    places = Places(centres, np.tile([0.0, 0.0, 1.0], (len(centres), 1)), np.full(len(centres), 0.5))
+    geometry = tls_geometry(sensor, places) if isinstance(sensor, LaserScanner) else stereo_geometry(sensor, places)
+    return Trials(
+        detection_probability(geometry.sampling, side_m, config), _exceeding(sample(0, 0.0), sample(1, side_m / 2), config)
+    )
+
+
+def _cubes(side_m: float, count: int, apart_m: float) -> RockfallConfig:
+    exact = {"rotation_rad": Gaussian(mean=0.0, sigma=0.0), "irregularity": Gaussian(mean=0.0, sigma=0.0)}
+    size = Gaussian(mean=side_m, sigma=0.0)
+    return RockfallConfig(count=count, shape="cube", size_m=size, minimum_distance_m=apart_m, safe_zone_offset_m=0.2, **exact)
+
+
+def _quiet(sensor: LaserScanner | StereoPair) -> LaserScanner | StereoPair:
+    if isinstance(sensor, LaserScanner):
+        return replace(sensor, model=TlsModel.model_validate({"noise": {"range_sigma_m": 0, "angle_sigma_rad": 0}}))
+    quiet = StereoModel.model_validate({"noise": {"parallax_sigma_px": 0, "regularization_sigma_px": 0}})
+    return replace(sensor, model=quiet)
+
+
+def _visible_floor(sensor: LaserScanner | StereoPair, centres: FloatArray, side_m: float) -> tuple[FloatArray, FloatArray]:
+    """(k, 2) smallest and largest x, y of the part of each floor that all viewpoints see."""
+    if isinstance(sensor, LaserScanner):
+        viewpoints = [sensor.position]
+    else:
+        pair = sensor.cameras.in_wall_frame(sensor.frame)
+        viewpoints = [pair.left.position, pair.right.position]
+    sights = np.array([centres - viewpoint for viewpoint in viewpoints])
+    shift = side_m / 2 * sights[:, :, :2] / -sights[:, :, 2:]
+    low = centres[:, :2] - side_m / 2 + np.maximum(shift.max(axis=0), 0.0)
+    return low, centres[:, :2] + side_m / 2 + np.minimum(shift.min(axis=0), 0.0)
+
+
+def _block_of(truth: FloatArray, depth: float, low: FloatArray, high: FloatArray) -> IntArray:
+    """(n,) the block at whose floor, `depth` below the wall, each cell really looks; -1 for none."""
+    at_depth = np.flatnonzero(np.abs(truth[:, 2] + depth) < _ON_SURFACE_M)
+    place = truth[at_depth, :2]
+    _, nearest = cKDTree((low + high) / 2).query(place, p=np.inf)
+    inside = ((place > low[nearest]) & (place < high[nearest])).all(axis=1)
+    block = np.full(len(truth), -1, dtype=np.int32)
+    block[at_depth[inside]] = nearest[inside]
+    return block
+
+
+def _statistics(points: FloatArray, block: IntArray, count: int) -> FloatArray:
+    """(3, count) number of points, mean and variance of z of each block."""
+    used = (block >= 0) & ~np.isnan(points[:, 2])
+    label, z = block[used], points[used, 2]
+    number = np.bincount(label, minlength=count)
+    mean = np.bincount(label, z, count) / np.maximum(number, 1)
+    variance = np.bincount(label, np.square(z - mean[label]), count) / np.maximum(number - 1, 1)
+    return np.stack([number, mean, variance])
+
+
+def _exceeding(before: FloatArray, after: FloatArray, config: PlanningConfig) -> BoolArray:
+    """(k,) whether each change exceeds its level of detection (Lague et al. 2013)."""
+    number = np.minimum(before[0], after[0])
+    error = np.sqrt(before[2] / np.maximum(before[0], 1) + after[2] / np.maximum(after[0], 1))
+    limit = config.critical_value * (error + config.registration_sigma_m)
+    return (number >= config.minimum_points) & (before[1] - after[1] > limit)
