@@ -150,6 +150,18 @@ class Camera:
         """The same camera, its pose moved from the world into the wall frame."""
         return replace(self, position=frame.to_wall(self.position), rotation=frame.rotation @ self.rotation)
 
+    def reduced(self, step: float, width: int, height: int, corner: tuple[float, float] = (0.0, 0.0)) -> Camera:
+        """The camera of an image of width x height pixels, each `step` px of this frame wide, that starts at `corner`, px."""
+        cx = (self.width / 2 + self.cx_px - corner[0]) / step - width / 2
+        cy = (self.height / 2 + self.cy_px - corner[1]) / step - height / 2
+        scaled = {name: getattr(self, name) / step for name in ("f_px", "b1", "b2")}
+        return replace(self, width=width, height=height, cx_px=cx, cy_px=cy, **scaled)
+
+    def turned(self) -> Camera:
+        """The same camera with its image read upside down: its pixel (u, v) is this one's (width - u, height - v)."""
+        mirrored = {name: -getattr(self, name) for name in ("cx_px", "cy_px", "p1", "p2")}
+        return replace(self, rotation=self.rotation * [-1.0, -1.0, 1.0], **mirrored)
+
     def check_invertible(self) -> None:
         """Raise InputError where `tangents` does not invert `pixel` over the whole frame (a distortion that folds the image)."""
         u, v = np.meshgrid(np.linspace(0, self.width, 33), np.linspace(0, self.height, 33))
@@ -175,6 +187,10 @@ class CameraPair:
 
     def in_wall_frame(self, frame: WallFrame) -> CameraPair:
         return CameraPair(self.left.in_wall_frame(frame), self.right.in_wall_frame(frame))
+
+    def exchanged(self) -> CameraPair:
+        """The same pair with the right camera's part played by the left: both turned upside down, so that sides change."""
+        return CameraPair(self.right.turned(), self.left.turned())
 
     @property
     def base_m(self) -> float:
