@@ -85,14 +85,19 @@ def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, confi
     """
     if len(points) <= _NORMAL_NEIGHBOURS:
         raise InputError(f"{len(points)} points are too few", where="Poisson surface", allowed="more than 16")
-    tree = cKDTree(points)
-    spacing = float(np.median(tree.query(points, k=2, workers=-1)[0][:, 1]))
-    if not spacing > 0:
-        raise InputError("most points of the cloud lie twice in the same place", where="surface", remedy="remove duplicates")
-    depth = config.poisson_depth or _poisson_depth(points, spacing)
+    depth = config.poisson_depth or octree_depth(points)
     vertices, faces = _poisson(points, viewpoint, depth)
-    distance, nearest = tree.query(vertices, workers=-1)
-    near = distance <= config.poisson_trim_spacings * spacing
+    return labelled_surface(vertices, faces, points, (points, block), config)
+
+
+def labelled_surface(
+    vertices: FloatArray, faces: IntArray, points: FloatArray, labels: tuple[FloatArray, IntArray], config: SurfaceConfig
+) -> TriangleMesh:
+    """A surface made from `points` by others, without what lies `poisson_trim_spacings` median spacings from them or farther.
+
+    labels: (n, 3) points and their (n,) blocks; each vertex takes that of the nearest. Raises InputError where nothing is left.
+    """
+    near = cKDTree(points).query(vertices, workers=-1)[0] <= config.poisson_trim_spacings * _spacing(points)
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
         raise InputError(
@@ -102,7 +107,22 @@ def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, confi
         )
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
-    return TriangleMesh(vertices[used], _numbers(used)[faces], vertex_block=block[nearest[used]].astype(np.int32))
+    nearest = cKDTree(labels[0]).query(vertices[used], workers=-1)[1]
+    return TriangleMesh(vertices[used], _numbers(used)[faces], vertex_block=labels[1][nearest].astype(np.int32))
+
+
+def octree_depth(points: FloatArray) -> int:
+    """The octree depth whose cells are as large as the median spacing of (n, 3) points; InputError where they coincide."""
+    longest = float(np.ptp(points, axis=0).max())
+    return int(np.clip(np.ceil(np.log2(longest / _spacing(points))), 4, _POISSON_DEPTH_LIMIT))
+
+
+def _spacing(points: FloatArray) -> float:
+    """Median distance of a point to the nearest other one, m."""
+    spacing = float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))
+    if not spacing > 0:
+        raise InputError("most points of the cloud lie twice in the same place", where="surface", remedy="remove duplicates")
+    return spacing
 
 
 @dataclass(frozen=True)
@@ -226,12 +246,6 @@ def _ends(missing: BoolArray, axis: int) -> tuple[IntArray, IntArray]:
     before = np.maximum.accumulate(np.where(missing, np.int32(-1), place), axis=axis)
     after = np.flip(np.minimum.accumulate(np.flip(np.where(missing, np.int32(size), place), axis), axis=axis), axis)
     return before, after
-
-
-def _poisson_depth(points: FloatArray, spacing: float) -> int:
-    """The octree depth whose cells are as large as the points' spacing."""
-    longest = float(np.ptp(points, axis=0).max())
-    return int(np.clip(np.ceil(np.log2(longest / spacing)), 4, _POISSON_DEPTH_LIMIT))
 
 
 def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[FloatArray, IntArray]:
