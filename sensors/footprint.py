@@ -4,7 +4,7 @@ Energy falls with the angle r from the axis as exp(-8 r^2 / D^2), D the full div
 of it lies within 8 r^2 / D^2 = -ln(1 - u). Rings of 6, 12, 18... sub-rays surround a central one; every sub-ray carries the same
 energy, so ring j stands for the annulus between two such fractions, at its root-mean-square radius, and all radii are scaled so
 that the second moments are the Gaussian's, D^2/16 about each axis. The share of the energy that a straight edge cuts off is then
-right to 0.11 at worst with 19 sub-rays (root mean square 0.03), 0.21 with 7, 0.07 with 37. A hexagonal grid with Gaussian weights
+right to 0.11 at worst with 19 sub-rays (root mean square 0.03), 0.22 with 7, 0.07 with 37. A hexagonal grid with Gaussian weights
 does worse (0.15 with 19): an edge along the grid crosses many of its sub-rays at once.
 """
 

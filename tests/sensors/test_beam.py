@@ -38,7 +38,7 @@ def test_sub_rays_have_the_moments_of_the_gaussian(count: int) -> None:
     assert np.abs(turned[:, None] - (x + 1j * y)).min(axis=1).max() < 1e-12
 
 
-@pytest.mark.parametrize(("count", "worst", "typical"), [(7, 0.21, 0.075), (19, 0.11, 0.035), (37, 0.07, 0.025), (61, 0.05, 0.02)])
+@pytest.mark.parametrize(("count", "worst", "typical"), [(7, 0.22, 0.08), (19, 0.11, 0.035), (37, 0.07, 0.025), (61, 0.05, 0.02)])
 def test_a_straight_edge_cuts_off_the_gaussians_energy(count: int, worst: float, typical: float) -> None:
     """The stated bounds, for edges in all directions, against the error function."""
     offsets, edges = unit_offsets(count), np.linspace(-1.0, 1.0, 801)
