@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,7 @@ def main(sensor: SensorName) -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         write_reference(out, config, site, reference)
+        reference = replace(reference, observation=None)
         progress.timings.clear()
         start = time.perf_counter()
         epoch = observe_epoch(config, site, reference, 1, random, progress)

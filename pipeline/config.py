@@ -75,6 +75,9 @@ class ProductsConfig(Config):
 
     truth_channels: bool = Field(True, description="the true range or depth of each point, as extra dimensions of points.laz")
     world: bool | None = Field(None, description="points and surface in the wall's own coordinates too; none: for imported walls")
+    block_meshes: bool = Field(
+        False, description="four meshes of each block: wall difference, intersection, niche, removed block"
+    )
 
 
 class SimulationConfig(Config):

@@ -15,7 +15,7 @@ from pipeline.mesh import mesh_observation
 from pipeline.progress import Progress
 from pipeline.register import Registration, register_to
 from pipeline.site import Site
-from scene.blocks import place_blocks
+from scene.blocks import Blocks, place_blocks
 from scene.carve import Carved, carve, carved_records
 from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray, TriangleMesh
@@ -28,11 +28,12 @@ from sensors.placement import check_in_front
 class Reference:
     """The first epoch, of the untouched wall: all later ones are compared with it.
 
-    caster: the untouched wall; surface: reconstructed; raster: of the surface, its grid is that of every difference map;
-    target: the surface as ICP wants it, where epochs are registered.
+    observation: None once it is written, which spares its memory; caster: the untouched wall; surface: reconstructed;
+    raster: of the surface, its grid is that of every difference map; target: the surface as ICP wants it, where epochs are
+    registered.
     """
 
-    observation: Observation
+    observation: Observation | None
     caster: RayCaster
     surface: TriangleMesh
     raster: SurfaceRaster
@@ -41,12 +42,13 @@ class Reference:
 
 @dataclass(frozen=True)
 class Epoch:
-    """A later epoch. blocks: records of what was carved, with what the difference map shows of each; surface: reconstructed,
-    before registration; raster: after it; difference: (h, w) float32, m, reference minus epoch."""
+    """A later epoch. solids: the blocks; blocks: records of what was carved, with what the difference map shows of each;
+    surface: reconstructed, before registration; raster: after it; difference: (h, w) float32, m, reference minus epoch."""
 
     number: int
     observation: Observation
     carved: Carved
+    solids: Blocks
     blocks: list[dict[str, Any]]
     surface: TriangleMesh
     registration: Registration | None
@@ -104,7 +106,7 @@ def observe_epoch(
         {**record, "world_position_m": to_world(site, record["position_m"]), **seen}
         for record, seen in zip(records, measured, strict=True)
     ]
-    return Epoch(number, observation, carved, found, surface, registration, raster, change, statistics)
+    return Epoch(number, observation, carved, blocks, found, surface, registration, raster, change, statistics)
 
 
 def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, count: int) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ from pipeline.formats.ply import write_ply
 from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
 from pipeline.site import Site
 from pipeline.tiles import tiles
+from scene.blocks import Blocks
+from scene.carve import block_meshes
 from scene.imported import ImportedWall
 from scene.mesh import WALL, FloatArray, TriangleMesh
 from sensors.observation import Observation
@@ -32,8 +34,8 @@ def epoch_folder(out: Path, number: int) -> Path:
 
 
 def write_reference(out: Path, config: SimulationConfig, site: Site, reference: Reference) -> None:
-    """Write epoch_000 and the hillshade of the reference, unless the folder is there already."""
-    if epoch_folder(out, 0).exists():
+    """Write epoch_000 and the hillshade of the reference, unless the folder is there already or the observation is gone."""
+    if epoch_folder(out, 0).exists() or reference.observation is None:
         return
     with _folder(out, 0) as folder:
         _write_common(folder, config, site, reference.observation, reference.surface, site.mesh, [])
@@ -56,6 +58,8 @@ def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Refe
         write_geotiff(
             out / f"{name}.tif", epoch.difference, grid, description="reference minus epoch, m; missing rock is positive"
         )
+        if config.products.block_meshes:
+            _write_block_meshes(folder / "blocks", site.mesh, epoch.solids)
         images = list(_images(out, config, epoch, reference, name))
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
         masks = epoch.raster.block != WALL
@@ -127,6 +131,14 @@ def _write_common(
     if wanted or (wanted is None and isinstance(config.wall, ImportedWall)):
         write_laz(folder / "points_world.laz", site.frame.to_world(points), **values)
         write_ply(folder / "surface_world.ply", _in_world(surface, site))
+
+
+def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:
+    """The four meshes of each block (thesis 3.3): wall difference, intersection, niche, removed block."""
+    for index in range(len(blocks)):
+        meshes = block_meshes(wall, blocks, index)
+        for field in fields(meshes):
+            write_ply(folder / f"block_{index + 1:04d}_{field.name}.ply", getattr(meshes, field.name))
 
 
 def _in_world(mesh: TriangleMesh, site: Site) -> TriangleMesh:

@@ -193,6 +193,17 @@ def test_a_wall_in_utm_coordinates_gives_products_in_those_coordinates(tmp_path:
     assert np.abs(surface.bounds.mean(axis=0) - wall.bounds.mean(axis=0) - offset).max() < 0.2
 
 
+def test_the_four_meshes_of_each_block_are_written_on_request(tmp_path: Path) -> None:
+    simulate(config(products={"block_meshes": True}), "tls", tmp_path / "run")
+    folder = tmp_path / "run/epoch_001/blocks"
+    assert len(list(folder.iterdir())) == 5 * 4
+    volumes = {block["label"]: block["volume_m3"] for block in json.loads((tmp_path / "run/epoch_001/blocks.json").read_text())}
+    for label, volume in volumes.items():
+        removed = trimesh.load(folder / f"block_{label:04d}_intersection.ply")
+        assert removed.is_watertight
+        assert removed.volume == pytest.approx(volume, rel=1e-3)
+
+
 def test_tiles_become_the_images_of_the_data_set(tmp_path: Path) -> None:
     simulate(config(tiles={"size_px": 64, "minimum_valid_share": 0.1}), "tls", tmp_path / "run")
     data_set = COCO(tmp_path / "run/annotations.json")
