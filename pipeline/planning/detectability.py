@@ -34,6 +34,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -61,7 +62,7 @@ class PlanningConfig(Config):
         0.5, gt=0, le=1, description="depth of the niche over the block's side (a half: it protruded half)"
     )
     probability: float = Field(0.95, gt=0, lt=1, description="share of cases in which the smallest block is to be seen")
-    block_size_m: tuple[float, ...] = Field(
+    block_size_m: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         (0.1, 0.2, 0.5), min_length=1, description="sides of the blocks of curves and maps [m]"
     )
 
