@@ -274,9 +274,16 @@ def test_pixel_locking_is_a_sine_of_the_fraction_of_the_matched_images_pixel(qua
     assert np.nanmax(found - true) == pytest.approx(0.4, abs=1e-3)
 
 
-def test_matching_effects_act_in_the_chains_order_whatever_the_configs() -> None:
-    """Fattening, smoothing, locking, then filling; noise before locking: parallax noise of a locked matcher is locked too."""
-    mesh, pair = step(6.0, 0.0), rig()
+@pytest.mark.parametrize(
+    "turn", [[[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]], ids=["upright", "level"]
+)
+def test_matching_effects_act_in_the_chains_order_whatever_the_configs(turn: list[list[float]]) -> None:
+    """Fattening, smoothing, locking, then filling; noise before locking: parallax noise of a locked matcher is locked too.
+
+    An upright edge has a half-occluded strip to fill; at a level one, fattening and smoothing meet and do not commute.
+    """
+    flat = step(6.0, 0.0)
+    mesh, pair = flat.with_vertices(flat.vertices @ np.array(turn)), rig()
     effects = [
         {"name": "occlusion_fill", "reach_px": 1e4},
         {"name": "pixel_locking", "amplitude_px": 0.4},
