@@ -1,6 +1,8 @@
 """One TLS observation of 1 M pulses with 19 sub-rays each on 1.3 M triangles against the bare cast of the same 19 M rays.
 
-To reach: at least 0.5 of the bare ray rate. Also: the bias of the beam on a rough wall, to stay below 0.1 mm.
+To reach: at least 0.5 of the bare ray rate, and no bias of the footprint above 0.1 mm on a rough wall. At edges (differences of
+20 mm and more) a real beam does differ from its axis: echoes of the surface that is hit more squarely are stronger. There the
+peer is a beam of 61 sub-rays.
 """
 
 from __future__ import annotations
@@ -57,10 +59,15 @@ def main() -> None:
     print(f"observation with the beam             {beams:6.3f} s   {count / beams / 1e6:6.2f} M pulses/s")
     print(f"observation with one ray              {pulses:6.3f} s   {count / pulses / 1e6:6.2f} M pulses/s")
     print(f"share of the bare rate, beam          {cast / beams:6.2f}     (target: at least 0.5)")
-    bias = differences(scanner, step, beam, caster, random)
-    error, inside = bias.std() / np.sqrt(bias.size), bias[np.abs(bias) < EDGE_MM].mean()
-    print(f"bias of the beam's range, all pulses  {bias.mean():6.3f} mm  (standard error {error:.3f}; target: at most 0.1)")
-    print(f"bias of the beam's range, off edges   {inside:6.3f} mm  (differences below {EDGE_MM} mm)")
+    print("mean range with the beam less mean range")
+    axis, dense = (differences(scanner, step, beam, other, caster, random) for other in ([], [{**beam, "sub_rays": 61}]))
+    for name, values in (
+        ("of the axis, off edges", axis[np.abs(axis) < EDGE_MM]),
+        ("of the axis, edges included", axis),
+        ("of a beam of 61 sub-rays", dense),
+    ):
+        error = values.std() / np.sqrt(values.size)
+        print(f"  {name:36s}{values.mean():6.3f} mm  (standard error {error:.3f})")
     print(f"peak memory                           {memory:6.2f} GB")
 
 
@@ -76,11 +83,11 @@ def sub_rays(scanner: LaserScanner) -> list[mi.Ray3f]:
     return [mi.Ray3f(origin, mi.Vector3f(ray)) for ray in beam.sub_rays_about(axis, *across)]
 
 
-def differences(scanner, step: float, beam: dict[str, object], caster: RayCaster, random: KeyedRandom) -> np.ndarray:
-    """Range of the beam less that of its axis, mm, without noise, of the pulses that return in both."""
+def differences(scanner, step: float, beam: dict, other: list[dict], caster: RayCaster, random: KeyedRandom) -> np.ndarray:
+    """Range of the beam less that with the `other` effects, mm, without noise, of the pulses that return in both."""
     noise = {"range_sigma_m": 0.0, "angle_sigma_rad": 0.0}
-    narrow, wide = (scanner(step, noise=noise, effects=effects).observe(caster, random).depth for effects in ([], [beam]))
-    difference = 1e3 * (wide - narrow)
+    wide, reference = (scanner(step, noise=noise, effects=effects).observe(caster, random).depth for effects in ([beam], other))
+    difference = 1e3 * (wide - reference)
     return difference[np.isfinite(difference)]
 
 
