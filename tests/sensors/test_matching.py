@@ -129,7 +129,7 @@ def test_the_left_right_check_empties_the_half_occluded_strip() -> None:
         assert (np.abs(compared.error) > 1).mean() < 0.02
     assert filled[0] > 0.3
     assert filled[1] < 0.15
-    assert filled[2] < 0.05
+    assert filled[2] < 0.1
 
 
 def test_tiles_agree_with_the_whole() -> None:
