@@ -31,7 +31,7 @@ LARGEST_SHIFT_PX = 1.5
 class RefinementConfig(Config):
     """Least-squares matching after the semi-global one; pixels are the depth map's cells."""
 
-    steps: int = Field(5, ge=1, le=50, description="iterations")
+    steps: int = Field(3, ge=1, le=50, description="iterations")
     window_px: int = Field(7, ge=3, le=31, description="side of the window, odd [px]")
     largest_sigma_px: float = Field(0.5, gt=0, description="matches with a larger standard deviation are dropped [px]")
     least_correlation: float = Field(0.7, ge=0, lt=1, description="matches whose windows correlate less are dropped")
