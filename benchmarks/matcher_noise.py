@@ -31,6 +31,11 @@ from sensors.stereo import REDUCTION, StereoPair
 from sensors.stereo_matched import MatchedStereoPair
 
 Raster = NDArray[np.float64]
+FITTED = StereoModel(
+    noise={"parallax_sigma_px": 0.35, "regularization_sigma_px": 1.2, "regularization_step_px": 16.0},
+    effects=[{"name": "edge_fattening", "radius_px": 10.0}],
+)
+"""Simulated noise like the refined matcher's on rendered rock, px of the full frame at medium quality."""
 QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}
 
 
@@ -76,8 +81,8 @@ def rendered(style: str) -> Iterator[tuple[str, Raster, Raster]]:
     for name, config in (("sgbm", MatchingConfig(refinement=None)), ("sgbm, refined", MatchingConfig())):
         pair = MatchedStereoPair(quiet, texture, IlluminationConfig(), ExposureConfig(), config)
         yield name, disparity(pair.observe(caster, random), quiet), true
-    noisy = StereoPair(cameras, frame, StereoModel())
-    yield "simulated, defaults", disparity(noisy.observe(caster, random), quiet), true
+    for name, model in (("simulated, defaults", StereoModel()), ("simulated, fitted", FITTED)):
+        yield name, disparity(StereoPair(cameras, frame, model).observe(caster, random), quiet), true
 
 
 def disparity(seen: Observation, pair: StereoPair) -> Raster:
