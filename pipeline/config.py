@@ -16,6 +16,7 @@ from pipeline.mesh import SurfaceConfig
 from pipeline.overrides import apply_overrides
 from pipeline.planning.detectability import PlanningConfig
 from pipeline.presets import is_path, with_preset
+from pipeline.reconstruct import FusionConfig, Reconstruction
 from pipeline.register import IcpConfig
 from pipeline.tiles import TileConfig
 from scene.blocks import RockfallConfig
@@ -78,6 +79,7 @@ class ProductsConfig(Config):
     block_meshes: bool = Field(
         False, description="four meshes of each block: wall difference, intersection, niche, removed block"
     )
+    metashape: bool = Field(False, description="stereo: depth maps and cameras with a script that loads them into Metashape")
 
 
 class SimulationConfig(Config):
@@ -101,7 +103,11 @@ class SimulationConfig(Config):
     matching: MatchingConfig = Field(MatchingConfig(), description="the real matcher (matcher: sgbm)")
     scanner: ScannerConfig = ScannerConfig()
     station: StationConfig = StationConfig()
+    reconstruction: Reconstruction = Field(
+        "direct", description="surface from the sensor's own grid (direct), or by COLMAP from both depth maps (stereo)"
+    )
     surface: SurfaceConfig = SurfaceConfig()
+    fusion: FusionConfig = FusionConfig()
     icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: left out")
     difference: DifferenceConfig = DifferenceConfig()
     annotation: AnnotationConfig = AnnotationConfig()

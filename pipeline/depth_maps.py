@@ -62,15 +62,13 @@ def normals(source: DepthMap, radius: int) -> NDArray[np.float64]:
     mean_j, mean_i, spread, count = _moments(valid.astype(float), radius)
     mean_w, covariance_j, covariance_i = _covariances(valid, inverse, count, mean_j, mean_i, radius)
     (jj, ii, ji), camera = spread, source.camera
+    u, v = _centres(camera)
     with np.errstate(invalid="ignore", divide="ignore"):
         determinant = jj * ii - ji * ji
-        slope_j = (ii * covariance_j - ji * covariance_i) / determinant  # inverse depth per column
-        slope_i = (jj * covariance_i - ji * covariance_j) / determinant  # per row
-    u, v = _centres(camera)
-    a, b = slope_j * camera.f_px, slope_i * camera.f_px
-    x, y = camera.tangents(u + mean_j, v + mean_i)
-    normal = -np.stack([a, b, mean_w - a * x - b * y], axis=-1)
-    with np.errstate(invalid="ignore"):
+        a = camera.f_px * (ii * covariance_j - ji * covariance_i) / determinant  # inverse depth per x
+        b = camera.f_px * (jj * covariance_i - ji * covariance_j) / determinant  # per y
+        x, y = camera.tangents(u + mean_j, v + mean_i)
+        normal = -np.stack([a, b, mean_w - a * x - b * y], axis=-1)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     usable = valid & (count >= _LEAST_SAMPLES) & (determinant > 1e-6)
     return np.where(usable[..., None], normal, np.nan)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.closest_points import ReferenceSurface
 from pipeline.config import SimulationConfig
 from pipeline.difference import BlockStatistics, SurfaceRaster, block_statistics, difference, raster_grid, surface_raster
-from pipeline.mesh import mesh_observation
+from pipeline.look import DepthMaps, look, reconstruct
 from pipeline.progress import Progress
 from pipeline.register import Registration, register_to
 from pipeline.site import Site
@@ -30,7 +30,7 @@ class Reference:
 
     observation: None once it is written, which spares its memory; caster: the untouched wall; surface: reconstructed;
     raster: of the surface, its grid is that of every difference map; target: the surface as ICP wants it, where epochs are
-    registered.
+    registered; depth_maps: where they go to others.
     """
 
     observation: Observation | None
@@ -38,6 +38,7 @@ class Reference:
     surface: TriangleMesh
     raster: SurfaceRaster
     target: ReferenceSurface | None
+    depth_maps: DepthMaps | None
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class Epoch:
     raster: SurfaceRaster
     difference: NDArray[np.float32]
     statistics: BlockStatistics
+    depth_maps: DepthMaps | None
 
 
 STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "difference": 2.0, "write": 8.0}
@@ -67,13 +69,13 @@ def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom,
         caster = RayCaster(site.mesh)
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, where)
-        observation = site.sensor.observe(caster, random.child("epoch", 0, "observe"))
+        seen = look(config, site, caster, random.child("epoch", 0, "observe"))
     with progress.stage("epoch 0: mesh"):
-        surface = mesh_observation(observation, config.surface)
+        surface = reconstruct(config, seen)
         target = None if config.icp is None else ReferenceSurface.build(surface.vertices, surface.vertex_normals())
     with progress.stage("epoch 0: difference"):
         raster = surface_raster(surface, raster_grid(surface.bounds, config.difference))
-    return Reference(observation, caster, surface, raster, target)
+    return Reference(seen.observation, caster, surface, raster, target, seen.depth_maps)
 
 
 def observe_epoch(
@@ -89,9 +91,9 @@ def observe_epoch(
         carved = carve(site.mesh, blocks)
         records = carved_records(blocks, carved.removed_volume_m3)
     with progress.stage(f"epoch {number}: observe"):
-        observation = site.sensor.observe(RayCaster(carved.mesh), keyed.child("observe"))
+        seen = look(config, site, RayCaster(carved.mesh), keyed.child("observe"))
     with progress.stage(f"epoch {number}: mesh"):
-        surface = mesh_observation(observation, config.surface)
+        surface = reconstruct(config, seen)
     registration, registered = None, surface
     if config.icp is not None and reference.target is not None:
         with progress.stage(f"epoch {number}: register"):
@@ -106,7 +108,9 @@ def observe_epoch(
         {**record, "world_position_m": to_world(site, record["position_m"]), **seen}
         for record, seen in zip(records, measured, strict=True)
     ]
-    return Epoch(number, observation, carved, blocks, found, surface, registration, raster, change, statistics)
+    return Epoch(
+        number, seen.observation, carved, blocks, found, surface, registration, raster, change, statistics, seen.depth_maps
+    )
 
 
 def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, count: int) -> list[dict[str, Any]]:

@@ -17,6 +17,8 @@ from pipeline.formats.atomic import write_bytes, write_json
 from pipeline.formats.geotiff import write_geotiff, write_tiff
 from pipeline.formats.laz import write_laz
 from pipeline.formats.ply import write_ply
+from pipeline.look import DepthMaps
+from pipeline.metashape_export import write_metashape_export
 from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
 from pipeline.site import Site
 from pipeline.tiles import tiles
@@ -39,6 +41,7 @@ def write_reference(out: Path, config: SimulationConfig, site: Site, reference: 
         return
     with _folder(out, 0) as folder:
         _write_common(folder, config, site, reference.observation, reference.surface, site.mesh, [])
+        _write_depth_maps(folder, config, reference.depth_maps)
         write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
         record = {
             "epoch": 0,
@@ -55,6 +58,7 @@ def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Refe
     grid = reference.raster.grid
     with _folder(out, epoch.number) as folder:
         _write_common(folder, config, site, epoch.observation, epoch.surface, epoch.carved.mesh, epoch.blocks)
+        _write_depth_maps(folder, config, epoch.depth_maps)
         write_geotiff(
             out / f"{name}.tif", epoch.difference, grid, description="reference minus epoch, m; missing rock is positive"
         )
@@ -131,6 +135,11 @@ def _write_common(
     if wanted or (wanted is None and isinstance(config.wall, ImportedWall)):
         write_laz(folder / "points_world.laz", site.frame.to_world(points), **values)
         write_ply(folder / "surface_world.ply", _in_world(surface, site))
+
+
+def _write_depth_maps(folder: Path, config: SimulationConfig, depth_maps: DepthMaps | None) -> None:
+    if config.products.metashape and depth_maps is not None:
+        write_metashape_export(folder / "metashape", *depth_maps)
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:

@@ -39,8 +39,10 @@ class FusionConfig(Config):
     maximum_reprojection_px: float = Field(2.0, gt=0, description="between the depth maps, in their pixels [px]")
     maximum_depth_ratio: float = Field(0.01, gt=0, description="difference of depths over depth")
     maximum_normal_angle_rad: float = Field(0.35, gt=0, le=np.pi, description="between normals (COLMAP: 10 degrees) [rad]")
-    normal_radius_px: int = Field(2, ge=1, le=20, description="radius of the window that normals are fitted in, depth map pixels")
-    point_weight: float = Field(1.0, ge=0, description="Poisson: weight of the points against the smooth gradient field")
+    normal_radius_px: int = Field(1, ge=1, le=20, description="radius of the window that normals are fitted in, depth map pixels")
+    point_weight: float = Field(
+        4.0, ge=0, description="Poisson: weight of the points against the gradient field (COLMAP: 1; Kazhdan and Hoppe: 4)"
+    )
 
 
 def write_workspace(

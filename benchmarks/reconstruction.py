@@ -1,0 +1,63 @@
+"""Direct triangulation against COLMAP's fusion and Poisson surface, each against the wall as it really is (low quality)."""
+
+from __future__ import annotations
+
+from measure import peak_memory_gb, seconds
+
+from pipeline.depth_maps import DepthMap
+from pipeline.difference import DifferenceConfig, cast_raster, difference, raster_grid, statistics, surface_raster
+from pipeline.mesh import SurfaceConfig, mesh_observation
+from pipeline.reconstruct import FusionConfig, colmap_surface
+from scene.frame import WallFrame
+from scene.keyed_random import KeyedRandom
+from scene.mesh import TriangleMesh
+from scene.procedural import ProceduralWall
+from scene.raycast import RayCaster
+from sensors.exchanged import depth_cameras, observe_right
+from sensors.model import StereoModel, StereoNoise
+from sensors.placement import RigConfig, Target
+from sensors.stereo import StereoPair
+
+GSD_M = 0.05
+NOISE = {
+    "none": StereoNoise(parallax_sigma_px=0.0, regularization_sigma_px=0.0),
+    "matching": StereoNoise(parallax_sigma_px=0.6, regularization_sigma_px=0.25),
+}
+
+
+def main() -> None:
+    random, surface, fusion = KeyedRandom(1), SurfaceConfig(), FusionConfig()
+    world = ProceduralWall(style="glendale", resolution_m=0.0697).mesh(random)
+    cameras = RigConfig(k1=-0.05).place(Target(world))
+    frame = WallFrame.fit(world.vertices, cameras.left.position)
+    caster = RayCaster(world.with_vertices(frame.to_wall(world.vertices)))
+    grid = raster_grid(caster.mesh.bounds, DifferenceConfig(gsd_m=GSD_M))
+    truth = cast_raster(caster, grid)
+    print(f"glendale, {len(world.faces):,} triangles, depth maps at low quality; surface minus truth along z, GSD {GSD_M} m")
+    print("| noise | reconstruction | mean mm | StD mm | RMS mm | NMAD mm | covered | vertices | s |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name, noise in NOISE.items():
+        pair = StereoPair(cameras, frame, StereoModel(noise=noise), "low")
+        left, right = pair.observe(caster, random), observe_right(pair, caster, random)
+        valid = left.valid
+        maps = [DepthMap(camera, seen.depth) for camera, seen in zip(depth_cameras(pair), (left, right), strict=True)]
+        made: dict[str, TriangleMesh] = {}
+
+        def direct(seen=left, made=made) -> None:
+            made["direct"] = mesh_observation(seen, surface)
+
+        def colmap(maps=maps, points=left.points[valid], block=left.block[valid], made=made) -> None:
+            made["colmap"] = colmap_surface(*maps, points, block, surface, fusion)
+
+        for kind, work in (("direct", direct), ("colmap", colmap)):
+            took = seconds(work)
+            error = -difference(truth, surface_raster(made[kind], grid))
+            found = statistics(error)
+            figures = " | ".join(f"{1e3 * value:.1f}" for value in (found.mean, found.standard_deviation, found.rmse, found.nmad))
+            share = found.count / error.size
+            print(f"| {name} | {kind} | {figures} | {share:.3f} | {len(made[kind].vertices):,} | {took:.1f} |")
+    print(f"peak memory {peak_memory_gb():.2f} GB")
+
+
+if __name__ == "__main__":
+    main()
