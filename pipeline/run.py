@@ -52,9 +52,9 @@ def simulate(
     identity = {"schema": SCHEMA, "sensor": sensor, "seed": config.seed, "config": config.model_dump(mode="json")}
     _claim(out, identity, resume)
     random = KeyedRandom(config.seed)
-    with progress.stage("wall"):
-        site = prepare_site(config, sensor, random)
     try:
+        with progress.stage("wall"):
+            site = prepare_site(config, sensor, random)
         reference = observe_reference(config, site, random, progress)
         with progress.stage("epoch 0: write"):
             write_reference(out, config, site, reference)
@@ -64,8 +64,13 @@ def simulate(
                 epoch = observe_epoch(config, site, reference, number, random, progress)
                 with progress.stage(f"epoch {number}: write"):
                     write_epoch(out, config, site, reference, epoch)
+    except InputError:
+        _leave_nothing_half_written(out, resume)
+        raise
     except KeyboardInterrupt:
-        _finish(out, identity, site, progress, complete=False)
+        _remove_unfinished(out)
+        if epoch_folder(out, 0).exists():
+            _finish(out, identity, site, progress, complete=False)
         raise
     with progress.stage("report"):
         return _finish(out, identity, site, progress, complete=True)
@@ -98,8 +103,19 @@ def _claim(out: Path, identity: dict[str, Any], resume: bool) -> None:
             where=f"--out {out}",
             remedy="resume with the same config, sensor and seed, or choose another --out",
         )
+    _remove_unfinished(out)
+
+
+def _remove_unfinished(out: Path) -> None:
     for left in out.glob(".epoch_*"):
         shutil.rmtree(left)
+
+
+def _leave_nothing_half_written(out: Path, resumed: bool) -> None:
+    """After wrong input: remove what this run has written, unless an epoch is finished that could be gone on from."""
+    _remove_unfinished(out)
+    if not resumed and not epoch_folder(out, 1).exists():
+        shutil.rmtree(out)
 
 
 def _finish(out: Path, identity: dict[str, Any], site: Site, progress: Progress, *, complete: bool) -> RunSummary:

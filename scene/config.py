@@ -53,12 +53,11 @@ def load_yaml(path: Path) -> Any:
 
 
 def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
-    """One mistake as `section.key: message (got value)`, with the nearest key for an unknown one."""
-    path = [str(part) for part in item["loc"]]
-    key = ".".join(path)
+    """One mistake as `section.key: message, got value`, with the nearest key for an unknown one."""
+    keys, known = _path(model, item["loc"])
+    key = ".".join(keys)
     if item["type"] == "extra_forbidden":
-        known = _known_keys(model, path[:-1])
-        hint = nearest(path[-1], known) or (f"allowed: {', '.join(sorted(known))}" if known else "")
+        hint = nearest(keys[-1], known) or (f"allowed: {', '.join(sorted(known))}" if known else "")
         return f"unknown key '{key}'; {hint}" if hint else f"unknown key '{key}'"
     if item["type"] == "missing":
         return f"'{key}' is missing"
@@ -68,13 +67,20 @@ def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
     return f"'{key}': {message[0].lower()}{message[1:]}, got {item['input']!r}"
 
 
-def _known_keys(model: type[BaseModel], path: list[str]) -> set[str]:
-    """The field names of the section at `path`, over all the alternatives of a union."""
+def _path(model: type[BaseModel], location: tuple[str | int, ...]) -> tuple[list[str], set[str]]:
+    """The keys that lead to a mistake, without the tags of unions, and the names allowed beside the last of them."""
+    keys: list[str] = []
     models: list[type[BaseModel]] = [model]
-    for part in path:
-        step = [inner for outer in models if part in outer.model_fields for inner in _models_in(outer, part)]
-        models = step or models  # a union's tag or a list's index is no field: stay where we are
-    return {name for found in models for name in found.model_fields}
+    known: set[str] = set()
+    for depth, part in enumerate(location):
+        holders = [found for found in models if part in found.model_fields]
+        if holders or isinstance(part, int) or depth == len(location) - 1:
+            keys.append(str(part))
+        if not isinstance(part, int):
+            known = {name for found in models for name in found.model_fields}
+        if holders:
+            models = [inner for outer in holders for inner in _models_in(outer, str(part))]
+    return keys, known
 
 
 def _models_in(model: type[BaseModel], field: str) -> list[type[BaseModel]]:

@@ -26,11 +26,11 @@ class Wall:
 def _kind(values: Any) -> str:
     """The key `mesh` makes it an imported wall."""
     named = "mesh" in values if isinstance(values, Mapping) else isinstance(values, ImportedWall)
-    return "mesh" if named else "style"
+    return "imported" if named else "procedural"
 
 
 WallConfig = Annotated[
-    Annotated[ProceduralWall, Tag("style")] | Annotated[ImportedWall, Tag("mesh")],
+    Annotated[ProceduralWall, Tag("procedural")] | Annotated[ImportedWall, Tag("imported")],
     Discriminator(_kind),
 ]
 

@@ -20,7 +20,7 @@ _FULL = {
     errno.EFBIG: "the file exceeds the size limit",
 }
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
-_NO_SUCH_PLACE = {errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EEXIST}
+_NO_SUCH_PLACE = {errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOENT}
 _ELSEWHERE = "choose another folder with --out"
 
 

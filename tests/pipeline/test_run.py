@@ -246,7 +246,7 @@ def test_what_cannot_be_simulated_ends_in_one_clear_line(
     with pytest.raises(InputError, match=message) as caught:
         simulate(config(**changes), sensor, tmp_path / "run")
     assert "\n" not in str(caught.value)
-    assert not list((tmp_path / "run").glob("epoch_001*"))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
