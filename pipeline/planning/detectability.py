@@ -8,9 +8,10 @@ otherwise). Two epochs are compared over the floor of the niche, along its norma
 
 1  Points. The sensor's rays meet the surface in a lattice with steps a and b, so that a patch of w_a x w_b holds N = N_a N_b
    points, N_a = floor(w_a/a) or one more; the latter with probability frac(w_a/a), for a place that owes nothing to the lattice.
-   The mean is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. Seen obliquely, the lattice falls elsewhere on the
-   floor than on the face of the block, so that the two epochs' numbers N_1 and N_2 are independent. Fewer than
-   `minimum_points` in one of them make no test.
+   The mean is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. On the floor the lattice lies shifted by h t_a
+   (t: tangents below) against the block's face, a share delta = frac(h t_a/a) of a step, so with rho = frac(w_a/a) both epochs
+   have the line more with probability max(0, rho - delta) + max(0, rho + delta - 1). Fewer than `minimum_points` in an epoch
+   make no test.
 2  Shadow. Seen along a direction with the tangents t_a, t_b against the normal, the niche's rim hides h t_a and h t_b of its
    floor; several viewpoints hide on both sides: w_a = s - h (max(0, t_a...) - min(0, t_a...)). Both epochs are compared over what
    is left.
@@ -18,8 +19,11 @@ otherwise). Two epochs are compared over the floor of the niche, along its norma
    patch's mean keeps c_m^2 and shows c^2 - c_m^2 as spread. With sigma^2 = w^2 + c^2 - c_m^2 and the registration's error
    ~ N(0, reg^2):
        D ~ N(h, tau^2),  tau^2 = w^2/N_1 + w^2/N_2 + 2 c_m^2 + reg^2,      se^2 = sigma^2/N_1 + sigma^2/N_2
+   A beam that leaves in another direction than recorded, by b_a on the surface, misses the floor near its edge: the share
+   f_a = erf(r) - (1 - exp(-r^2))/(r sqrt(pi)), r = w_a/(b_a sqrt(2)), hits it. With f = f_a f_b the change is f h in the mean,
+   and the points after the fall scatter by f (1 - f) h^2 more.
 4  Test. s1, s2 are estimates from the same points, so (D - z reg)/se^ times se/tau is noncentral t with
-   nu = (1/N_1 + 1/N_2)^2 / (1/(N_1^2 (N_1 - 1)) + 1/(N_2^2 (N_2 - 1))) (Welch, Satterthwaite) and delta = (h - z reg)/tau:
+   nu = se^4 / (se_1^4/(N_1 - 1) + se_2^4/(N_2 - 1)) (Welch, Satterthwaite) and delta = (f h - z reg)/tau:
        P(detected | N_1, N_2) = P(T_nu(delta) > q),  q = z se/tau  ~  1 - Phi((q (1 - 1/(4 nu)) - delta) / sqrt(1 + q^2/(2 nu)))
    (Abramowitz & Stegun 26.7.10, within 0.005 from nu = 4). For white noise and N_1 = N_2 the noncentral t is exact, and for many
    points P is Phi((h - LoD)/se).
@@ -27,11 +31,13 @@ otherwise). Two epochs are compared over the floor of the niche, along its norma
 
 Limits: the wall is a plane over the block, as steep as its normal at that place; roughness that is not the same in both epochs is
 not counted, nor are points of the niche's side walls, which help; a niche whose floor is hidden altogether counts as not seen.
-The block lies along the lattice; a turned one has the same mean number of points.
+Seen very obliquely, beams that miss the floor are taken to hit the face, where some hit a side wall: the
+probability is then somewhat low. The block lies along the lattice; a turned one has the same mean number of points.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated
@@ -39,7 +45,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 from scipy.integrate import cumulative_trapezoid
-from scipy.special import ndtr
+from scipy.special import erf, ndtr
 
 from scene.config import Config
 from scene.mesh import FloatArray
@@ -72,8 +78,9 @@ class Sampling:
     """What a sensor puts on n places of a surface; all (n,) or numbers.
 
     step_a, step_b: of the lattice of points on the surface, along two perpendicular directions, m; shadow_a, shadow_b: hidden
-    width of a niche's floor over its depth; white: standard deviation of a point along the normal, m; smooth: of a smooth error
-    whose nodes are grain_a, grain_b apart, averaged over places, m.
+    width of a niche's floor over its depth; white: standard deviation of a point along the normal, m; slope_a, slope_b: tangents
+    of the rays that make the lattice against the normal; blur_a, blur_b: standard deviation of where on the surface a point
+    really lies, m; smooth: of a smooth error along the normal whose nodes are grain_a, grain_b apart, averaged over places, m.
     """
 
     step_a: FloatArray
@@ -81,18 +88,20 @@ class Sampling:
     shadow_a: FloatArray
     shadow_b: FloatArray
     white: FloatArray
+    slope_a: FloatArray | float = 0.0
+    slope_b: FloatArray | float = 0.0
+    blur_a: FloatArray | float = 0.0
+    blur_b: FloatArray | float = 0.0
     smooth: FloatArray | float = 0.0
     grain_a: FloatArray | float = np.inf
     grain_b: FloatArray | float = np.inf
 
 
-def lattice(
-    step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights: list[FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Steps and shadows (step_a, step_b, shadow_a, shadow_b) of a `Sampling`.
+def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights: Sequence[FloatArray]) -> dict[str, FloatArray]:
+    """The steps, shadows and slopes of a `Sampling`, by name.
 
     step_a, step_b: (n, 3) steps of the lattice on the surface, m, taken as the rectangle of the same area along step_a;
-    sights: (n, 3) each, from the viewpoints to the places, any length.
+    sights: (n, 3) each, from the viewpoints to the places, any length; the lattice is made by the first.
     """
     length = np.linalg.norm(step_a, axis=1)
     width = np.linalg.norm(np.cross(step_a, step_b), axis=1) / length
@@ -104,7 +113,9 @@ def lattice(
         for axis in (axis_a, axis_b)
     ]
     shadow_a, shadow_b = (np.maximum(0, tangent.max(axis=0)) - np.minimum(0, tangent.min(axis=0)) for tangent in tangents)
-    return length, width, shadow_a, shadow_b
+    slope_a, slope_b = (tangent[0] for tangent in tangents)
+    steps = {"step_a": length, "step_b": width}
+    return {**steps, "shadow_a": shadow_a, "shadow_b": shadow_b, "slope_a": slope_a, "slope_b": slope_b}
 
 
 def detection_probability(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
@@ -112,13 +123,15 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))
     kept = sampling.smooth**2 * _kept(width_a / sampling.grain_a) * _kept(width_b / sampling.grain_b)
-    spread = sampling.white**2 + np.maximum(sampling.smooth**2 - kept, 0.0)
+    hit = _hit(width_a, sampling.blur_a) * _hit(width_b, sampling.blur_b)
+    white = np.stack([sampling.white**2, sampling.white**2 + hit * (1 - hit) * depth**2])
+    spread = white + np.maximum(sampling.smooth**2 - kept, 0.0)
     total = np.zeros(np.broadcast(width_a, width_b, sampling.white).shape)
-    counts = _counts(width_a / sampling.step_a, width_b / sampling.step_b)
-    for before, share_before in counts:
-        for after, share_after in counts:
-            found = _exceeds(depth, (before, after), sampling.white**2, spread, kept, config)
-            total += share_before * share_after * np.where(np.minimum(before, after) >= config.minimum_points, found, 0.0)
+    for lines_a, share_a in _lines(width_a / sampling.step_a, depth * sampling.slope_a / sampling.step_a):
+        for lines_b, share_b in _lines(width_b / sampling.step_b, depth * sampling.slope_b / sampling.step_b):
+            points = lines_a * lines_b
+            found = _exceeds(hit * depth, points, white, spread, kept, config)
+            total += share_a * share_b * np.where(points.min(axis=0) >= config.minimum_points, found, 0.0)
     return total
 
 
@@ -133,29 +146,35 @@ def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
     return np.where(possible, np.exp(high), np.nan)
 
 
-def _counts(steps_a: FloatArray, steps_b: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """The four possible numbers of lattice points in a patch of steps_a x steps_b steps, each with its probability."""
-    (fewer_a, rest_a), (fewer_b, rest_b) = ((np.floor(steps), steps % 1.0) for steps in (steps_a, steps_b))
-    lines_a, lines_b = ([(fewer, 1 - rest), (fewer + 1, rest)] for fewer, rest in ((fewer_a, rest_a), (fewer_b, rest_b)))
-    return [(a * b, share_a * share_b) for a, share_a in lines_a for b, share_b in lines_b]
+def _lines(steps: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """The four cases of how many lattice lines fall in a width of `steps` steps, and their probabilities.
+
+    Each case holds the numbers before and after, (2, n); shift: of the lattice between the two, in steps.
+    """
+    fewer, rest, shift = np.floor(steps), steps % 1.0, shift % 1.0
+    both = np.maximum(0.0, rest - shift) + np.maximum(0.0, rest + shift - 1.0)
+    shares = {(0, 0): 1 - 2 * rest + both, (0, 1): rest - both, (1, 0): rest - both, (1, 1): both}
+    return [(np.stack([fewer + before, fewer + after]), share) for (before, after), share in shares.items()]
+
+
+def _hit(width: FloatArray, blur: FloatArray | float) -> FloatArray:
+    """The share f_a of the points recorded in a width that really lie in it (step 3 of the module)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.maximum(width / (np.sqrt(2) * blur), 1e-9)
+        share = erf(ratio) - (1 - np.exp(-(ratio**2))) / (ratio * np.sqrt(np.pi))
+    return np.where(blur > 0, share, 1.0)
 
 
 def _exceeds(
-    depth: FloatArray,
-    points: tuple[FloatArray, FloatArray],
-    white: FloatArray,
-    spread: FloatArray,
-    kept: FloatArray,
-    config: PlanningConfig,
+    change: FloatArray, points: FloatArray, white: FloatArray, spread: FloatArray, kept: FloatArray, config: PlanningConfig
 ) -> FloatArray:
-    """P(detected | N_1, N_2), steps 3 and 4 of the module; white, spread, kept are variances, m2."""
-    z, registration = config.critical_value, config.registration_sigma_m
-    first, second = (np.maximum(number, 2.0) for number in points)
-    inverse = 1 / first + 1 / second
-    freedom = inverse**2 / (1 / (first**2 * (first - 1)) + 1 / (second**2 * (second - 1)))
-    tau = np.maximum(np.sqrt(white * inverse + 2 * kept + registration**2), 1e-12)  # without noise a step function
-    q = z * np.sqrt(spread * inverse) / tau
-    delta = (depth - z * registration) / tau
+    """P(detected | N_1, N_2), step 4 of the module; points, white, spread: (2, n) before and after; the latter and kept: m2."""
+    z, registration, number = config.critical_value, config.registration_sigma_m, np.maximum(points, 2.0)
+    squared = spread / number
+    error = np.maximum(squared.sum(axis=0), 1e-24)  # without noise a step function
+    freedom = error**2 / np.maximum((squared**2 / (number - 1)).sum(axis=0), 1e-48)
+    tau = np.maximum(np.sqrt((white / number).sum(axis=0) + 2 * kept + registration**2), 1e-12)
+    q, delta = z * np.sqrt(error) / tau, (change - z * registration) / tau
     return ndtr((delta - q * (1 - 1 / (4 * freedom))) / np.sqrt(1 + q**2 / (2 * freedom)))
 
 

@@ -99,11 +99,11 @@ def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.
         in_left=_in_frame(nominal.left, places.points),
         in_right=_in_frame(nominal.right, places.points),
         sampling=Sampling(
-            *steps,
+            **steps,
             white=np.sqrt(np.maximum(normal_variance - smooth**2, 0.0)),
             smooth=smooth,
-            grain_a=steps[0] / cell * noise.step,
-            grain_b=steps[1] / cell * noise.step,
+            grain_a=steps["step_a"] / cell * noise.step,
+            grain_b=steps["step_b"] / cell * noise.step,
         ),
     )
 

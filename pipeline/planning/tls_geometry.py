@@ -88,6 +88,7 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
     ray, step = sight * range_m[:, None], scanner.pattern
     line = slide(ray, rising_azimuth * (range_m * np.sin(zenith) * step.azimuth_step)[:, None], places.normals)
     pulse = slide(ray, rising_zenith * (range_m * step.zenith_step)[:, None], places.normals)
+    steps = lattice(line, pulse, places.normals, [sight])
     footprint = _divergence(effects) * range_m
     return TlsGeometry(
         range_m=range_m,
@@ -103,7 +104,12 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
         normal_sigma_m=normal_sigma,
         power=echo.power,
         reached=_reached(scanner, effects, azimuth, zenith, echo),
-        sampling=Sampling(*lattice(line, pulse, places.normals, [sight]), normal_sigma),
+        sampling=Sampling(
+            **steps,
+            white=normal_sigma,
+            blur_a=steps["step_a"] * sigma[:, 1] / (range_m * np.sin(zenith) * step.azimuth_step),
+            blur_b=steps["step_b"] * sigma[:, 2] / (range_m * step.zenith_step),
+        ),
     )
 
 
