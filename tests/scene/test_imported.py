@@ -7,7 +7,6 @@ import pytest
 import trimesh
 
 from scene.cleaning import clean, unique_rows, weld
-from scene.errors import InputError
 from scene.imported import ImportedWall
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
