@@ -1,6 +1,7 @@
 """Detection probability of niches: the closed form of `scarpsim inspect` against simulated observations of a flat wall.
 
 To reach: the standardised difference of each row within +-3.3 (one row in a thousand lies outside by chance).
+Rows at 45 degrees with a handful of points per niche may miss it: see the limits in pipeline/planning/detectability.py.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from pipeline.difference import DifferenceStatistics, statistics
@@ -122,7 +123,11 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
         for colour, (name, values) in zip(_FAMILY * len(panel.curves), panel.curves.items(), strict=False):
             axes.plot(panel.x, 100 * np.asarray(values), color=colour, linewidth=1.5, label=name)
         axes.axvline(panel.at, color="0.3", linewidth=0.8, linestyle="--", label="this set-up")
-        axes.set_xscale("log" if panel.logarithmic else "linear")
+        if panel.logarithmic:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylim(-2, 102)
         _dress(axes, panel.label, y_label)
         axes.label_outer()
