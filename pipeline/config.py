@@ -15,7 +15,7 @@ from pipeline.formats.cameras import PairConfig, read_cameras_yaml
 from pipeline.mesh import SurfaceConfig
 from pipeline.overrides import apply_overrides
 from pipeline.planning.detectability import PlanningConfig
-from pipeline.presets import is_path, with_preset
+from pipeline.presets import is_path, model_file, with_preset
 from pipeline.reconstruct import FusionConfig, Reconstruction
 from pipeline.register import IcpConfig
 from pipeline.tiles import TileConfig
@@ -173,7 +173,7 @@ def load_config(path: Path, overrides: Sequence[str], sensor: SensorName | None,
         values = {"sensor": [values]}
     values = apply_overrides(_with_paths(values, path.parent), overrides)
     if isinstance(values.get("sensor"), str):
-        values["sensor"] = load_yaml(Path(values["sensor"]))
+        values["sensor"] = load_yaml(model_file(values["sensor"]))
     if seed is not None:
         values["seed"] = seed
     config = parse(SimulationConfig, values, str(path))
@@ -196,11 +196,12 @@ def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     for section, key in (("wall", "mesh"), ("cameras", "file")):
         if isinstance(result.get(section), dict) and key in result[section]:
             result[section] = {**result[section], key: absolute(result[section][key])}
-    for key in ("cameras", "sensor"):
-        result = {**result, key: absolute(result[key])} if isinstance(result.get(key), str) else result
+    if isinstance(result.get("cameras"), str):
+        result["cameras"] = absolute(result["cameras"])
+    for key in ("scanner", "sensor"):
+        if isinstance(result.get(key), str) and is_path(result[key]):
+            result[key] = absolute(result[key])
     scanner = result.get("scanner")
-    if isinstance(scanner, str) and is_path(scanner):
-        result["scanner"] = absolute(scanner)
-    elif isinstance(scanner, dict) and isinstance(scanner.get("preset"), str) and is_path(scanner["preset"]):
+    if isinstance(scanner, dict) and isinstance(scanner.get("preset"), str) and is_path(scanner["preset"]):
         result["scanner"] = {**scanner, "preset": absolute(scanner["preset"])}
     return result

@@ -1,4 +1,4 @@
-"""Scanner presets as files: those in configs/scanners by name, a user's own by path."""
+"""Scanner presets and sensor models as files: those in configs/scanners and configs/noise by name, a user's own by path."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sensors.presets import ScannerPreset
 
 
 def is_path(name: str) -> bool:
-    """Whether a preset is named by a file instead of by a bundled preset's name."""
+    """Whether a preset or model is named by a file instead of by a bundled one's name."""
     return name.endswith((".yaml", ".yml")) or "/" in name or "\\" in name
 
 
@@ -22,6 +22,11 @@ def read_preset(name: str) -> ScannerPreset:
     """
     path = Path(name) if is_path(name) else bundled_config("scanners", name)
     return parse(ScannerPreset, load_yaml(path), str(path))
+
+
+def model_file(name: str) -> Path:
+    """The file of a sensor model: a bundled name such as `glendale_high`, or a YAML file itself."""
+    return Path(name) if is_path(name) else bundled_config("noise", name)
 
 
 def with_preset(values: dict[str, Any]) -> dict[str, Any]:
