@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from scene.cleaning import clean, unique_rows, weld
+from scene.errors import InputError
 from scene.imported import ImportedWall
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
@@ -245,3 +246,67 @@ def test_flipped_turns_the_faces_round(tmp_path):
     plain, _ = ImportedWall(mesh=tmp_path / "wall.obj").load()
     turned, _ = ImportedWall(mesh=tmp_path / "wall.obj", flipped=True).load()
     np.testing.assert_array_equal(turned.faces, plain.faces[:, ::-1])
+
+
+def broken(vertex):
+    mesh = sheet()
+    mesh.vertices[[7, 9]] = vertex
+    return mesh
+
+
+def line():
+    return TriangleMesh(np.arange(9.0)[:, None] * [1.0, 2.0, 3.0], np.arange(9, dtype=np.int32).reshape(3, 3))
+
+
+WRONG = {
+    "nan": (broken(np.nan), {}, r"2 of 48 vertices are not finite, the first is vertex 7 at \(nan, nan, nan\); allowed: finite"),
+    "infinite": (broken(np.inf), {}, r"2 of 48 vertices are not finite, the first is vertex 7 at \(inf"),
+    "empty": (replace(sheet(), faces=np.empty((0, 3), np.int32)), {}, "holds no triangles"),
+    "line": (line(), {}, "no triangle has an area"),
+    "millimetres": (sheet(step=1e4), {}, r"7e\+04 m in size with `unit: m`; allowed: 0.5 m to 5000 m; set `unit` to cm or mm"),
+    "tiny": (sheet(), {"unit": "mm"}, "set `unit` to m or ft"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_each_wrong_mesh_is_answered_in_one_line(tmp_path, name):
+    mesh, keys, words = WRONG[name]
+    path = written(tmp_path / "wall.ply", mesh)
+    with pytest.raises(InputError, match=words) as caught:
+        load(path, **keys)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("missing.ply", None, "there is no such file"),
+        ("wall.plx", b"", "'.plx' is no mesh format that can be read; allowed: .*did you mean 'ply'"),
+        ("wall.pkl", b"cos\nsystem\n", "'.pkl' is no mesh format"),
+        ("wall.ply", b"this is no mesh", "is not a valid ply file"),
+        ("empty.ply", b"", "is not a valid ply file"),
+        ("cut.off", b"OFF\n3 1 0\n0 0 0\n", "is not a valid off file"),
+        ("wild.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7 of 3|is not a valid off file"),
+        ("points.xyz", b"0 0 0\n1 0 0\n0 1 0\n", "holds no triangles"),
+    ],
+)
+def test_each_wrong_file_is_answered_in_one_line(tmp_path, name, content, words):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_one_sided_surface_is_refused():
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    centre = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    across = 0.3 * np.stack([np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)], axis=1)
+    vertices = np.stack([centre + across, centre - across], axis=1).reshape(-1, 3)
+    near, far = 2 * np.arange(12), 2 * np.arange(12) + 1
+    next_near, next_far = np.append(near[1:], far[0]), np.append(far[1:], near[0])
+    faces = np.concatenate([np.stack([near, far, next_near], 1), np.stack([far, next_far, next_near], 1)]).astype(np.int32)
+    with pytest.raises(InputError, match="only one side"):
+        clean(TriangleMesh(vertices, faces), "strip")
