@@ -111,7 +111,7 @@ def _choices(annotation: Any) -> str:
         return f"one of {', '.join(words)}" if len(words) > 1 else ""
     if isinstance(annotation, type) and issubclass(annotation, Enum):
         return f"one of {', '.join(str(member.value) for member in annotation)}"
-    named = [kind for option in _sections(annotation) if (kind := _kind(option))]
+    named = dict.fromkeys(kind for option in _sections(annotation) if (kind := _kind(option)))
     return f"kinds: {', '.join(named)}" if len(named) > 1 else ""
 
 

@@ -12,7 +12,7 @@ from scene.errors import InputError
 
 SUMMARY = "observe a rock wall before and after rocks fall, and map the differences"
 EXAMPLE = """  simulate --sensor tls
-  simulate --sensor stereo --config my_site.yaml --seed 7 --set blocks.count=200 --out runs/my_site"""
+  simulate --sensor stereo --config my_site.yaml --seed 7 --set rockfall.count=200 --out runs/my_site"""
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """The variables by which the numerical libraries learn how many threads they may use."""
 
