@@ -44,7 +44,7 @@ for camera in chunk.cameras:
 chunk.importCameras(str(FOLDER / "cameras.xml"), format=Metashape.CamerasFormatXML)
 
 loaded = [camera.label for camera in chunk.depth_maps.keys()] if chunk.depth_maps else []
-unposed = [camera.label for camera in chunk.cameras if not camera.transform]
+unposed = [camera.label for camera in chunk.cameras if camera.transform is None]
 if sorted(loaded) != sorted(SIDES) or unposed:
     raise RuntimeError("depth maps: %s; cameras without a pose: %s" % (loaded, unposed))
 print("Loaded: %s. Next: Workflow > Build Model, source data: Depth maps." % ", ".join(loaded))
