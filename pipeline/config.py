@@ -26,6 +26,7 @@ from scene.illumination import IlluminationConfig
 from scene.procedural import ProceduralWall
 from scene.texture import TextureConfig
 from scene.wall import WallConfig
+from scene.wetness import WetnessConfig
 from sensors.camera import CameraPair
 from sensors.exposure import ExposureConfig
 from sensors.matching import MatchingConfig
@@ -89,6 +90,7 @@ class SimulationConfig(Config):
     epochs: int = Field(1, ge=1, le=9999, description="epochs after the reference, each with rockfalls of its own")
     wall: WallConfig = ProceduralWall()
     rockfall: RockfallConfig = RockfallConfig()
+    wetness: WetnessConfig | None = Field(None, description="wet patches of the rock, in every epoch; none: dry")
     sensor: tuple[SensorModel, ...] = Field((), description="sensor models (noise and effects), at most one of each sensor")
     cameras: CamerasConfig = RigConfig()
     depth_map: Quality = Field("medium", description="depth map at 1/2 (high), 1/4 (medium), 1/8 (low) of the frame")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -66,7 +66,7 @@ STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "differenc
 def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom, progress: Progress) -> Reference:
     """Observe the untouched wall, reconstruct and rasterise it; `random` is the run's."""
     with progress.stage("epoch 0: observe"):
-        caster = RayCaster(site.mesh)
+        caster = RayCaster(as_observed(config, site.mesh))
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, where)
         seen = look(config, site, caster, random.child("epoch", 0, "observe"))
@@ -89,6 +89,7 @@ def observe_epoch(
     with progress.stage(f"epoch {number}: carve"):
         blocks = place_blocks(config.rockfall, site.mesh, keyed.child("blocks"), reference.caster)
         carved = carve(site.mesh, blocks)
+        carved = replace(carved, mesh=as_observed(config, carved.mesh))
         records = carved_records(blocks, carved.removed_volume_m3)
     with progress.stage(f"epoch {number}: observe"):
         seen = look(config, site, RayCaster(carved.mesh), keyed.child("observe"))
@@ -111,6 +112,11 @@ def observe_epoch(
     return Epoch(
         number, seen.observation, carved, blocks, found, surface, registration, raster, change, statistics, seen.depth_maps
     )
+
+
+def as_observed(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:
+    """The wall in the state that sensors meet: wet where the config says so."""
+    return mesh if config.wetness is None else config.wetness.wetted(mesh)
 
 
 def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, count: int) -> list[dict[str, Any]]:

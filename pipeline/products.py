@@ -40,7 +40,7 @@ def write_reference(out: Path, config: SimulationConfig, site: Site, reference: 
     if epoch_folder(out, 0).exists() or reference.observation is None:
         return
     with _folder(out, 0) as folder:
-        _write_common(folder, config, site, reference.observation, reference.surface, site.mesh, [])
+        _write_common(folder, config, site, reference.observation, reference.surface, reference.caster.mesh, [])
         _write_depth_maps(folder, config, reference.depth_maps)
         write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
         record = {

@@ -105,7 +105,7 @@ class ScannerPreset(Config):
             known["zenith_limits_rad"] = tuple(float(np.radians(limit)) for limit in self.zenith_limits_deg.value)
         for key, figure in (("azimuth_step_rad", self.azimuth_step_deg), ("zenith_step_rad", self.zenith_step_deg)):
             known |= {} if figure is None else {key: float(np.radians(figure.value))}
-        for key in ("pulse_rate_hz", "minimum_range_m", "maximum_range_m"):
+        for key in ("pulse_rate_hz", "minimum_range_m", "maximum_range_m", "wavelength_nm"):
             figure = getattr(self, key)
             known |= {} if figure is None else {key: figure.value}
         return known

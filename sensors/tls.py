@@ -15,6 +15,7 @@ from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray
 from scene.raycast import RayCaster
+from sensors.atmosphere import extinction_per_m
 from sensors.camera import axis_rotation
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Stage, apply_stage
@@ -40,6 +41,8 @@ class ScannerConfig(Config):
     pulse_rate_hz: float = Field(100_000.0, gt=0, description="pulses per second [Hz]")
     minimum_range_m: float = Field(1.0, ge=0, description="nearest range that is recorded [m]")
     maximum_range_m: float = Field(1000.0, gt=0, description="farthest range that is recorded [m]")
+    visibility_m: float | None = Field(None, gt=0, description="haze or fog weakens the echoes; none: clear air [m]")
+    wavelength_nm: float = Field(1550.0, ge=300, le=3000, description="of the laser, for the extinction in haze [nm]")
 
     @model_validator(mode="after")
     def _ordered(self) -> ScannerConfig:
@@ -52,6 +55,11 @@ class ScannerConfig(Config):
         if self.minimum_range_m >= self.maximum_range_m:
             raise ValueError("minimum_range_m must be smaller than maximum_range_m")
         return self
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of the air, 1/m; 0 where no visibility is given."""
+        return 0.0 if self.visibility_m is None else extinction_per_m(self.visibility_m, self.wavelength_nm)
 
 
 @dataclass(frozen=True)
@@ -170,10 +178,12 @@ class LaserScanner:
         )
 
     def _echo(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
-        """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2, relative."""
+        """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
         hits = scene.intersect(vector(self.position), ray)
         cos_incidence = -dr.dot(hits.normal, mi.Vector3f(ray))
         power = hits.albedo * cos_incidence * dr.square(REFERENCE_RANGE_M / mi.Float32(hits.distance))
+        if self.config.extinction_per_m > 0:
+            power *= dr.exp(dr.opaque(mi.Float32, -2 * self.config.extinction_per_m) * mi.Float32(hits.distance))
         nearest, farthest = opaque(self.config.minimum_range_m, self.config.maximum_range_m)
         in_reach = (hits.distance >= nearest) & (hits.distance <= farthest)
         returned = hits.valid & (cos_incidence > 0) & in_reach

@@ -80,7 +80,7 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
     azimuth, zenith = np.arctan2(local[:, 1], local[:, 0]), np.arccos(local[:, 2] / range_m)
     sight, rising_azimuth, rising_zenith = (turned(scanner.rotation, axis) for axis in _axes(azimuth, zenith))
     cosine = -np.einsum("ni,ni->n", sight, places.normals)
-    echo = Echoes(range_m, cosine, _power(places.albedo, cosine, range_m))
+    echo = Echoes(range_m, cosine, _power(scanner, places.albedo, cosine, range_m))
     axes = np.stack([sight, rising_azimuth, rising_zenith], axis=1)
     sigma = np.stack([_range_sigma(effects, echo), *_across_sigma(effects, range_m, zenith)], axis=1)
     covariance = np.einsum("nk,nki,nkj->nij", sigma**2, axes, axes)
@@ -121,9 +121,10 @@ def _axes(azimuth: FloatArray, zenith: FloatArray) -> list[FloatArray]:
     return [np.stack(column, axis=1) for column in columns]
 
 
-def _power(albedo: FloatArray, cosine: FloatArray, range_m: FloatArray) -> FloatArray:
-    """The lidar range equation, rho cos i / R^2, relative to albedo 1, hit squarely, at 100 m."""
-    return albedo * np.maximum(cosine, 0.0) * np.square(REFERENCE_RANGE_M / range_m)
+def _power(scanner: LaserScanner, albedo: FloatArray, cosine: FloatArray, range_m: FloatArray) -> FloatArray:
+    """The lidar range equation, rho cos i / R^2 exp(-2 sigma R), relative to albedo 1, hit squarely, at 100 m, in clear air."""
+    power = albedo * np.maximum(cosine, 0.0) * np.square(REFERENCE_RANGE_M / range_m)
+    return power * np.exp(-2 * scanner.config.extinction_per_m * range_m)
 
 
 def _range_sigma(effects: tuple[Effect, ...], echo: Echoes) -> FloatArray:
