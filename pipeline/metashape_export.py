@@ -34,6 +34,7 @@ SIDES = ("left", "right")
 
 chunk = Metashape.app.document.addChunk()
 chunk.label = "scarpsim " + FOLDER.parent.name
+(FOLDER / "imported").mkdir(exist_ok=True)
 chunk.importDepthImages(
     filenames=[str(FOLDER / "depth" / (side + ".tif")) for side in SIDES],
     color_filenames=[str(FOLDER / "images" / (side + ".png")) for side in SIDES],
@@ -58,7 +59,6 @@ def write_metashape_export(folder: Path, left: DepthMap, right: DepthMap) -> Non
     """
     maps = dict(zip(SIDES, (left, right), strict=True))
     write_metashape(folder / "cameras.xml", {side: source.camera for side, source in maps.items()})
-    (folder / "imported").mkdir(parents=True, exist_ok=True)  # where Metashape writes the images it prepares
     for side, source in maps.items():
         depth = np.nan_to_num(source.depth, nan=0.0)
         write_tiff(folder / "depth" / f"{side}.tif", depth, description="depth along the camera's axis, m; 0: none")

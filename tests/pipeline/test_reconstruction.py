@@ -181,7 +181,7 @@ def test_a_run_by_colmap_shows_the_blocks(pycolmap: Any, tmp_path: Path) -> None
     assert statistics["inside_blocks"]["median_m"] > 0.05
     for number in (0, 1):
         folder = tmp_path / f"run/epoch_{number:03d}/metashape"
-        assert {path.name for path in folder.iterdir()} == {"cameras.xml", "depth", "images", "imported", "load_depth_maps.py"}
+        assert {path.name for path in folder.iterdir()} == {"cameras.xml", "depth", "images", "load_depth_maps.py"}
 
 
 def test_a_scan_has_no_depth_maps_to_fuse(tmp_path: Path) -> None:
