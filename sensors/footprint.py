@@ -20,7 +20,7 @@ import numpy as np
 from scene.backend import dr, mi
 from scene.mesh import FloatArray
 
-Mode = Literal["first", "strongest", "mean"]
+Mode = Literal["first", "strongest", "mean", "multiple"]
 Ranging = Literal["pulse", "phase"]
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
@@ -45,9 +45,9 @@ class Echo:
 class Beam:
     """A beam and its receiver: a pencil unless a footprint effect widens it.
 
-    divergence_rad: full angle, 1/e^2; sub_rays: 1 + 3 m (m + 1) for m rings; mode: which return of several is recorded;
-    separation_m: echoes nearer to each other than this run into one return (c tau / 2); modulation_wavelength_m: of a phase
-    scanner's finest measuring wave, None for pulses.
+    divergence_rad: full angle, 1/e^2; sub_rays: 1 + 3 m (m + 1) for m rings; mode: which return of several is recorded,
+    multiple: the strongest and beside it all others; separation_m: echoes nearer to each other than this run into one return
+    (c tau / 2); modulation_wavelength_m: of a phase scanner's finest measuring wave, None for pulses.
     """
 
     divergence_rad: float = 0.0
@@ -68,7 +68,7 @@ class Beam:
         """The recorded return of every pulse, from the echoes of its sub-rays."""
         if len(echoes) == 1:
             return echoes[0]
-        echoes = [replace(echo, range_m=dr.select(echo.returned, echo.range_m, _NOWHERE_M)) for echo in echoes]
+        echoes = _with_misses_last(echoes)
         if self.modulation_wavelength_m is not None:
             return _in_phase(echoes, self.modulation_wavelength_m)
         if self.mode == "mean":
@@ -76,13 +76,46 @@ class Beam:
         low, high = self._extent(echoes)
         return _merged(echoes, [echo.returned & (echo.range_m >= low) & (echo.range_m <= high) for echo in echoes])
 
+    @property
+    def records_several(self) -> bool:
+        """Whether there may be returns beside the one of `received`."""
+        return self.mode == "multiple" and self.sub_rays > 1 and self.modulation_wavelength_m is None
+
+    def count(self, echoes: Sequence[Echo]) -> mi.UInt32:
+        """(n,) how many returns every pulse has."""
+        (high, energy), *others = self._sorted(_with_misses_last(echoes))
+        gap, number = dr.opaque(mi.Float64, self.separation_m), dr.select(energy > 0, mi.UInt32(1), 0)
+        for range_m, power in others:
+            number += dr.select((range_m - high > gap) & (power > 0), mi.UInt32(1), 0)
+            high = range_m
+        return number
+
+    def numbered(self, echoes: Sequence[Echo], number: mi.UInt32) -> tuple[Echo, mi.Bool]:
+        """The return of a number, counted by range from 1, and whether it is the one of `received`, the strongest."""
+        echoes = _with_misses_last(echoes)
+        (first, _), *others = self._sorted(echoes)
+        gap, current = dr.opaque(mi.Float64, self.separation_m), mi.UInt32(1)
+        low = high = previous = first
+        for range_m, _ in others:
+            starts = range_m - previous > gap
+            current += dr.select(starts, mi.UInt32(1), 0)
+            low = dr.select(starts & (current == number), range_m, low)
+            high = dr.select(current == number, range_m, high)
+            previous = range_m
+        chosen = _merged(echoes, [echo.returned & (echo.range_m >= low) & (echo.range_m <= high) for echo in echoes])
+        return chosen, low == self._extent(echoes)[0]
+
+    def _sorted(self, echoes: Sequence[Echo]) -> list[tuple[mi.Float64, mi.Float32]]:
+        """(range, power) of the echoes by range, those that did not return last and without power."""
+        return _by_range([(echo.range_m, dr.select(echo.returned, echo.power, mi.Float32(0))) for echo in echoes])
+
     def _extent(self, echoes: Sequence[Echo]) -> tuple[mi.Float64, mi.Float64]:
         """Nearest and farthest range of the recorded return's echoes.
 
         A return is a chain of echoes, sorted by range, each within the separation of the one before: no bins, so no bias.
         """
         zero, gap = mi.Float32(0), dr.opaque(mi.Float64, self.separation_m)
-        (low, energy), *others = _by_range([(echo.range_m, dr.select(echo.returned, echo.power, zero)) for echo in echoes])
+        (low, energy), *others = self._sorted(echoes)
         high, recorded, most = low, (low, low), energy
         for range_m, power in others:
             joins = range_m - high <= gap
@@ -119,6 +152,11 @@ def _ring_radius(inner: float, outer: float) -> float:
         return 0.0 if fraction == 1 else (1 - np.log1p(-fraction)) * (1 - fraction)
 
     return float(np.sqrt((tail(inner) - tail(outer)) / (outer - inner) / 8))
+
+
+def _with_misses_last(echoes: Sequence[Echo]) -> list[Echo]:
+    """The echoes, those that did not return beyond all others."""
+    return [replace(echo, range_m=dr.select(echo.returned, echo.range_m, _NOWHERE_M)) for echo in echoes]
 
 
 def _merged(echoes: Sequence[Echo], member: Sequence[mi.Bool]) -> Echo:

@@ -15,6 +15,26 @@ from scene.raycast import RayCaster
 
 
 @dataclass(frozen=True)
+class FurtherReturns:
+    """The returns of a scan beside those in its grid, of pulses that have several; n of them, by cell, then by range.
+
+    cell: (n,) int64 the pulse's place in the grid, counted in rows; number: (n,) uint8 return number, 1 the nearest; points:
+    (n, 3) float64, m; depth: (n,) float64 range, m; block: (n,) int32; intensity: (n,) float32; truth: named (n,) channels, as
+    the grid's; grid_number, grid_count: (h, w) uint8 return number of the point in the grid, and the pulse's number of returns.
+    """
+
+    cell: NDArray[np.int64]
+    number: NDArray[np.uint8]
+    points: FloatArray
+    depth: FloatArray
+    block: IntArray
+    intensity: NDArray[np.float32]
+    truth: dict[str, NDArray[np.floating]]
+    grid_number: NDArray[np.uint8]
+    grid_count: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
 class Observation:
     """One observation with the sensor's own organisation, wall frame.
 
@@ -24,7 +44,8 @@ class Observation:
     points: (h, w, 3) float64, m, as recorded; depth: (h, w) float64, m, range (TLS) or distance along the camera's axis (stereo);
     block: (h, w) int32, the block whose niche was hit (0: wall); viewpoint: (3,) m, where the sensor stands;
     intensity: (h, w) float32 relative received power; pulse_interval_s: time from one cell to the next, in order of rows; truth:
-    named (h, w) channels, such as `true_range_m`, present where the sensor was asked for them.
+    named (h, w) channels, such as `true_range_m`, present where the sensor was asked for them; further: returns beside those in
+    the grid, of a scanner that records several; None where no pulse has any.
     """
 
     sensor: str
@@ -35,6 +56,7 @@ class Observation:
     intensity: NDArray[np.float32] | None = None
     pulse_interval_s: float | None = None
     truth: dict[str, NDArray[np.floating]] = field(default_factory=dict)
+    further: FurtherReturns | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:

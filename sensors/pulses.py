@@ -58,6 +58,11 @@ class Pulses:
         """Recorded minus true range grows by `error`, m."""
         return replace(self, range_m=self.range_m + error)
 
+    def at(self, index: mi.UInt32) -> Pulses:
+        """The pulses of the given places, before they are traced."""
+        own = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return Pulses(**{name: dr.gather(type(value), value, index) for name, value in own if value is not None})
+
     def evaluated(self) -> Pulses:
         """The same pulses, computed: for an effect that needs numbers of the whole scan; what follows starts from memory."""
         dr.eval([value for field in fields(self) if (value := getattr(self, field.name)) is not None])

@@ -21,8 +21,9 @@ from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Stage, apply_stage
 from sensors.footprint import Beam, Echo
 from sensors.model import TlsModel
-from sensors.observation import Observation, packed
+from sensors.observation import FurtherReturns, Observation, packed
 from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction, tangents
+from sensors.returns import MOST_RETURNS, Recorded, further_returns
 
 Window = tuple[float, float]
 
@@ -131,13 +132,37 @@ class LaserScanner:
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
         """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith)."""
+        pulses, beam = self._aimed(self._emit(), random)
+        echoes = self._echoes(scene, pulses, beam)
+        pulses = self._measured(pulses, beam.received(echoes), random)
+        if not beam.records_several:
+            return self._record(pulses)
+        count = beam.count(echoes)
+        dr.schedule(count)  # so that it is computed in the kernel of the scan
+        seen = self._record(pulses)
+        return replace(seen, further=self._further(scene, random, seen, count)) if np.any(count.numpy() > 1) else seen
+
+    def _aimed(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
+        """The pulses as they really leave, and the beam."""
         effects = self.model.chain()
-        pulses = apply_stage(effects, Stage.AIM, self._emit(), random)
-        beam = apply_stage(effects, Stage.FOOTPRINT, Beam(), random)
-        pulses = self._trace(scene, pulses, beam)
+        return apply_stage(effects, Stage.AIM, pulses, random), apply_stage(effects, Stage.FOOTPRINT, Beam(), random)
+
+    def _measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
+        """What the instrument makes of the return of each pulse."""
+        pulses = replace(
+            pulses,
+            true_range=echo.range_m,
+            range_m=echo.range_m,
+            cos_incidence=echo.cos_incidence,
+            albedo=echo.albedo,
+            power=echo.power,
+            block=echo.block,
+            returned=echo.returned,
+            minimum_range=dr.opaque(mi.Float64, self.config.minimum_range_m),
+        )
         for stage in (Stage.RANGE, Stage.POWER, Stage.RETURN):
-            pulses = apply_stage(effects, stage, pulses, random)
-        return self._record(pulses)
+            pulses = apply_stage(self.model.chain(), stage, pulses, random)
+        return pulses
 
     def _emit(self) -> Pulses:
         pattern = self.pattern
@@ -159,23 +184,12 @@ class LaserScanner:
             aim_zenith=zenith,
         )
 
-    def _trace(self, scene: RayCaster, pulses: Pulses, beam: Beam) -> Pulses:
+    def _echoes(self, scene: RayCaster, pulses: Pulses, beam: Beam) -> list[Echo]:
         """Ray-trace the emitted beams, sub-ray by sub-ray."""
         azimuth, zenith = pulses.aim_azimuth, pulses.aim_zenith
         axis = rotated(self.rotation, direction(azimuth, zenith))
         across = [rotated(self.rotation, vectors) for vectors in tangents(azimuth, zenith)]
-        echo = beam.received([self._echo(scene, ray) for ray in beam.sub_rays_about(axis, *across)])
-        return replace(
-            pulses,
-            true_range=echo.range_m,
-            range_m=echo.range_m,
-            cos_incidence=echo.cos_incidence,
-            albedo=echo.albedo,
-            power=echo.power,
-            block=echo.block,
-            returned=echo.returned,
-            minimum_range=dr.opaque(mi.Float64, self.config.minimum_range_m),
-        )
+        return [self._echo(scene, ray) for ray in beam.sub_rays_about(axis, *across)]
 
     def _echo(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
         """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
@@ -190,7 +204,26 @@ class LaserScanner:
         return Echo(hits.distance, cos_incidence, hits.albedo, power, hits.block, returned)
 
     def _record(self, pulses: Pulses) -> Observation:
-        """Points from the nominal direction and the recorded range."""
+        """The scan's grid."""
+        shape = self.pattern.lines, self.pattern.pulses
+        found = self._recorded(pulses)
+        if np.isnan(found.depth).all():
+            raise InputError(
+                "no pulse returned", where="station, scanner", remedy="check position, rotation, window, range limits and effects"
+            )
+        return Observation(
+            sensor="tls",
+            points=found.points.reshape(*shape, 3),
+            depth=found.depth.reshape(shape),
+            block=found.block.reshape(shape),
+            viewpoint=self.position,
+            intensity=found.intensity.reshape(shape),
+            pulse_interval_s=1.0 / self.config.pulse_rate_hz,
+            truth={name: channel.reshape(shape) for name, channel in found.truth.items()},
+        )
+
+    def _recorded(self, pulses: Pulses) -> Recorded:
+        """Points from the nominal direction and the recorded range; NaN and WALL where nothing returned."""
         returned = pulses.returned
         range_m = dr.select(returned, pulses.range_m, np.nan)
         nominal = rotated(self.rotation, direction(pulses.azimuth, pulses.zenith))
@@ -199,22 +232,29 @@ class LaserScanner:
         block = dr.select(returned, pulses.block, WALL)
         channels = {"true_range_m": pulses.true_range, "cos_incidence": pulses.cos_incidence} if self.truth else {}
         truth = {name: dr.select(returned, channel, np.nan) for name, channel in channels.items()}
-        dr.eval(points, range_m, power, block, truth, returned)
-        if dr.none(returned):
-            raise InputError(
-                "no pulse returned", where="station, scanner", remedy="check position, rotation, window, range limits and effects"
-            )
-        shape = self.pattern.lines, self.pattern.pulses
-        return Observation(
-            sensor="tls",
-            points=points.numpy().reshape(*shape, 3),
-            depth=range_m.numpy().reshape(shape),
-            block=block.numpy().reshape(shape),
-            viewpoint=self.position,
-            intensity=power.numpy().reshape(shape),
-            pulse_interval_s=1.0 / self.config.pulse_rate_hz,
-            truth={name: channel.numpy().reshape(shape) for name, channel in truth.items()},
+        dr.eval(points, range_m, power, block, truth)
+        return Recorded(
+            points=points.numpy().reshape(-1, 3),
+            depth=range_m.numpy(),
+            intensity=power.numpy(),
+            block=block.numpy(),
+            truth={name: channel.numpy() for name, channel in truth.items()},
         )
+
+    def _further(self, scene: RayCaster, random: KeyedRandom, seen: Observation, count: mi.UInt32) -> FurtherReturns:
+        """The returns of pulses with `count` of them beside those in the grid; each number is traced again, for few pulses.
+
+        Every return has noise of its own. An effect that compares with the whole scan compares with the returns of one number.
+        """
+        found, emitted = [], self._emit().evaluated()
+        for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
+            index = dr.compress(count >= max(number, 2))
+            pulses, beam = self._aimed(emitted.at(index), random)
+            echo, in_grid = beam.numbered(self._echoes(scene, pulses, beam), dr.opaque(mi.UInt32, number))
+            dr.schedule(in_grid)
+            recorded = self._recorded(self._measured(pulses, echo, random.child("return", number)))
+            found.append((index.numpy().astype(np.int64), in_grid.numpy().astype(bool), recorded))
+        return further_returns(found, seen)
 
 
 def _grid_number(start: float, step: float) -> mi.UInt32:

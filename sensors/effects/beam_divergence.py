@@ -15,10 +15,11 @@ class BeamDivergence(Effect):
     """A Gaussian beam of full divergence D (1/e^2), as sub-rays; which of a pulse's returns is recorded, and where (`footprint`).
 
     Ranging by pulse: echoes closer than c tau / 2 run into one return at their centroid, weighted by power (mixed pixels); the
-    first return is recorded, the strongest, or the mean of all. Ranging by phase: all echoes add as phasors; the mode does not
-    matter. On a tilted plane the footprint is D R / cos i long, and the mean is the axis's range to second order in D. The block
-    label is that of the strongest echo in the return. At edges a return leans to the surface that is hit more squarely, whose
-    echo is stronger: 0.2 mm on average over a rough wall of 1 M pulses at 105 m.
+    first return is recorded, the strongest, the mean of all, or (multiple) the strongest in the grid of the scan and every other
+    one beside it. Ranging by phase: all echoes add as phasors; the mode does not matter. On a tilted plane the footprint is
+    D R / cos i long, and the mean is the axis's range to second order in D. The block label is that of the strongest echo in the
+    return. At edges a return leans to the surface that is hit more squarely, whose echo is stronger: 0.2 mm on average over a
+    rough wall of 1 M pulses at 105 m.
     """
 
     name: Literal["beam_divergence"] = "beam_divergence"
@@ -27,7 +28,7 @@ class BeamDivergence(Effect):
     divergence_rad: float = parameter(
         "full divergence, 1/e^2", unit="rad", source="datasheets (mind their conventions)", typical=3e-4, ge=0, le=0.1
     )
-    mode: Mode = Field("strongest", description="which of several returns is recorded: first, strongest, mean")
+    mode: Mode = Field("strongest", description="which of several returns is recorded: first, strongest, mean, multiple (all)")
     sub_rays: Literal[1, 7, 19, 37, 61, 91] = Field(19, description="sub-rays of a pulse")
     pulse_width_s: float = parameter(
         "pulse width tau: echoes closer than c tau / 2 are one return",
