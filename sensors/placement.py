@@ -10,9 +10,10 @@ from pydantic import Field
 
 from scene.config import Config
 from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair, Matrix3, Vector3
+from sensors.camera import Camera, CameraPair, Matrix3, Vector3, axis_rotation
 
 VERTICAL = np.array([0.0, 0.0, 1.0])
 
@@ -86,6 +87,24 @@ def look_at(position: FloatArray, aim: FloatArray) -> FloatArray:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
+class PoseSigma(Config):
+    """How well a station's pose is known; the difference of real and surveyed pose is drawn anew at each observation."""
+
+    position_m: float = Field(0.0, ge=0, description="standard deviation of each coordinate [m]")
+    rotation_rad: float = Field(0.0, ge=0, le=0.1, description="standard deviation of the turn about each axis [rad]")
+
+    def displaced(self, position: FloatArray, rotation: FloatArray, random: KeyedRandom) -> tuple[FloatArray, FloatArray]:
+        """Where a scanner of surveyed pose (position (3,) m, rotation (3, 3) scanner to frame) really stands."""
+        if self.position_m == self.rotation_rad == 0:
+            return position, rotation
+        shift, turn = random.generator().standard_normal((2, 3)) * [[self.position_m], [self.rotation_rad]]
+        x, y, z = (axis_rotation(axis, float(angle)) for axis, angle in enumerate(turn))
+        return position + shift, z @ y @ x @ rotation
+
+
+EXACT_POSE = PoseSigma()
+
+
 class StationConfig(Config):
     """Where the laser scanner stands: by coordinates, or at a distance in front of the wall's centre."""
 
@@ -95,6 +114,7 @@ class StationConfig(Config):
     )
     height_m: float = Field(1.6, description="height above the wall's toe, where no position_m is given [m]")
     rotation: Matrix3 | None = Field(None, description="scanner to world; none: levelled, azimuth 0 towards the wall's centre")
+    pose_sigma: PoseSigma = EXACT_POSE
 
     def place(self, target: Target) -> tuple[FloatArray, FloatArray]:
         """Position (3,) m and rotation (3, 3) scanner to world."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import psutil
@@ -19,9 +20,11 @@ from sensors.atmosphere import extinction_per_m
 from sensors.camera import axis_rotation
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Stage, apply_stage
+from sensors.faces import mean_of_faces
 from sensors.footprint import Beam, Echo
 from sensors.model import TlsModel
 from sensors.observation import FurtherReturns, Observation, packed
+from sensors.placement import EXACT_POSE, PoseSigma
 from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction, tangents
 from sensors.returns import MOST_RETURNS, Recorded, further_returns
 
@@ -43,6 +46,10 @@ class ScannerConfig(Config):
     minimum_range_m: float = Field(1.0, ge=0, description="nearest range that is recorded [m]")
     maximum_range_m: float = Field(1000.0, gt=0, description="farthest range that is recorded [m]")
     visibility_m: float | None = Field(None, gt=0, description="haze or fog weakens the echoes; none: clear air [m]")
+    faces: Literal[1, 2] = Field(1, description="2: scan in both faces and take the mean, in which axis errors cancel")
+    face_tolerance_m: float = Field(
+        0.1, ge=0, description="ranges of both faces that differ by more are not averaged, the first face's is kept [m]"
+    )
     wavelength_nm: float = Field(1550.0, ge=300, le=3000, description="of the laser, for the extinction in haze [nm]")
 
     @model_validator(mode="after")
@@ -91,10 +98,23 @@ class Pattern:
             )
         return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)
 
+    def second_face(self) -> Pattern:
+        """The same directions in the other face: the azimuth turned by pi, the zenith angle 2 pi less what it was."""
+        return replace(
+            self,
+            azimuth_start=self.azimuth_start + np.pi,
+            zenith_start=2 * np.pi - self.zenith_start,
+            zenith_step=-self.zenith_step,
+        )
+
 
 @dataclass(frozen=True)
 class LaserScanner:
-    """A scanner on its station. position: (3,) m and rotation: (3, 3), scanner to wall frame; pattern: what it scans."""
+    """A scanner on its station.
+
+    position: (3,) m and rotation: (3, 3), scanner to wall frame, as surveyed; pattern: what it scans; truth: whether channels of
+    it are kept; pose_sigma: how well the pose is known.
+    """
 
     position: FloatArray
     rotation: FloatArray
@@ -102,6 +122,7 @@ class LaserScanner:
     config: ScannerConfig
     model: TlsModel
     truth: bool = False
+    pose_sigma: PoseSigma = EXACT_POSE
 
     @classmethod
     def aimed(
@@ -112,6 +133,7 @@ class LaserScanner:
         config: ScannerConfig,
         model: TlsModel,
         truth: bool = False,
+        pose_sigma: PoseSigma = EXACT_POSE,
     ) -> LaserScanner:
         """A scanner whose window, where the config leaves it open, is the extent of `vertices` ((n, 3), wall frame).
 
@@ -128,19 +150,31 @@ class LaserScanner:
                 where="scanner.zenith_limits_rad",
                 remedy="move the station or tilt it",
             )
-        return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model, truth)
+        return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model, truth, pose_sigma)
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith)."""
+        """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith). Recorded from the surveyed pose."""
+        position, rotation = self.pose_sigma.displaced(self.position, self.rotation, random.child("pose"))
+        real = replace(self, position=position, rotation=rotation)
+        seen = self._scan(real, scene, random)
+        if self.config.faces == 1:
+            return seen
+        turned = replace(self, pattern=self.pattern.second_face())
+        return mean_of_faces(seen, turned._scan(real, scene, random.child("face", 2)), self.config.face_tolerance_m)
+
+    def _scan(self, real: LaserScanner, scene: RayCaster, random: KeyedRandom) -> Observation:
+        """A scan in one face; real: the scanner where it really stands."""
         pulses, beam = self._aimed(self._emit(), random)
-        echoes = self._echoes(scene, pulses, beam)
+        echoes = real._echoes(scene, pulses, beam)
         pulses = self._measured(pulses, beam.received(echoes), random)
         if not beam.records_several:
             return self._record(pulses)
+        if self.config.faces == 2:
+            raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
         count = beam.count(echoes)
         dr.schedule(count)  # so that it is computed in the kernel of the scan
         seen = self._record(pulses)
-        return replace(seen, further=self._further(scene, random, seen, count)) if np.any(count.numpy() > 1) else seen
+        return replace(seen, further=self._further(real, scene, random, seen, count)) if np.any(count.numpy() > 1) else seen
 
     def _aimed(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
         """The pulses as they really leave, and the beam."""
@@ -241,7 +275,9 @@ class LaserScanner:
             truth={name: channel.numpy() for name, channel in truth.items()},
         )
 
-    def _further(self, scene: RayCaster, random: KeyedRandom, seen: Observation, count: mi.UInt32) -> FurtherReturns:
+    def _further(
+        self, real: LaserScanner, scene: RayCaster, random: KeyedRandom, seen: Observation, count: mi.UInt32
+    ) -> FurtherReturns:
         """The returns of pulses with `count` of them beside those in the grid; each number is traced again, for few pulses.
 
         Every return has noise of its own. An effect that compares with the whole scan compares with the returns of one number.
@@ -250,7 +286,7 @@ class LaserScanner:
         for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
             index = dr.compress(count >= max(number, 2))
             pulses, beam = self._aimed(emitted.at(index), random)
-            echo, in_grid = beam.numbered(self._echoes(scene, pulses, beam), dr.opaque(mi.UInt32, number))
+            echo, in_grid = beam.numbered(real._echoes(scene, pulses, beam), dr.opaque(mi.UInt32, number))
             dr.schedule(in_grid)
             recorded = self._recorded(self._measured(pulses, echo, random.child("return", number)))
             found.append((index.numpy().astype(np.int64), in_grid.numpy().astype(bool), recorded))
