@@ -17,8 +17,10 @@ from pipeline.formats.atomic import write_bytes, write_json
 from pipeline.formats.geotiff import write_geotiff, write_tiff
 from pipeline.formats.laz import write_laz
 from pipeline.formats.ply import write_ply
-from pipeline.look import DepthMaps
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.look import Look
 from pipeline.metashape_export import write_metashape_export
+from pipeline.recorded_points import recorded_points
 from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
 from pipeline.site import Site
 from pipeline.tiles import tiles
@@ -26,7 +28,6 @@ from scene.blocks import Blocks
 from scene.carve import block_meshes
 from scene.imported import ImportedWall
 from scene.mesh import WALL, FloatArray, TriangleMesh
-from sensors.observation import Observation
 
 EPOCH_RECORD = "epoch.json"
 
@@ -37,15 +38,14 @@ def epoch_folder(out: Path, number: int) -> Path:
 
 def write_reference(out: Path, config: SimulationConfig, site: Site, reference: Reference) -> None:
     """Write epoch_000 and the hillshade of the reference, unless the folder is there already or the observation is gone."""
-    if epoch_folder(out, 0).exists() or reference.observation is None:
+    if epoch_folder(out, 0).exists() or reference.seen is None:
         return
     with _folder(out, 0) as folder:
-        _write_common(folder, config, site, reference.observation, reference.surface, reference.caster.mesh, [])
-        _write_depth_maps(folder, config, reference.depth_maps)
+        _write_common(folder, config, site, reference.seen, reference.surface, reference.caster.mesh, [])
         write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
         record = {
             "epoch": 0,
-            "points": int(reference.observation.valid.sum()),
+            **_seen_record(reference.seen),
             "blocks": [],
             "annotations": coco([], config.annotation),
         }
@@ -57,8 +57,7 @@ def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Refe
     name = f"difference_{epoch.number:03d}"
     grid = reference.raster.grid
     with _folder(out, epoch.number) as folder:
-        _write_common(folder, config, site, epoch.observation, epoch.surface, epoch.carved.mesh, epoch.blocks)
-        _write_depth_maps(folder, config, epoch.depth_maps)
+        _write_common(folder, config, site, epoch.seen, epoch.surface, epoch.carved.mesh, epoch.blocks)
         write_geotiff(
             out / f"{name}.tif", epoch.difference, grid, description="reference minus epoch, m; missing rock is positive"
         )
@@ -81,7 +80,7 @@ def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Refe
 def _record(config: SimulationConfig, epoch: Epoch, images: list[LabelledImage], sigma: float) -> dict[str, Any]:
     return {
         "epoch": epoch.number,
-        "points": int(epoch.observation.valid.sum()),
+        **_seen_record(epoch.seen),
         "volume_balance_m3": epoch.carved.balance_m3,
         "wall_volume_m3": epoch.carved.wall_volume_m3,
         "registration": None if epoch.registration is None else epoch.registration.to_dict(),
@@ -93,6 +92,13 @@ def _record(config: SimulationConfig, epoch: Epoch, images: list[LabelledImage],
         "blocks": epoch.blocks,
         "annotations": coco(images, config.annotation),
     }
+
+
+def _seen_record(seen: Look) -> dict[str, Any]:
+    """Number of points and, of several stations, how the further ones were registered to the first."""
+    points = sum(int(each.valid.sum()) + (0 if each.further is None else len(each.further.cell)) for each in seen.observations)
+    registered = () if seen.joined is None else seen.joined.registrations
+    return {"points": points} | ({"stations": [found.to_dict() for found in registered]} if registered else {})
 
 
 def _images(out: Path, config: SimulationConfig, epoch: Epoch, reference: Reference, name: str) -> Iterator[LabelledImage]:
@@ -111,35 +117,32 @@ def _write_common(
     folder: Path,
     config: SimulationConfig,
     site: Site,
-    observation: Observation,
+    seen: Look,
     surface: TriangleMesh,
     truth: TriangleMesh,
     blocks: list[dict[str, Any]],
 ) -> None:
     """What every epoch has: points, depth map, surface, truth, blocks."""
-    valid = observation.valid
-    channels = {name: channel[valid].astype(np.float32) for name, channel in observation.truth.items()}
-    optional = {"intensity": observation.intensity, "gps_time": observation.gps_time}
-    values: dict[str, Any] = {name: channel[valid] for name, channel in optional.items() if channel is not None}
-    values["extra"] = {**channels, "block": observation.block[valid]}
-    points = observation.points[valid]
-    write_laz(folder / "points.laz", points, **values)
-    if observation.sensor == "stereo":
-        write_tiff(
-            folder / "depth_left.tif", observation.depth.astype(np.float32), description="depth along the left camera's axis, m"
-        )
+    cloud = recorded_points(seen.observations)
+    _write_cloud(folder / "points.laz", cloud)
+    if seen.observation.sensor == "stereo":
+        depth = seen.observation.depth.astype(np.float32)
+        write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
     write_ply(folder / "surface.ply", surface)
     write_ply(folder / "truth.ply", truth)
     write_json(folder / "blocks.json", blocks)
     wanted = config.products.world
     if wanted or (wanted is None and isinstance(config.wall, ImportedWall)):
-        write_laz(folder / "points_world.laz", site.frame.to_world(points), **values)
+        _write_cloud(folder / "points_world.laz", replace(cloud, points=site.frame.to_world(cloud.points)))
         write_ply(folder / "surface_world.ply", _in_world(surface, site))
+    if config.products.metashape and seen.depth_maps is not None:
+        write_metashape_export(folder / "metashape", *seen.depth_maps)
 
 
-def _write_depth_maps(folder: Path, config: SimulationConfig, depth_maps: DepthMaps | None) -> None:
-    if config.products.metashape and depth_maps is not None:
-        write_metashape_export(folder / "metashape", *depth_maps)
+def _write_cloud(path: Path, cloud: PointCloud) -> None:
+    extra = dict(cloud.extra)
+    returns = {name: extra.pop(name, None) for name in ("return_number", "number_of_returns")}
+    write_laz(path, cloud.points, intensity=cloud.intensity, gps_time=cloud.gps_time, extra=extra, **returns)
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:

@@ -129,7 +129,7 @@ def _view(scene: RayCaster, camera: Camera, u: mi.Float64, v: mi.Float64) -> tup
     """What the pixels (u, v) of `camera` see: hits, whose distance is the depth along the camera's axis, and points."""
     x, y = camera.on_device().tangents(u, v)
     origin, direction = vector(camera.position), rotated(camera.rotation, mi.Array3f64(x, y, 1.0))
-    hits = scene.intersect(origin, direction)
+    hits = scene.intersect(origin, direction, exact=True)
     return hits, origin + hits.distance * direction
 
 

@@ -227,7 +227,7 @@ class LaserScanner:
 
     def _echo(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
         """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
-        hits = scene.intersect(vector(self.position), ray)
+        hits = scene.intersect(vector(self.position), ray, exact=True)
         cos_incidence = -dr.dot(hits.normal, mi.Vector3f(ray))
         power = hits.albedo * cos_incidence * dr.square(REFERENCE_RANGE_M / mi.Float32(hits.distance))
         if self.config.extinction_per_m > 0:

@@ -87,6 +87,43 @@ def test_hits_are_refined_to_float64() -> None:
     assert np.isnan(distance[~hit]).all()
 
 
+def test_rays_at_edges_and_silhouettes_are_settled_in_float64() -> None:
+    """Against every triangle in double precision: rays through points within 20 um of edges of a steep wall 100 m away.
+
+    At most one in two hundred of these chosen rays may still be wrong by more than 0.1 um (where all the rays beside it meet a
+    third face); of all rays, one in a thousand passes an edge as closely.
+    """
+    wall = heightfield(6.0, 4.0, 0.1, roughness=1.5)
+    random = np.random.default_rng(4)
+    face = wall.faces[random.integers(0, len(wall.faces), 1500)]
+    share = random.uniform(0, 1, (1500, 1))
+    on_edge = share * wall.vertices[face[:, 0]] + (1 - share) * wall.vertices[face[:, 1]]
+    origin = np.array([30.0, -20.0, 95.0])
+    directions = on_edge + random.uniform(-2e-5, 2e-5, on_edge.shape) - origin
+    expected = np.array([first_hit(origin, direction, wall) for direction in directions])
+    wrong = {}
+    for exact in (False, True):
+        device = [mi.Array3f64(np.ascontiguousarray(rows.T)) for rows in (np.broadcast_to(origin, directions.shape), directions)]
+        hits = RayCaster(wall).intersect(*device, coherent=False, exact=exact)
+        both = np.array(hits.valid) & ~np.isnan(expected)  # the border's rays decide in float32 whether they meet the wall at all
+        assert both.mean() > 0.95
+        wrong[exact] = np.mean(np.abs(np.array(hits.distance) - expected)[both] > 1e-9)
+    assert wrong[True] < 0.005
+    assert wrong[False] > 0.05
+
+
+def first_hit(origin: np.ndarray, direction: np.ndarray, mesh: TriangleMesh) -> float:
+    """Distance, in lengths of the direction, to the nearest triangle that the ray goes through; NaN for a miss."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    across = np.cross(direction, c - a)
+    scale = 1 / np.einsum("ij,ij->i", b - a, across)
+    u = scale * np.einsum("ij,ij->i", origin - a, across)
+    around = np.cross(origin - a, b - a)
+    v, t = scale * (around @ direction), scale * np.einsum("ij,ij->i", c - a, around)
+    through = (u >= -1e-11) & (v >= -1e-11) & (u + v <= 1 + 1e-11)
+    return float(t[through].min()) if through.any() else float("nan")
+
+
 def test_hits_know_normal_albedo_and_block() -> None:
     ball = sphere(np.zeros(3), 5.0, 4)
     labels = (np.arange(len(ball.faces)) % 7).astype(np.int32)
