@@ -68,7 +68,7 @@ def main(sensor: SensorName) -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         write_reference(out, config, site, reference)
-        reference = replace(reference, observation=None)
+        reference = replace(reference, seen=None)
         progress.timings.clear()
         start = time.perf_counter()
         epoch = observe_epoch(config, site, reference, 1, random, progress)
@@ -82,7 +82,7 @@ def main(sensor: SensorName) -> None:
     boolean = time_bare(site.mesh, blocks)["seconds"]
     grid = reference.raster.grid
     print(f"{VARIANT}, {sensor}: {len(site.mesh.faces):,} triangles, {len(blocks)} blocks,")
-    print(f"{epoch.observation.depth.size:,} rays, raster {grid.width} x {grid.height}, {size:.0f} MB with the reference's,")
+    print(f"{epoch.seen.observation.depth.size:,} rays, raster {grid.width} x {grid.height}, {size:.0f} MB with the reference's,")
     print(f"volumes balance to {np.abs(epoch.carved.balance_m3) / epoch.carved.wall_volume_m3:.0e} of the wall's")
     for name, seconds in progress.timings.items():
         print(f"  {name:24}{seconds:6.2f} s")

@@ -18,6 +18,7 @@ from pipeline.planning.detectability import PlanningConfig
 from pipeline.presets import is_path, model_file, with_preset
 from pipeline.reconstruct import FusionConfig, Reconstruction
 from pipeline.register import IcpConfig
+from pipeline.stations import StationsConfig
 from pipeline.tiles import TileConfig
 from scene.blocks import RockfallConfig
 from scene.config import Config, load_yaml, parse
@@ -65,6 +66,13 @@ CamerasConfig = Annotated[
 ]
 
 
+StationChoice = Annotated[
+    Annotated[StationConfig, Tag("one")]
+    | Annotated[Annotated[tuple[StationConfig, ...], Field(min_length=1, max_length=255)], Tag("several")],
+    Discriminator(lambda values: "several" if isinstance(values, list | tuple) else "one"),
+]
+
+
 def _model_kind(values: Any) -> str:
     return str(values.get("sensor") if isinstance(values, dict) else values.sensor)
 
@@ -104,7 +112,11 @@ class SimulationConfig(Config):
     exposure: ExposureConfig = Field(ExposureConfig(), description="from light to grey values (matcher: sgbm)")
     matching: MatchingConfig = Field(MatchingConfig(), description="the real matcher (matcher: sgbm)")
     scanner: ScannerConfig = ScannerConfig()
-    station: StationConfig = StationConfig()
+    station: StationChoice = Field(
+        StationConfig(),
+        description="where the laser scanner stands; of several stations a list, whose first the others are joined to",
+    )
+    stations: StationsConfig = StationsConfig()
     reconstruction: Reconstruction = Field(
         "direct", description="surface from the sensor's own grid (direct), or by COLMAP from both depth maps (stereo)"
     )
@@ -155,6 +167,10 @@ class SimulationConfig(Config):
 
     def tls_model(self) -> TlsModel:
         return next((model for model in self.sensor if isinstance(model, TlsModel)), TlsModel())
+
+    def stations_of_the_scanner(self) -> tuple[StationConfig, ...]:
+        """The laser scanner's stations, one or several."""
+        return (self.station,) if isinstance(self.station, StationConfig) else self.station
 
     def camera_pair(self, target: Target) -> CameraPair:
         """The nominal pair, world frame; a rig is placed in front of `target`."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.closest_points import ReferenceSurface
 from pipeline.config import SimulationConfig
 from pipeline.difference import BlockStatistics, SurfaceRaster, block_statistics, difference, raster_grid, surface_raster
-from pipeline.look import DepthMaps, look, reconstruct
+from pipeline.look import Look, look, reconstruct
 from pipeline.progress import Progress
 from pipeline.register import Registration, register_to
 from pipeline.site import Site
@@ -20,7 +20,6 @@ from scene.carve import Carved, carve, carved_records
 from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray, TriangleMesh
 from scene.raycast import RayCaster
-from sensors.observation import Observation
 from sensors.placement import check_in_front
 
 
@@ -28,26 +27,28 @@ from sensors.placement import check_in_front
 class Reference:
     """The first epoch, of the untouched wall: all later ones are compared with it.
 
-    observation: None once it is written, which spares its memory; caster: the untouched wall; surface: reconstructed;
-    raster: of the surface, its grid is that of every difference map; target: the surface as ICP wants it, where epochs are
-    registered; depth_maps: where they go to others.
+    seen: what the sensor saw, None once it is written, which spares its memory; caster: the untouched wall; surface:
+    reconstructed; raster: of the surface, its grid is that of every difference map; target: the surface as ICP wants it, where
+    epochs are registered.
     """
 
-    observation: Observation | None
+    seen: Look | None
     caster: RayCaster
     surface: TriangleMesh
     raster: SurfaceRaster
     target: ReferenceSurface | None
-    depth_maps: DepthMaps | None
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """A later epoch. solids: the blocks; blocks: records of what was carved, with what the difference map shows of each;
-    surface: reconstructed, before registration; raster: after it; difference: (h, w) float32, m, reference minus epoch."""
+    """A later epoch.
+
+    seen: what the sensor saw; solids: the blocks; blocks: records of what was carved, with what the difference map shows of each;
+    surface: reconstructed, before registration; raster: after it; difference: (h, w) float32, m, reference minus epoch.
+    """
 
     number: int
-    observation: Observation
+    seen: Look
     carved: Carved
     solids: Blocks
     blocks: list[dict[str, Any]]
@@ -56,7 +57,6 @@ class Epoch:
     raster: SurfaceRaster
     difference: NDArray[np.float32]
     statistics: BlockStatistics
-    depth_maps: DepthMaps | None
 
 
 STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "difference": 2.0, "write": 8.0}
@@ -75,7 +75,7 @@ def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom,
         target = None if config.icp is None else ReferenceSurface.build(surface.vertices, surface.vertex_normals())
     with progress.stage("epoch 0: difference"):
         raster = surface_raster(surface, raster_grid(surface.bounds, config.difference))
-    return Reference(seen.observation, caster, surface, raster, target, seen.depth_maps)
+    return Reference(seen, caster, surface, raster, target)
 
 
 def observe_epoch(
@@ -106,12 +106,10 @@ def observe_epoch(
         measured = measure_blocks(change, raster, len(records))
         statistics = block_statistics(change, raster.block)
     found = [
-        {**record, "world_position_m": to_world(site, record["position_m"]), **seen}
-        for record, seen in zip(records, measured, strict=True)
+        {**record, "world_position_m": to_world(site, record["position_m"]), **values}
+        for record, values in zip(records, measured, strict=True)
     ]
-    return Epoch(
-        number, seen.observation, carved, blocks, found, surface, registration, raster, change, statistics, seen.depth_maps
-    )
+    return Epoch(number, seen, carved, blocks, found, surface, registration, raster, change, statistics)
 
 
 def as_observed(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:

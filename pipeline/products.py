@@ -141,8 +141,15 @@ def _write_common(
 
 def _write_cloud(path: Path, cloud: PointCloud) -> None:
     extra = dict(cloud.extra)
-    returns = {name: extra.pop(name, None) for name in ("return_number", "number_of_returns")}
-    write_laz(path, cloud.points, intensity=cloud.intensity, gps_time=cloud.gps_time, extra=extra, **returns)
+    write_laz(
+        path,
+        cloud.points,
+        intensity=cloud.intensity,
+        gps_time=cloud.gps_time,
+        return_number=extra.pop("return_number", None),
+        number_of_returns=extra.pop("number_of_returns", None),
+        extra=extra,
+    )
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:

@@ -58,7 +58,7 @@ def simulate(
         reference = observe_reference(config, site, random, progress)
         with progress.stage("epoch 0: write"):
             write_reference(out, config, site, reference)
-        reference = replace(reference, observation=None)
+        reference = replace(reference, seen=None)
         for number in range(1, config.epochs + 1):
             if not (epoch_folder(out, number) / EPOCH_RECORD).exists():
                 epoch = observe_epoch(config, site, reference, number, random, progress)

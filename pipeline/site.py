@@ -22,7 +22,7 @@ class Site:
     """The untouched wall (wall frame), its frame, and the sensor that observes it.
 
     name: of the wall; repairs: what was mended in an imported mesh; viewpoints: where the sensor's eyes are, by their place in
-    the config, wall frame.
+    the config, wall frame; further_stations: of a laser scanner with several, those after the first, which is `sensor`.
     """
 
     name: str
@@ -31,6 +31,7 @@ class Site:
     frame: WallFrame
     sensor: Sensor
     viewpoints: dict[str, FloatArray]
+    further_stations: tuple[LaserScanner, ...] = ()
 
 
 def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Site:
@@ -47,12 +48,18 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         pair = _stereo(config, cameras, frame, random)
         eyes = {f"cameras, {side}": frame.to_wall(getattr(cameras, side).position) for side in ("left", "right")}
         return Site(wall.name, wall.repairs, mesh, frame, pair, eyes)
-    station = config.station.place(target)
-    frame = WallFrame.fit(wall.mesh.vertices, station[0])
+    stations = config.stations_of_the_scanner()
+    poses = [station.place(target) for station in stations]
+    frame = WallFrame.fit(wall.mesh.vertices, poses[0][0])
     mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
-    truth = config.products.truth_channels
-    scanner = LaserScanner.aimed(station, frame, mesh.vertices, config.scanner, config.tls_model(), truth=truth)
-    return Site(wall.name, wall.repairs, mesh, frame, scanner, {"station": scanner.position})
+    instrument = config.scanner, config.tls_model(), config.products.truth_channels
+    scanners = [
+        LaserScanner.aimed(pose, frame, mesh.vertices, *instrument, station.pose_sigma)
+        for pose, station in zip(poses, stations, strict=True)
+    ]
+    eyes = {f"station, number {number}": scanner.position for number, scanner in enumerate(scanners, start=1)}
+    eyes = eyes if len(scanners) > 1 else {"station": scanners[0].position}
+    return Site(wall.name, wall.repairs, mesh, frame, scanners[0], eyes, tuple(scanners[1:]))
 
 
 def _stereo(config: SimulationConfig, cameras: CameraPair, frame: WallFrame, random: KeyedRandom) -> Sensor:

@@ -1,0 +1,65 @@
+"""An epoch's points as a file holds them: those of the sensor's grid, further returns of a pulse, of all stations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.point_cloud import PointCloud
+from sensors.observation import Observation
+
+
+def recorded_points(observations: Sequence[Observation]) -> PointCloud:
+    """The points of every station, one after another, each in the order of its pulses and their returns; m, their frame.
+
+    The extra channels are those of the truth, `block`, where a pulse has several returns `return_number` and `number_of_returns`,
+    and of several stations `station`, counted from 1. Times start with each station's scan.
+    """
+    clouds = [_of_station(observation) for observation in observations]
+    if len(clouds) == 1:
+        return clouds[0]
+    if any("return_number" in cloud.extra for cloud in clouds):
+        clouds = [_with_returns(cloud) for cloud in clouds]
+    station = np.repeat(np.arange(1, len(clouds) + 1, dtype=np.uint8), [len(cloud.points) for cloud in clouds])
+    columns = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in clouds[0].extra}
+    return PointCloud(
+        points=np.concatenate([cloud.points for cloud in clouds]),
+        intensity=_joined([cloud.intensity for cloud in clouds]),
+        gps_time=_joined([cloud.gps_time for cloud in clouds]),
+        extra={**columns, "station": station},
+    )
+
+
+def _of_station(seen: Observation) -> PointCloud:
+    valid, further = seen.valid, seen.further
+    channels = {**seen.truth, "block": seen.block}
+    optional = {"intensity": seen.intensity, "gps_time": seen.gps_time}
+    values: dict[str, Any] = {name: None if channel is None else channel[valid] for name, channel in optional.items()}
+    extra: dict[str, Any] = {name: channel[valid] for name, channel in channels.items()}
+    if further is None:
+        return PointCloud(seen.points[valid], **values, extra=extra)
+    cell = np.concatenate([np.flatnonzero(valid), further.cell])
+    number = np.concatenate([further.grid_number[valid], further.number])
+    order = np.lexsort((number, cell))
+    beside = {**further.truth, "block": further.block}
+    time = seen.gps_time
+    return PointCloud(
+        points=np.concatenate([seen.points[valid], further.points])[order],
+        intensity=np.concatenate([values["intensity"], further.intensity])[order],
+        gps_time=None if time is None else time.ravel()[cell][order],
+        extra={name: np.concatenate([channel, beside[name]])[order] for name, channel in extra.items()}
+        | {"return_number": number[order], "number_of_returns": further.grid_count.ravel()[cell][order]},
+    )
+
+
+def _with_returns(cloud: PointCloud) -> PointCloud:
+    """The cloud with return numbers: 1 of 1 where it has none."""
+    ones = np.ones(len(cloud.points), dtype=np.uint8)
+    extra = {"return_number": ones, "number_of_returns": ones} | cloud.extra
+    return PointCloud(cloud.points, cloud.intensity, cloud.gps_time, extra)
+
+
+def _joined(channels: Sequence[Any]) -> Any:
+    return None if any(channel is None for channel in channels) else np.concatenate(channels)
