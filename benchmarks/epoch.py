@@ -38,12 +38,12 @@ from sensors.tls import LaserScanner
 def observation_casts(site: Site, caster: RayCaster) -> float:
     """Seconds of the bare casts that the sensor needs."""
     if isinstance(site.sensor, LaserScanner):
-        pulses = site.sensor._emit()
+        pulses = site.sensor.emit()
         aim = rotated(site.sensor.rotation, direction(pulses.aim_azimuth, pulses.aim_zenith))
         return medians(bare_cast(caster, vector(site.sensor.position), aim), rounds=3)[0]
     assert isinstance(site.sensor, StereoPair)
     cameras = site.sensor.cameras.in_wall_frame(site.frame)
-    _, u, v = site.sensor._cells()
+    _, u, v = site.sensor.cells()
     x, y = cameras.left.on_device().tangents(u, v)
     origin, ahead = vector(cameras.left.position), rotated(cameras.left.rotation, mi.Array3f64(x, y, 1.0))
     point = origin + caster.intersect(origin, ahead).distance * ahead

@@ -31,7 +31,7 @@ def main() -> None:
     pair = StereoPair(cameras, frame, StereoModel(noise=NOISE))
 
     wall_pair = cameras.in_wall_frame(frame)
-    _, u, v = pair._cells()
+    _, u, v = pair.cells()
     x, y = wall_pair.left.on_device().tangents(u, v)
     origin, ahead = vector(wall_pair.left.position), rotated(wall_pair.left.rotation, mi.Array3f64(x, y, 1.0))
     point = origin + caster.intersect(origin, ahead).distance * ahead

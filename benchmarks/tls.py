@@ -37,7 +37,7 @@ def main() -> None:
     count = scanner.pattern.lines * scanner.pattern.pulses
     caster = RayCaster(mesh)
 
-    pulses = scanner._emit()
+    pulses = scanner.emit()
     aim = rotated(scanner.rotation, direction(pulses.aim_azimuth, pulses.aim_zenith))
     origin = vector(scanner.position)
     bare = bare_cast(caster, origin, aim)

@@ -73,7 +73,7 @@ def main() -> None:
 
 def sub_rays(scanner: LaserScanner) -> list[mi.Ray3f]:
     """The rays of the beam, one set of all pulses per sub-ray, not yet evaluated."""
-    pulses = scanner._emit()
+    pulses = scanner.emit()
     axis, *across = (
         rotated(scanner.rotation, vectors)
         for vectors in (direction(pulses.azimuth, pulses.zenith), *tangents(pulses.azimuth, pulses.zenith))

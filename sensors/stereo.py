@@ -53,20 +53,21 @@ class StereoPair:
         """One depth map, reprojected with the nominal calibration; rows and columns are those of the left image, reduced."""
         effects = self.model.chain(random)
         nominal = self.cameras.in_wall_frame(self.frame)
-        real = self._real(effects, random).in_wall_frame(self.frame)
-        index, u, v = self._cells()
-        hits, point = _view(scene, real.left, u - _exposed(effects, "left", v, random), v)
+        real = self.real_pair(effects, random).in_wall_frame(self.frame)
+        index, u, v = self.cells()
+        hits, point = view(scene, real.left, u - exposed(effects, "left", v, random), v)
         matched, right_u, right_v = _visible(scene, real.right, hits, point)
-        right_u += _exposed(effects, "right", right_v, random)
+        right_u += exposed(effects, "right", right_v, random)
         geometry = rectify(nominal)
-        left_u, left_v = _rectified(nominal.left, geometry.left, u, v, geometry.f, geometry.u_left, geometry.v)
-        rectified_u, _ = _rectified(nominal.right, geometry.right, right_u, right_v, geometry.f, geometry.u_right, geometry.v)
+        f, v_0 = geometry.f, geometry.v
+        left_u, left_v = rectified_pixel(nominal.left, geometry.left, u, v, f, geometry.u_left, v_0)
+        rectified_u, _ = rectified_pixel(nominal.right, geometry.right, right_u, right_v, f, geometry.u_right, v_0)
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
         size = nominal.left.width, nominal.left.height, REDUCTION[self.quality]
         matches = Matches(index, u, v, left_u - rectified_u, matched, *seen, *size)
         for stage in (Stage.MATCH, Stage.FILL):
             matches = apply_stage(effects, stage, matches, random)
-        return self._observation(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
+        return self.recorded(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -74,17 +75,19 @@ class StereoPair:
         step = REDUCTION[self.quality]
         return self.cameras.left.height // step, self.cameras.left.width // step
 
-    def _real(self, effects: tuple[Effect, ...], random: KeyedRandom) -> CameraPair:
+    def real_pair(self, effects: tuple[Effect, ...], random: KeyedRandom) -> CameraPair:
+        """The pair as it really is, world frame: the calibrated one with the camera effects added."""
         return apply_stage(effects, Stage.CAMERA, self.cameras, random)
 
-    def _cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
+    def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
         """Number of each cell and its centre (u, v) in the left image, px of the full-resolution frame."""
         rows, columns = self.shape
         index, step = dr.arange(mi.UInt32, rows * columns), float(REDUCTION[self.quality])
         row, column = index // columns, index % columns
         return index, (mi.Float64(column) + 0.5) * step, (mi.Float64(row) + 0.5) * step
 
-    def _observation(self, matches: Matches, camera_point: mi.Array3f64, left: Camera) -> Observation:
+    def recorded(self, matches: Matches, camera_point: mi.Array3f64, left: Camera) -> Observation:
+        """The observation of matches whose points, 3 x (n,) m, are given in the frame of the nominal left camera."""
         valid = matches.matched & (camera_point.z > 0)
         depth = dr.select(valid, camera_point.z, np.nan)
         point = dr.select(valid, rotated(left.rotation, camera_point) + vector(left.position), np.nan)
@@ -120,12 +123,12 @@ def reproject(geometry: Rectification, u: Any, v: Any, disparity: Any) -> mi.Arr
     return rotated(geometry.left.T, mi.Array3f64((u - u_left) / f * z, (v - v_0) / f * z, z))
 
 
-def _exposed(effects: tuple[Effect, ...], camera: Literal["left", "right"], v: mi.Float64, random: KeyedRandom) -> mi.Float64:
+def exposed(effects: tuple[Effect, ...], camera: Literal["left", "right"], v: mi.Float64, random: KeyedRandom) -> mi.Float64:
     """Recorded minus ideal column of pixels in the rows `v` of one camera, px."""
     return apply_stage(effects, Stage.EXPOSE, ImageRows(camera, v, mi.Float64(0.0)), random).du
 
 
-def _view(scene: RayCaster, camera: Camera, u: mi.Float64, v: mi.Float64) -> tuple[Hits, mi.Array3f64]:
+def view(scene: RayCaster, camera: Camera, u: mi.Float64, v: mi.Float64) -> tuple[Hits, mi.Array3f64]:
     """What the pixels (u, v) of `camera` see: hits, whose distance is the depth along the camera's axis, and points."""
     x, y = camera.on_device().tangents(u, v)
     origin, direction = vector(camera.position), rotated(camera.rotation, mi.Array3f64(x, y, 1.0))
@@ -144,7 +147,7 @@ def _visible(scene: RayCaster, camera: Camera, hits: Hits, point: mi.Array3f64) 
     return seen & ~scene.occluded(centre, sight, 1.0 - SHADOW_MARGIN), u, v
 
 
-def _rectified(
+def rectified_pixel(
     camera: Camera, rotation: FloatArray, u: mi.Float64, v: mi.Float64, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
     """Rectified pixel of the image pixel (u, v)."""

@@ -34,7 +34,7 @@ from sensors.observation import Observation
 from sensors.rectified import Disparity, RectifiedGrid
 from sensors.rectify import Rectification, rectify
 from sensors.refinement import refine
-from sensors.stereo import REDUCTION, StereoPair, _exposed, _rectified, _view, reproject
+from sensors.stereo import REDUCTION, StereoPair, exposed, rectified_pixel, reproject, view
 
 STEP_PX = 1.0
 """Difference of neighbouring disparities beyond which a cell between them takes the nearest one instead of a mean."""
@@ -66,23 +66,23 @@ class MatchedStereoPair:
         """One depth map, as `StereoPair.observe` returns it; `block` and the truth are what the left pixel really sees."""
         effects = self.pair.model.chain(random)
         nominal = self.pair.cameras.in_wall_frame(self.pair.frame)
-        real = self.pair._real(effects, random).in_wall_frame(self.pair.frame)
+        real = self.pair.real_pair(effects, random).in_wall_frame(self.pair.frame)
         geometry, step = rectify(nominal), REDUCTION[self.pair.quality]
-        index, u, v = self.pair._cells()
-        hits, point = _view(scene, real.left, u - _exposed(effects, "left", v, random), v)
+        index, u, v = self.pair.cells()
+        hits, point = view(scene, real.left, u - exposed(effects, "left", v, random), v)
         true_z = _depth(point, nominal.left, geometry)
         dr.eval(hits, true_z)
         search_m = _range(true_z, hits.valid)
         photographs = self.photograph(scene, real, effects, random)
         grid = RectifiedGrid.cover(nominal, geometry, step)
         disparity = self.matched(photographs, grid, search_m)
-        left_u, left_v = _rectified(nominal.left, geometry.left, u, v, geometry.f, geometry.u_left, geometry.v)
+        left_u, left_v = rectified_pixel(nominal.left, geometry.left, u, v, geometry.f, geometry.u_left, geometry.v)
         found = _sampled(disparity, *grid.cells(left_u, left_v))
         full_px = (mi.Float64(found) + grid.disparity_offset) * step
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
         matches = Matches(index, u, v, full_px, ~dr.isnan(found), *seen, nominal.left.width, nominal.left.height, step)
         matches = apply_stage(effects, Stage.FILL, matches, random)
-        return self.pair._observation(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
+        return self.pair.recorded(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
 
     def photograph(
         self, scene: RayCaster, real: CameraPair, effects: tuple[Effect, ...], random: KeyedRandom
@@ -94,7 +94,7 @@ class MatchedStereoPair:
         studio = Studio(scene, light, self.texture, float(distance * step / self.pair.cameras.left.f_px))
 
         def picture(side: Literal["left", "right"], camera: Camera) -> Radiance:
-            return studio.radiance(camera, step, self.exposure.samples_per_side, lambda v: _exposed(effects, side, v, random))
+            return studio.radiance(camera, step, self.exposure.samples_per_side, lambda v: exposed(effects, side, v, random))
 
         pictures = picture("left", real.left), picture("right", real.right)
         white = full_scale(*pictures)

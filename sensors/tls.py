@@ -164,7 +164,7 @@ class LaserScanner:
 
     def _scan(self, real: LaserScanner, scene: RayCaster, random: KeyedRandom) -> Observation:
         """A scan in one face; real: the scanner where it really stands."""
-        pulses, beam = self._aimed(self._emit(), random)
+        pulses, beam = self._aimed(self.emit(), random)
         echoes = real._echoes(scene, pulses, beam)
         pulses = self._measured(pulses, beam.received(echoes), random)
         if not beam.records_several:
@@ -198,7 +198,8 @@ class LaserScanner:
             pulses = apply_stage(self.model.chain(), stage, pulses, random)
         return pulses
 
-    def _emit(self) -> Pulses:
+    def emit(self) -> Pulses:
+        """The pattern's pulses, in order of lines, before any effect."""
         pattern = self.pattern
         index = dr.arange(mi.UInt32, pattern.lines * pattern.pulses)
         line = index // dr.opaque(mi.UInt32, pattern.pulses)
@@ -282,7 +283,7 @@ class LaserScanner:
 
         Every return has noise of its own. An effect that compares with the whole scan compares with the returns of one number.
         """
-        found, emitted = [], self._emit().evaluated()
+        found, emitted = [], self.emit().evaluated()
         for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
             index = dr.compress(count >= max(number, 2))
             pulses, beam = self._aimed(emitted.at(index), random)
