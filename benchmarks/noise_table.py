@@ -1,0 +1,148 @@
+"""Noise of simulated difference maps of the Glendale site, after ICP and without blocks, against the thesis's tables 5-1 to 5-3.
+
+    python benchmarks/noise_table.py [--maps 45] [--levels high medium low] [--parameters]
+
+Each map differs two observations of one wall with noise drawn anew in both. Finished maps are kept under --out, so an interrupted
+run goes on where it was. --parameters: the noise of each parameter alone instead. Tables are printed and put into docs/noise.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measure import peak_memory_gb
+
+from pipeline.bundled import bundled_config
+from pipeline.config import SimulationConfig, load_config
+from pipeline.difference import statistics
+from pipeline.noise_maps import noise_map, with_model
+from pipeline.site import Site, prepare_site
+from scene.config import load_yaml, parse
+from scene.keyed_random import KeyedRandom
+from scene.raycast import RayCaster
+from sensors.model import StereoModel
+
+DOCUMENT = Path(__file__).parents[1] / "docs" / "noise.md"
+LEVELS = ("high", "medium", "low")
+THESIS_MM = {"high": (23.8, 24.4), "medium": (14.0, 14.6), "low": (7.8, 8.5)}
+"""Mean StD and mean RMSE over 45 maps."""
+SETTINGS = [
+    "wall.resolution_m=0.1",
+    "difference.gsd_m=0.1",
+    "icp.subsample_points=true",
+    "icp.subsample_ratio=0.9",
+]
+FIRST_SEED = 1000
+Figures = dict[str, Any]
+
+
+class Maps:
+    """Statistics of noise maps of one site, each kept in a file of its own."""
+
+    def __init__(self, config: SimulationConfig, site: Site, folder: Path) -> None:
+        self.config, self.site, self.folder, self.caster = config, site, folder, RayCaster(site.mesh)
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def of(self, model: StereoModel, maps: int) -> list[Figures]:
+        """Statistics, m, of maps 1 to `maps` of a sensor model."""
+        return [self._one(model, number) for number in range(1, maps + 1)]
+
+    def _one(self, model: StereoModel, number: int) -> Figures:
+        identity = self.config.model_dump_json() + model.model_dump_json()
+        path = self.folder / f"{hashlib.sha256(identity.encode()).hexdigest()[:16]}_{number:03}.json"
+        if not path.exists():
+            change = noise_map(self.config, with_model(self.site, model), self.caster, KeyedRandom(FIRST_SEED + number))
+            path.write_text(json.dumps(statistics(change).to_dict()))
+        return dict(json.loads(path.read_text()))
+
+
+def bundled_model(name: str) -> StereoModel:
+    path = bundled_config("noise", f"glendale_{name}")
+    return parse(StereoModel, load_yaml(path), str(path))
+
+
+def level_table(measured: Maps, levels: list[str], maps: int) -> list[str]:
+    """Means over the maps, ranges, and the ratio to the thesis's figures; lengths in mm."""
+    rows = [
+        f"| level ({maps} maps) | StD | thesis | ratio | RMSE | thesis | ratio | range of RMSE | median | NMAD |",
+        "|" + "---|" * 10,
+    ]
+    for level in levels:
+        found = measured.of(bundled_model(level), maps)
+        std, rmse, median, nmad = (
+            1e3 * np.array([one[f"{name}_m"] for one in found]) for name in ("standard_deviation", "rmse", "median", "nmad")
+        )
+        targets = THESIS_MM.get(level)
+        compared = [_compared(value.mean(), targets and targets[place]) for place, value in enumerate((std, rmse))]
+        spread = f"{rmse.min():.1f} - {rmse.max():.1f}"
+        rows.append(f"| {level} | {compared[0]} | {compared[1]} | {spread} | {median.mean():.2f} | {nmad.mean():.1f} |")
+    return rows
+
+
+def _compared(value: float, target: float | None) -> str:
+    return f"{value:.1f} | {target} | {value / target:.2f}" if target else f"{value:.1f} | - | -"
+
+
+def parameter_table(measured: Maps, maps: int) -> list[str]:
+    """Root mean square over the maps of the StD (and NMAD), mm, of each parameter's noise alone, as printed and as calibrated."""
+    rows = [f"| alone ({maps} maps) | printed StD | NMAD | calibrated StD | NMAD |", "|" + "---|" * 5]
+    models = [single_parameters(bundled_model(name)) for name in ("printed", "high")]
+    for name in models[0]:
+        cells = [_root_mean_square(measured.of(model[name], maps)) for model in models]
+        rows.append(f"| {name} | " + " | ".join(cells) + " |")
+        print(rows[-1], flush=True)
+    return rows
+
+
+def _root_mean_square(found: list[Figures]) -> str:
+    values = (np.array([one[f"{name}_m"] for one in found]) for name in ("standard_deviation", "nmad"))
+    return " | ".join(f"{1e3 * np.sqrt(np.mean(value**2)):.1f}" for value in values)
+
+
+def single_parameters(model: StereoModel) -> dict[str, StereoModel]:
+    """A model for each parameter of the noise that is not null, then all orientation, all matching and all of it."""
+    noise = model.noise.model_dump()
+    matching = {key: noise[key] for key in ("parallax_sigma_px", "regularization_sigma_px")}
+    orientation = {key: spread for key, spread in noise["orientation"].items() if spread["sigma"] > 0}
+    silent = {**dict.fromkeys(matching, 0.0), "regularization_step_px": noise["regularization_step_px"]}
+    groups = {key: silent | {"orientation": {key: spread}} for key, spread in orientation.items()}
+    groups |= {key: silent | {key: sigma} for key, sigma in matching.items()}
+    groups |= {"orientation": silent | {"orientation": orientation}, "matching": silent | matching, "all": noise}
+    return {key: StereoModel.model_validate({"noise": group}) for key, group in groups.items()}
+
+
+def into_document(name: str, rows: list[str]) -> None:
+    """Put a table between its two marks in docs/noise.md."""
+    text = DOCUMENT.read_text(encoding="utf-8")
+    table = "\n".join(rows)
+    marked = re.sub(rf"(<!-- {name} -->\n).*?(<!-- end -->)", lambda found: f"{found[1]}{table}\n{found[2]}", text, flags=re.S)
+    DOCUMENT.write_text(marked, encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--maps", type=int, default=45)
+    parser.add_argument("--levels", nargs="+", default=list(LEVELS), choices=[*LEVELS, "worst", "printed"])
+    parser.add_argument("--quality", default="medium", choices=["high", "medium", "low"], help="of the depth maps")
+    parser.add_argument("--parameters", action="store_true", help="the noise of each parameter alone")
+    parser.add_argument("--out", type=Path, default=Path("runs/noise_table"))
+    asked = parser.parse_args()
+    settings = [*SETTINGS, f"depth_map={asked.quality}"]
+    config = load_config(bundled_config("sites", "glendale"), settings, "stereo", None)
+    measured = Maps(config, prepare_site(config, "stereo", KeyedRandom(config.seed)), asked.out)
+    start = time.perf_counter()
+    rows = parameter_table(measured, asked.maps) if asked.parameters else level_table(measured, asked.levels, asked.maps)
+    into_document("parameters" if asked.parameters else "levels", rows)
+    print("\n".join(rows))
+    print(f"{time.perf_counter() - start:.0f} s, peak memory {peak_memory_gb():.2f} GB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""Difference maps of noise alone: nothing falls between two observations of one wall, so they show the sensor's noise only."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.closest_points import ReferenceSurface
+from pipeline.config import SimulationConfig
+from pipeline.difference import difference, raster_grid, surface_raster
+from pipeline.look import look, reconstruct
+from pipeline.register import register_to
+from pipeline.site import Site
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.mesh import TriangleMesh
+from scene.raycast import RayCaster
+from sensors.model import StereoModel
+from sensors.stereo import StereoPair
+
+
+def with_model(site: Site, model: StereoModel) -> Site:
+    """The site with another model of its pair; InputError for one that is not seen by a simulated stereo pair."""
+    if not isinstance(site.sensor, StereoPair):
+        raise InputError("noise maps are made of simulated matching", where="matcher", remedy="take the stereo sensor")
+    return replace(site, sensor=replace(site.sensor, model=model))
+
+
+def noise_map(config: SimulationConfig, site: Site, caster: RayCaster, random: KeyedRandom) -> NDArray[np.float32]:
+    """(h, w) differences, m, of two observations of the untouched wall (`caster`), NaN without data.
+
+    Both observations draw noise of their own from `random`; the second is registered to the first where the config has ICP.
+    """
+    reference = _surface(config, site, caster, random.child("reference"))
+    later = _surface(config, site, caster, random.child("later"))
+    if config.icp is not None:
+        target = ReferenceSurface.build(reference.vertices, reference.vertex_normals())
+        found = register_to(target, later.vertices, config.icp, random.child("register"))
+        later = later.with_vertices(found.apply(later.vertices))
+    grid = raster_grid(reference.bounds, config.difference)
+    return difference(surface_raster(reference, grid), surface_raster(later, grid))
+
+
+def _surface(config: SimulationConfig, site: Site, caster: RayCaster, random: KeyedRandom) -> TriangleMesh:
+    return reconstruct(config, look(config, site, caster, random))

@@ -1,0 +1,100 @@
+"""The bundled noise levels of the Glendale site: what they hold, and the difference maps that they make."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.bundled import bundled_config
+from pipeline.config import SimulationConfig, load_config
+from pipeline.difference import statistics
+from pipeline.noise_maps import noise_map, with_model
+from pipeline.site import Site, prepare_site
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.raycast import RayCaster
+from sensors.model import StereoModel, StereoNoise
+
+GLENDALE = bundled_config("sites", "glendale")
+FAST = ["depth_map=low", "wall.resolution_m=0.2", "difference.gsd_m=0.2", "icp.subsample_points=true", "icp.subsample_ratio=0.95"]
+DOCUMENTED_MM = {"high": 22.9, "medium": 15.3, "low": 7.8}
+"""Mean StD over 45 maps (docs/noise.md)."""
+MAPS = 4
+TOLERANCE = 0.25
+
+
+def model(name: str) -> StereoModel:
+    return load_config(GLENDALE, [f"sensor=glendale_{name}"], "stereo", None).stereo_model()
+
+
+def sigmas(noise: StereoNoise) -> dict[str, float]:
+    """Every sigma of a model's noise, by name."""
+    matching = {key: getattr(noise, key) for key in ("parallax_sigma_px", "regularization_sigma_px")}
+    return matching | {key: spread["sigma"] for key, spread in noise.orientation.model_dump().items()}
+
+
+@pytest.fixture(scope="module")
+def stage() -> tuple[SimulationConfig, Site, RayCaster]:
+    config = load_config(GLENDALE, FAST, "stereo", None)
+    site = prepare_site(config, "stereo", KeyedRandom(config.seed))
+    return config, site, RayCaster(site.mesh)
+
+
+@pytest.mark.parametrize(("level", "share"), [("medium", 0.66), ("low", 0.33)])
+def test_levels_scale_all_of_the_noise(level: str, share: float) -> None:
+    high, scaled = sigmas(model("high").noise), sigmas(model(level).noise)
+    assert scaled == pytest.approx({key: share * value for key, value in high.items()}, rel=1e-3)
+    assert min(high["parallax_sigma_px"], high["regularization_sigma_px"], high["cx_px"], high["k4"]) > 0
+
+
+def test_the_worst_epoch_has_three_times_the_orientation_noise() -> None:
+    high, worst = model("high").noise, model("worst").noise
+    expected = {
+        key: value * (1 if key in ("parallax_sigma_px", "regularization_sigma_px") else 3) for key, value in sigmas(high).items()
+    }
+    assert sigmas(worst) == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_printed_set_is_table_4_10_with_its_degrees_as_radians() -> None:
+    noise = sigmas(model("printed").noise)
+    assert noise["omega_rad"] == pytest.approx(np.radians(0.01), rel=1e-3)
+    assert noise["phi_rad"] == pytest.approx(np.radians(0.003), rel=1e-3)
+    printed = {"f_px": 2.5, "cx_px": 4.5, "cy_px": 1.8, "b1": 0.84, "b2": 2.18, "k1": 0.005, "k2": 0.04, "k3": 0.09, "k4": 0.04}
+    printed |= {"p1": 0.0005, "p2": 0.00008, "parallax_sigma_px": 0.6, "regularization_sigma_px": 0.25, "kappa_rad": 0.0}
+    assert {key: noise[key] for key in printed} == pytest.approx(printed)
+
+
+def test_the_calibrated_set_is_the_printed_one_by_two_factors() -> None:
+    printed, high = sigmas(model("printed").noise), sigmas(model("high").noise)
+    factors = {key: 3 / 4 if key in ("parallax_sigma_px", "regularization_sigma_px") else 1 / 9 for key in printed}
+    assert high == pytest.approx({key: factors[key] * value for key, value in printed.items()}, rel=1e-3)
+
+
+def test_a_model_is_named_or_given_as_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = bundled_config("noise", "glendale_high")
+    assert load_config(GLENDALE, [f"sensor={path}"], "stereo", None).stereo_model() == model("high")
+    monkeypatch.chdir(path.parents[2])
+    relative = Path("configs/noise/glendale_high.yaml")
+    assert load_config(GLENDALE, [f"sensor={relative}"], "stereo", None).stereo_model() == model("high")
+
+
+def test_an_unknown_name_is_told_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"there is no 'glendale_hihg'.*glendale_high"):
+        load_config(GLENDALE, ["sensor=glendale_hihg"], "stereo", None)
+
+
+@pytest.mark.parametrize("level", DOCUMENTED_MM)
+def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConfig, Site, RayCaster]) -> None:
+    config, site, caster = stage
+    noisy = with_model(site, model(level))
+    maps = [noise_map(config, noisy, caster, KeyedRandom(50 + number)) for number in range(MAPS)]
+    deviation = 1e3 * np.mean([statistics(change).standard_deviation for change in maps])
+    assert deviation == pytest.approx(DOCUMENTED_MM[level], rel=TOLERANCE)
+    assert abs(np.median([statistics(change).median for change in maps])) < 5e-4
+
+
+def test_without_noise_a_map_is_null(stage: tuple[SimulationConfig, Site, RayCaster]) -> None:
+    config, site, caster = stage
+    silent = StereoModel.model_validate({"noise": {"parallax_sigma_px": 0, "regularization_sigma_px": 0}})
+    change = noise_map(config, with_model(site, silent), caster, KeyedRandom(1))
+    assert np.nanmax(np.abs(change)) < 1e-5
