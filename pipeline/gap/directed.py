@@ -1,0 +1,74 @@
+"""The laser scanner sent in given directions instead of a pattern, so that a measurement can be simulated ray by ray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap.measurement import Measurement
+from scene.backend import dr, mi
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from sensors.effects.base import Stage
+from sensors.model import TlsModel, TlsNoise
+from sensors.pulses import Pulses
+from sensors.tls import LaserScanner, Pattern, ScannerConfig
+
+_NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
+_SPREAD = {
+    "range_noise", "range_noise_proportional", "range_noise_incidence", "range_noise_intensity", "angle_noise",
+    "range_quantization", "beam_divergence",
+}  # fmt: skip
+"""Effects that leave the mean as it is."""
+
+
+@dataclass(frozen=True)
+class DirectedScanner(LaserScanner):
+    """A scanner whose pulses leave in the directions of `geometry` (a TlsGeometry), one after another."""
+
+    geometry: Any = None
+
+    def emit(self) -> Pulses:
+        angles, count = self.geometry, len(self.geometry.azimuth)
+        index = dr.arange(mi.UInt32, count)
+        zero = np.zeros(count)
+        line = zero if angles.line is None else np.maximum(angles.line, 0)
+        share = zero if angles.share is None else angles.share
+        azimuth, zenith = mi.Float64(np.ascontiguousarray(angles.azimuth)), mi.Float64(np.ascontiguousarray(angles.zenith))
+        number = mi.UInt32(line.astype(np.uint32))
+        return Pulses(number, mi.Float64(share), mi.UInt32(0) + index * 0, index, azimuth, zenith, azimuth, zenith)
+
+
+def simulate_ranges(
+    measurement: Measurement, model: TlsModel, geometry: Any, random: KeyedRandom, scene: RayCaster | None = None
+) -> FloatArray:
+    """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
+    assert measurement.station is not None
+    position, rotation = measurement.station
+    count = len(geometry.azimuth)
+    pattern = Pattern(0.0, 1.0, count, 0.0, 1.0, 1)
+    config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
+    scanner = DirectedScanner(position, rotation, pattern, config, model, geometry=geometry)
+    return scanner.observe(scene or measurement.scene, random).depth.reshape(-1)
+
+
+def simulated_ranges(measurement: Measurement, geometry: Any) -> FloatArray:
+    """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise.
+
+    The intensity bias takes the recorded powers, where there are any, for those that the albedo of the reference would give.
+    """
+    model = measurement.model
+    assert isinstance(model, TlsModel)
+    by_intensity = [effect for effect in model.effects if effect.name == "range_intensity_bias"] if geometry.power is not None else []
+    kept = [effect for effect in model.effects if effect.name not in _SPREAD and effect.stage != Stage.RETURN]
+    kept = [effect for effect in kept if effect not in by_intensity]
+    mean = model.model_copy(update={"noise": _NO_NOISE, "effects": tuple(kept)})
+    predicted = simulate_ranges(measurement, mean, geometry, KeyedRandom(0, ("gap", "mean")))
+    for effect in by_intensity:
+        values: Any = effect
+        reference = values.reference_power or float(np.median(geometry.power))
+        predicted = predicted + values.coefficient_m * np.log(np.maximum(geometry.power, 1e-12) / reference)
+    return predicted

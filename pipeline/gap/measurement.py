@@ -1,0 +1,196 @@
+"""A measurement as `scarpsim gap` takes it: points, the surface as known, the instrument and what is believed about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Discriminator, Field, Tag, field_validator
+
+from pipeline.formats.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras import read_cameras_yaml
+from pipeline.formats.ply import read_ply
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points import read_points
+from scene.config import Config, load_yaml, parse
+from scene.errors import InputError
+from scene.frame import WallFrame
+from scene.imported import ImportedWall
+from scene.mesh import FloatArray, TriangleMesh
+from scene.raycast import RayCaster
+from sensors.camera import CameraPair, Matrix3, Vector3, check_rotation
+from sensors.model import StereoModel, TlsModel
+
+FILE = "measurement.yaml"
+Sweep = tuple[float, float, float]
+
+
+class ScannerPose(Config):
+    """Where the scanner stood, as surveyed."""
+
+    position_m: Vector3 = Field(description="scanner's centre, world frame [m]")
+    rotation: Matrix3 = Field(description="scanner to world; scanner z is the vertical axis")
+
+    @field_validator("rotation")
+    @classmethod
+    def _orthonormal(cls, rotation: Matrix3) -> Matrix3:
+        return check_rotation(rotation)
+
+
+class ScanPattern(Config):
+    """The nominal directions of a scan: start, stop and step of each angle."""
+
+    azimuth_rad: Sweep = Field(description="start, stop, step [rad]")
+    zenith_rad: Sweep = Field(description="start, stop, step [rad]")
+
+    @field_validator("azimuth_rad", "zenith_rad")
+    @classmethod
+    def _forward(cls, sweep: Sweep) -> Sweep:
+        if not (sweep[2] > 0 and sweep[1] > sweep[0]):
+            raise ValueError("needs start < stop and a step above 0")
+        return sweep
+
+
+class MeasurementConfig(Config):
+    """The file measurement.yaml."""
+
+    sensor: Literal["tls", "stereo"]
+    reference: Path = Field(description="the surface as known, world frame, m")
+    points: Path | list[Path] = Field(description="point cloud; several epochs: a list")
+    frame: Literal["scanner", "world"] = Field("world", description="of the points")
+    scanner: ScannerPose | None = None
+    pattern: ScanPattern | None = None
+    cameras: Path | None = Field(None, description="cameras.yaml or a Metashape XML: the nominal calibration (stereo)")
+    stable_areas: list[Any] = Field([], description="polygons or boxes in the wall frame: [x0, y0, x1, y1] or [[x, y], ...]")
+    model: Path = Field(description="what the simulation believes about the sensor today")
+
+
+def _kind(values: Any) -> str:
+    return str(values.get("sensor") if isinstance(values, dict) else values.sensor)
+
+
+class _ModelFile(Config):
+    sensor: Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_kind)]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What was measured, with everything that predicts it.
+
+    cloud: points in the wall frame; reference: wall frame; station: position (3,) and rotation (3, 3) scanner to wall frame, TLS
+    only; cameras: world frame, stereo only; frame: the wall frame.
+    """
+
+    sensor: Literal["tls", "stereo"]
+    cloud: PointCloud
+    reference: TriangleMesh
+    frame: WallFrame
+    model: TlsModel | StereoModel
+    pattern: ScanPattern | None = None
+    station: tuple[FloatArray, FloatArray] | None = None
+    cameras: CameraPair | None = None
+
+    @cached_property
+    def scene(self) -> RayCaster:
+        return RayCaster(self.reference)
+
+
+def read_model(path: Path) -> TlsModel | StereoModel:
+    """A file model.yaml. Raises InputError with the key that is wrong."""
+    values = load_yaml(path)
+    if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
+        raise InputError("names no sensor", where=str(path), allowed="sensor: tls, sensor: stereo")
+    return parse(_ModelFile, {"sensor": values}, str(path)).sensor
+
+
+def read_measurement(folder: Path) -> Measurement:
+    """Read a folder with measurement.yaml. Raises InputError that names the file and the key."""
+    path = folder / FILE if folder.is_dir() else folder
+    if not path.is_file():
+        raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
+    config, base = parse(MeasurementConfig, load_yaml(path), str(path)), path.parent
+    model = read_model(base / config.model)
+    if model.sensor != config.sensor:
+        raise InputError(f"model is of sensor {model.sensor}, the measurement of {config.sensor}", where=str(path))
+    cameras = _cameras(config, base, str(path))
+    mesh = _reference(base / config.reference)
+    towards = _viewpoint(config, cameras, str(path))
+    frame = WallFrame.fit(mesh.vertices, towards)
+    cloud = _joined([read_points(base / file) for file in _files(config)])
+    station = _station(config, frame)
+    return Measurement(
+        sensor=config.sensor,
+        cloud=_in_wall_frame(cloud, config, frame),
+        reference=mesh.with_vertices(frame.to_wall(mesh.vertices)),
+        frame=frame,
+        model=model,
+        pattern=config.pattern,
+        station=station,
+        cameras=cameras,
+    )
+
+
+def _files(config: MeasurementConfig) -> list[Path]:
+    return [config.points] if isinstance(config.points, Path) else config.points
+
+
+def _reference(path: Path) -> TriangleMesh:
+    """The reference as it is in the file: cleaning would move what the residuals are measured against."""
+    return read_ply(path) if path.suffix.lower() == ".ply" else ImportedWall(mesh=path).load()[0]
+
+
+def _cameras(config: MeasurementConfig, base: Path, where: str) -> CameraPair | None:
+    if config.sensor == "tls":
+        return None
+    if config.cameras is None:
+        raise InputError("a stereo measurement needs `cameras`", where=where, remedy="name cameras.yaml or a Metashape XML")
+    file = base / config.cameras
+    found = read_oriented(file)
+    return read_cameras_yaml(file) if found is None else stereo_pair(found, None, None, str(file))
+
+
+def _viewpoint(config: MeasurementConfig, cameras: CameraPair | None, where: str) -> FloatArray:
+    if cameras is not None:
+        return (cameras.left.position + cameras.right.position) / 2
+    if config.scanner is None:
+        raise InputError("a TLS measurement needs `scanner`", where=where, remedy="give scanner: position_m and rotation")
+    return np.array(config.scanner.position_m)
+
+
+def _station(config: MeasurementConfig, frame: WallFrame) -> tuple[FloatArray, FloatArray] | None:
+    if config.scanner is None:
+        return None
+    return frame.to_wall(np.array(config.scanner.position_m)), frame.rotation @ np.array(config.scanner.rotation)
+
+
+def _joined(clouds: list[PointCloud]) -> PointCloud:
+    """One cloud of all epochs, with the channels that all have."""
+    if len(clouds) == 1:
+        return clouds[0]
+    shared = set.intersection(*(set(cloud.extra) for cloud in clouds))
+    columns: dict[str, Any] = {}
+    for name in ("intensity", "gps_time"):
+        parts = [getattr(cloud, name) for cloud in clouds]
+        columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
+    extra = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in sorted(shared)}
+    extra["epoch"] = np.repeat(np.arange(len(clouds)), [len(cloud.points) for cloud in clouds])
+    return PointCloud(np.concatenate([cloud.points for cloud in clouds]), extra=extra, **columns)
+
+
+def _in_wall_frame(cloud: PointCloud, config: MeasurementConfig, frame: WallFrame) -> PointCloud:
+    points = cloud.points
+    keep = np.isfinite(points).all(axis=1)
+    if config.frame == "scanner" and config.scanner is not None:
+        turn = frame.rotation @ np.array(config.scanner.rotation)
+        points = np.einsum("ij,nj->ni", turn, points) + frame.to_wall(np.array(config.scanner.position_m))
+    else:
+        points = frame.to_wall(points)
+    return PointCloud(
+        points[keep],
+        None if cloud.intensity is None else np.asarray(cloud.intensity, dtype=np.float64)[keep],
+        None if cloud.gps_time is None else cloud.gps_time[keep],
+        {name: channel[keep] for name, channel in cloud.extra.items()},
+    )

@@ -1,0 +1,132 @@
+"""How each effect of the stereo pair on the mean would show in the disparity residuals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap.candidates import Candidate, amplitude_and_phase
+from pipeline.gap.measurement import Measurement
+from pipeline.gap.residuals import Residuals
+from pipeline.gap.stereo_residuals import NominalPair, StereoGeometry, real_pair, seen_disparity
+from scene.mesh import FloatArray
+from sensors.effects import (
+    AffinitySkew,
+    CameraKappa,
+    CameraOmega,
+    CameraPhi,
+    CameraShift,
+    FocalLength,
+    PrincipalPointX,
+    PrincipalPointY,
+    RadialDistortion,
+    TangentialDistortion,
+)
+from sensors.effects.base import Effect
+
+_SIDES = ("left", "right", "both")
+_CAMERA: tuple[tuple[type[Effect], tuple[tuple[str, ...], ...], float], ...] = (
+    (FocalLength, (("delta_px",),), 0.1),
+    (PrincipalPointX, (("delta_px",),), 0.1),
+    (PrincipalPointY, (("delta_px",),), 0.1),
+    (RadialDistortion, (("k1",), ("k1", "k2"), ("k1", "k2", "k3")), 1e-4),
+    (TangentialDistortion, (("p1",), ("p2",), ("p1", "p2")), 1e-5),
+    (AffinitySkew, (("b1_px",), ("b2_px",), ("b1_px", "b2_px")), 0.1),
+    (CameraOmega, (("angle_rad",),), 1e-5),
+    (CameraPhi, (("angle_rad",),), 1e-5),
+    (CameraKappa, (("angle_rad",),), 1e-5),
+    (CameraShift, (("x_m", "y_m", "z_m"),), 1e-3),
+)
+"""Effect, the sets of its parameters that are tried, and the step of the finite differences."""
+_FEWEST_ROWS = 24.0
+_FREQUENCIES = 60
+
+
+def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
+    """Every effect of the catalogue on the mean disparity, cameras and searched parameters as variants."""
+    geometry, nominal = residuals.geometry, NominalPair.of(measurement)
+    found = [
+        candidate
+        for effect, sets, step in _CAMERA
+        for side in _SIDES
+        for candidate in _camera_variants(effect, sets, step, side, nominal, geometry, measurement)
+    ]
+    return [*found, *_row_jitter(geometry), *_locking(geometry)]
+
+
+def _camera_variants(
+    effect: type[Effect],
+    sets: tuple[tuple[str, ...], ...],
+    step: float,
+    side: str,
+    nominal: NominalPair,
+    geometry: StereoGeometry,
+    measurement: Measurement,
+) -> list[Candidate]:
+    base = seen_disparity(nominal, nominal.pair, geometry)
+    columns: dict[str, FloatArray] = {}
+    for name in sorted({name for names in sets for name in names}):
+        changed = real_pair(nominal, (effect(**{"camera": side, name: step}),), measurement)
+        columns[name] = (seen_disparity(nominal, changed, geometry) - base) / step
+    name = effect.model_fields["name"].default
+    return [
+        Candidate(
+            name,
+            np.stack([columns[key] for key in names], axis=1),
+            lambda values, names=names: dict(zip(names, map(float, values), strict=True)),
+            names,
+            (1.0,) * len(names),
+            {"camera": side},
+        )
+        for names in sets
+    ]
+
+
+def _row_jitter(geometry: StereoGeometry) -> list[Candidate]:
+    """dx in the left image adds to the disparity, in the right image it is taken off, at the right image's row."""
+    height = float(np.ptp(geometry.v))
+    frequencies = np.geomspace(0.7 / height, 1 / _FEWEST_ROWS, _FREQUENCIES)
+    found = []
+    for side, rows, sign in (("left", geometry.v, 1.0), ("right", geometry.v_right, -1.0)):
+        for frequency in frequencies:
+            angle = 2 * np.pi * frequency * rows
+            fixed = {"camera": side, "rows_per_cycle": float(1 / frequency)}
+            found.append(_wave("row_jitter", sign, angle, "amplitude_px", fixed))
+    return found
+
+
+def _wave(name: str, sign: float, angle: FloatArray, amplitude: str, fixed: dict[str, Any]) -> Candidate:
+    columns = sign * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    return Candidate(
+        name, columns, lambda values: amplitude_and_phase(values, amplitude) | fixed, (amplitude, "phase_rad"), (1.0, 1.0), fixed
+    )
+
+
+def _locking(geometry: StereoGeometry) -> list[Candidate]:
+    """Locking on the full frame's pixels and on those of a reduced image; of the true disparity, which the residual is not in."""
+    found = []
+    for reduction in (1, 2, 4, 8):
+        column = np.sin(2 * np.pi * geometry.disparity / reduction)
+        fixed = {"reduction": float(reduction)}
+        found.append(
+            Candidate(
+                "pixel_locking", column[:, None], lambda values: {"amplitude_px": float(values[0])}, ("amplitude_px",), (1.0,), fixed
+            )
+        )
+    return found
+
+
+def exposure_and_locking(effects: tuple[Effect, ...], geometry: StereoGeometry) -> FloatArray:
+    """(n,) what a model's row jitter and pixel locking add to the disparity, px."""
+    total = np.zeros(len(geometry.u))
+    for effect in effects:
+        values: Any = effect
+        if effect.name == "row_jitter":
+            for side, rows, sign in (("left", geometry.v, 1.0), ("right", geometry.v_right, -1.0)):
+                if values.camera in (side, "both"):
+                    angle = 2 * np.pi * rows / values.rows_per_cycle + values.phase_rad
+                    total += sign * values.amplitude_px * np.sin(angle)
+        elif effect.name == "pixel_locking":
+            total += values.amplitude_px * np.sin(2 * np.pi * geometry.found)
+    return total
