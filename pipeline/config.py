@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from pipeline.annotate import AnnotationConfig
+from pipeline.bundled import bundled_config
 from pipeline.difference import DifferenceConfig
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import PairConfig, read_cameras_yaml
@@ -180,15 +181,18 @@ class SimulationConfig(Config):
 def load_config(path: Path, overrides: Sequence[str], sensor: SensorName | None, seed: int | None) -> SimulationConfig:
     """Read a config file, apply `--set` overrides and the seed; paths in the file are relative to its folder.
 
-    A bare sensor model (model.yaml, model_after.yaml: its `sensor` is a word) is a config of which all else is default. Raises
-    InputError for whatever is wrong, and where the config's only models are of another sensor than `sensor` (None: any).
+    The run.json of a finished run is a config too: that run again, to the byte. So is a bare sensor model (model.yaml,
+    model_after.yaml: its `sensor` is a word); all else is the demo's. Raises InputError for whatever is wrong, and where the
+    config's only models are of another sensor than `sensor` (None: any).
     """
     values = load_yaml(path)
     values = {} if values is None else values
     if not isinstance(values, dict):
         raise InputError("is not a mapping of keys", where=str(path), remedy="write `key: value` lines; see `scarpsim init`")
+    if isinstance(values.get("config"), dict) and "schema" in values:
+        values = values["config"]
     if isinstance(values.get("sensor"), str) and values["sensor"] in ("stereo", "tls"):
-        values = {"sensor": [values]}
+        values = {**load_yaml(bundled_config("", "demo")), "sensor": [values]}
     values = apply_overrides(_with_paths(values, path.parent), overrides)
     if isinstance(values.get("sensor"), str):
         values["sensor"] = load_yaml(model_file(values["sensor"]))

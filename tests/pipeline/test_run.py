@@ -146,6 +146,13 @@ def test_the_same_seed_gives_the_same_bytes_with_one_and_two_threads(finished: t
     assert digests(tmp_path / "one") == digests(first)
 
 
+def test_run_json_is_the_config_of_the_same_run_again(finished: tuple[SensorName, Path]) -> None:
+    sensor, out = finished
+    again = load_config(out / "run.json", [], sensor, None)
+    assert again == config()
+    assert again.model_dump(mode="json") == json.loads((out / "run.json").read_text())["config"]
+
+
 def test_an_interrupted_run_is_usable_and_resumes_to_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     two = config(epochs=2)
     simulate(two, "tls", tmp_path / "whole")
