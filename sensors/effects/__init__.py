@@ -17,6 +17,7 @@ from sensors.effects.camera_phi import CameraPhi
 from sensors.effects.camera_shift import CameraShift
 from sensors.effects.collimation import Collimation
 from sensors.effects.detection_limit import DetectionLimit
+from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.focal_length import FocalLength
 from sensors.effects.horizontal_eccentricity import HorizontalEccentricity
@@ -28,6 +29,7 @@ from sensors.effects.principal_point_x import PrincipalPointX
 from sensors.effects.principal_point_y import PrincipalPointY
 from sensors.effects.radial_distortion import RadialDistortion
 from sensors.effects.range_cyclic import RangeCyclic
+from sensors.effects.range_empirical import RangeEmpirical
 from sensors.effects.range_incidence_bias import RangeIncidenceBias
 from sensors.effects.range_intensity_bias import RangeIntensityBias
 from sensors.effects.range_noise import RangeNoise
@@ -111,8 +113,9 @@ def _named(effects: tuple[type[Effect], ...]) -> Any:
     return Annotated[Union[effects], Discriminator("name"), BeforeValidator(check)]  # noqa: UP007 (built at run time)
 
 
-TlsEffect = _named(TLS_EFFECTS)
-StereoEffect = _named(STEREO_EFFECTS)
+TlsEffect = _named((*TLS_EFFECTS, RangeEmpirical))
+StereoEffect = _named((*STEREO_EFFECTS, DisparityEmpirical))
+"""What a config may name: the catalogue and, for what it does not explain, the empirical terms that `scarpsim gap` adds."""
 
 __all__ = [
     "STEREO_EFFECTS",
@@ -126,6 +129,7 @@ __all__ = [
     "CameraShift",
     "Collimation",
     "DetectionLimit",
+    "DisparityEmpirical",
     "EdgeFattening",
     "Effect",
     "FocalLength",
@@ -138,6 +142,7 @@ __all__ = [
     "PrincipalPointY",
     "RadialDistortion",
     "RangeCyclic",
+    "RangeEmpirical",
     "RangeIncidenceBias",
     "RangeIntensityBias",
     "RangeNoise",
