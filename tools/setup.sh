@@ -70,10 +70,14 @@ fi
 # --inexact keeps extras that somebody added by hand, such as `uv sync --extra detect --inexact`.
 "$uv" sync --quiet --locked --inexact --python "$python" || fail "the environment could not be made from uv.lock"
 
-if [ -n "$("$python" pipeline/cli/system_libraries.py)" ]; then
+# -P: the script's folder stays off the path, where modules have names of the standard library's.
+missing_packages() { "$python" -P pipeline/cli/system_libraries.py || fail "the check of the system libraries failed"; }
+
+missing=$(missing_packages)
+if [ -n "$missing" ]; then
     apt_update
-    # shellcheck disable=SC2046  # one word per package
-    apt_install $("$python" pipeline/cli/system_libraries.py)
-    left=$("$python" pipeline/cli/system_libraries.py)
-    [ -z "$left" ] || fail "still missing after the installation: $left"
+    # shellcheck disable=SC2046  # one word per package; asked again, since new lists may offer a newer LLVM
+    apt_install $(missing_packages)
+    missing=$(missing_packages)
+    [ -z "$missing" ] || fail "still missing after the installation: $missing"
 fi

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from importlib import metadata
+from pathlib import Path
 
 import pytest
 
@@ -52,3 +54,11 @@ def test_llvm_is_looked_for_where_drjit_looks(monkeypatch: pytest.MonkeyPatch) -
     assert not library.present
     (package,) = system_libraries.packages([library])
     assert package.startswith("libllvm")
+
+
+def test_the_set_up_can_ask_for_missing_packages_with_a_bare_python() -> None:
+    """As tools/setup.sh does, before the environment is there: no package, and no module of ours in the way of the library's."""
+    script = Path(__file__).parents[2] / "pipeline/cli/system_libraries.py"
+    result = subprocess.run([sys.executable, "-P", "-S", str(script)], capture_output=True, text=True, check=False, env={})
+    assert result.returncode == 0, result.stderr
+    assert f"-P {script.relative_to(script.parents[2])}" in (script.parents[2] / "tools/setup.sh").read_text()
