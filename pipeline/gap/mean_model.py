@@ -54,7 +54,7 @@ class MeanModel:
         self._root = 1 / sigma[self._inside]
         self._total = np.bincount(self._cell, self._root**2, len(cells))
         scale = 1 / np.sqrt(self._total)
-        typical = float(np.median(scale))
+        self.typical_sigma = typical = float(np.median(scale))
         distance = cdist(cells.centre, cells.centre)
         self._bases: list[tuple[FloatArray, FloatArray]] = []
         for length in _LENGTHS_IN_CELLS:

@@ -6,7 +6,7 @@ columns k, as Akaike's criterion; more where a period is searched): the expected
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,6 +78,8 @@ class MeanSearch:
         self.cells = Cells.over(residuals.at)
         self.model = MeanModel(self.cells, residuals.sigma)
         columns = _without_pose(np.concatenate([*matrices, residuals.value[:, None]], axis=1), residuals.sigma)
+        self._matrix, self._values = columns[:, :-1], columns[:, -1]
+        self._pose, self._raw, self._sigma = residuals.pose, residuals.value, residuals.sigma
         self._projected, value = self.model.project(columns[:, :-1]), self.model.project(columns[:, -1:])
         self._normals = Normal.all(self.model, self._projected, value)
         self.null = max(self._normals, key=lambda normal: float(gain(normal, list(POSE), [])[0][0])).at
@@ -180,6 +182,51 @@ class MeanSearch:
 
     def _alike(self, best: Tried, tried: list[Tried]) -> tuple[str, ...]:
         return tuple(i.name for i in tried if i is not best and not i.empirical and i.score > best.score - CLASS_MARGIN)
+
+    def reference_sigma(self, chosen: list[Chosen]) -> float:
+        """Standard deviation of the reference's correlated error, in the observable's unit."""
+        at = self.fit(self.columns([self.candidates.index(item.candidate) for item in chosen])).at
+        return float(np.sqrt(at.ratio)) * self.model.typical_sigma
+
+    def without(self, chosen: list[Chosen]) -> FloatArray:
+        """(n,) residuals less pose and the chosen effects at their most likely values."""
+        columns = self.columns([self.candidates.index(item.candidate) for item in chosen])
+        return np.asarray(self._values - self._matrix[:, columns] @ self.fit(columns).coefficients)
+
+    def refined(self, chosen: list[Chosen]) -> tuple[list[Candidate], FloatArray, FloatArray]:
+        """The chosen candidates with their periods refined between the grid's, coefficients and covariance of all of them."""
+        candidates = [self._refined(item.candidate, chosen) for item in chosen]
+        columns = np.concatenate([self._pose, *(each.columns for each in candidates), self._raw[:, None]], axis=1)
+        clean = _without_pose(columns, self._sigma)
+        projected, value = self.model.project(clean[:, :-1]), self.model.project(clean[:, -1:])
+        base = list(range(clean.shape[1] - 1))
+        normals = Normal.all(self.model, projected, value)
+        found = solve(max(normals, key=lambda normal: float(gain(normal, base, [])[0][0])), base)
+        return candidates, found.coefficients[len(POSE) :], found.covariance[len(POSE) :, len(POSE) :]
+
+    def _refined(self, candidate: Candidate, chosen: list[Chosen]) -> Candidate:
+        """The period at the top of the white likelihood near the grid's best, with its standard error by the curvature."""
+        wave = candidate.wave
+        if wave is None:
+            return candidate
+        others = [item.candidate.columns for item in chosen if item.candidate is not candidate]
+        base = np.linalg.qr(np.concatenate([self._pose, *others], axis=1) / self._sigma[:, None])[0]
+        value = self._raw / self._sigma
+        value = value - base @ (base.T @ value)
+
+        def explained(frequency: float) -> float:
+            columns = wave.columns(1 / frequency) / self._sigma[:, None]
+            columns = columns - base @ (base.T @ columns)
+            return float(0.5 * value @ columns @ np.linalg.lstsq(columns, value, rcond=None)[0])
+
+        centre, step = 1 / float(candidate.fixed[wave.key]), 0.5 / float(np.ptp(wave.x))
+        for width in (step, step / 10):
+            trial = centre + np.linspace(-width, width, 21)
+            centre = float(trial[int(np.argmax([explained(each) for each in trial]))])
+        width = step / 20
+        curvature = (2 * explained(centre) - explained(centre - width) - explained(centre + width)) / width**2
+        error = 1 / np.sqrt(max(curvature, 1e-12)) / centre**2
+        return replace(candidate, columns=wave.columns(1 / centre), fixed={**candidate.fixed, wave.key: 1 / centre}, errors={wave.key: float(error)})
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of the families, cosines of their signatures after the pose fit, and the share that survives the pose fit."""

@@ -151,7 +151,7 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
         unit_m=1 / slope,
         smooth=hit & (curvature < _EDGE_PX),
         pose=_pose(nominal, geometry),
-        at=points[:, :2],
+        at=geometry.point[:, :2],
         covariates=_covariates(nominal, geometry, depth, curvature),
         index=np.arange(len(u)),
         geometry=geometry,

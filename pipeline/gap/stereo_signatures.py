@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.candidates import Candidate, amplitude_and_phase
+from pipeline.gap.candidates import Candidate, Wave, searched
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.stereo_residuals import NominalPair, StereoGeometry, real_pair, seen_disparity
@@ -87,20 +87,11 @@ def _row_jitter(geometry: StereoGeometry) -> list[Candidate]:
     """dx in the left image adds to the disparity, in the right image it is taken off, at the right image's row."""
     height = float(np.ptp(geometry.v))
     frequencies = np.geomspace(0.7 / height, 1 / _FEWEST_ROWS, _FREQUENCIES)
-    found = []
-    for side, rows, sign in (("left", geometry.v, 1.0), ("right", geometry.v_right, -1.0)):
-        for frequency in frequencies:
-            angle = 2 * np.pi * frequency * rows
-            fixed = {"camera": side, "rows_per_cycle": float(1 / frequency)}
-            found.append(_wave("row_jitter", sign, angle, "amplitude_px", fixed))
-    return found
-
-
-def _wave(name: str, sign: float, angle: FloatArray, amplitude: str, fixed: dict[str, Any]) -> Candidate:
-    columns = sign * np.stack([np.sin(angle), np.cos(angle)], axis=1)
-    return Candidate(
-        name, columns, lambda values: amplitude_and_phase(values, amplitude) | fixed, (amplitude, "phase_rad"), (1.0, 1.0), fixed
-    )
+    return [
+        searched("row_jitter", "amplitude_px", Wave("rows_per_cycle", np.full(len(rows), sign), rows), float(1 / f), camera=side)
+        for side, rows, sign in (("left", geometry.v, 1.0), ("right", geometry.v_right, -1.0))
+        for f in frequencies
+    ]
 
 
 def _locking(geometry: StereoGeometry) -> list[Candidate]:

@@ -86,7 +86,7 @@ def tls_residuals(measurement: Measurement) -> Residuals:
         unit_m=np.ones_like(measured),
         smooth=hit & flat,
         pose=_pose(axes[0], normal, distance),
-        at=measurement.cloud.points[:, :2],
+        at=(position + distance[:, None] * axes[0])[:, :2],
         covariates=_covariates(geometry, curvature),
         index=np.arange(len(measured)),
         geometry=geometry,

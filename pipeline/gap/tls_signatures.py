@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.candidates import Candidate, amplitude_and_phase
+from pipeline.gap.candidates import Candidate, Wave, amplitude_and_phase, searched
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.tls_spread import slant
 from scene.mesh import FloatArray
@@ -75,23 +75,17 @@ def _wave(name: str, factor: FloatArray, angle: FloatArray, amplitude: str, fixe
 
 def _cyclic(geometry: Any) -> list[Candidate]:
     """Periods on a grid as fine as the spread of the ranges can tell apart."""
-    reach = float(np.ptp(np.quantile(geometry.range_m, [0.01, 0.99])))
-    frequencies = _frequencies(1 / min(12.0, max(reach, 1.0)), 1 / 0.4, 0.5 / max(reach, 1.0))
-    return [
-        _wave("range_cyclic", np.ones_like(geometry.range_m), 2 * np.pi * f * geometry.range_m, "amplitude_m", {"period_m": 1 / f})
-        for f in frequencies
-    ]
+    reach = max(float(np.ptp(np.quantile(geometry.range_m, [0.01, 0.99]))), 1.0)
+    wave = Wave("period_m", np.ones_like(geometry.range_m), geometry.range_m)
+    return [searched("range_cyclic", "amplitude_m", wave, float(1 / f)) for f in _frequencies(1 / min(12.0, reach), 1 / 0.4, 0.5 / reach)]
 
 
 def _wobble(geometry: Any) -> list[Candidate]:
     lines = float(np.ptp(geometry.line))
     if lines < 4 * _FEWEST_LINES:
         return []
-    frequencies = _frequencies(1 / lines, 1 / _FEWEST_LINES, 0.5 / lines)
-    return [
-        _wave("wobble", -geometry.by_zenith, 2 * np.pi * f * geometry.line, "amplitude_rad", {"lines_per_cycle": 1 / f})
-        for f in frequencies
-    ]
+    wave = Wave("lines_per_cycle", -geometry.by_zenith, geometry.line)
+    return [searched("wobble", "amplitude_rad", wave, float(1 / f)) for f in _frequencies(2 / lines, 1 / _FEWEST_LINES, 0.5 / lines)]
 
 
 def _frequencies(low: float, high: float, step: float) -> FloatArray:

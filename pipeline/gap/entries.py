@@ -1,0 +1,159 @@
+"""What was found as entries of a config and of gap.json: parameters with their uncertainty, the class, and what would split it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap.candidates import Candidate
+from pipeline.gap.missing import MissingFound
+from pipeline.gap.quantization import Comb
+from pipeline.gap.residuals import Residuals
+from pipeline.gap.selection import Chosen, MeanSearch
+from pipeline.gap.spread import SpreadFound
+from scene.config import parse
+from scene.mesh import FloatArray
+from sensors.model import StereoModel, TlsModel
+
+_ONLY_OURS = ("reduction",)
+"""Searched values that tell variants apart and are no parameter of the effect."""
+_DEGREES = 5
+_SPLITS = {
+    frozenset({"range_offset", "range_scale"}): "a second station at another range",
+    frozenset({"collimation", "trunnion_tilt"}): "a scan with steeper lines of sight, or in two faces",
+    frozenset({"principal_point_x", "camera_phi"}): "a surface with more relief, or a second distance",
+    frozenset({"focal_length", "affinity_skew"}): "one of the cameras turned by 90 degrees, or check points across the whole frame",
+}
+_SPLIT_TLS = "a second station at another range and azimuth, or targets of known position"
+_SPLIT_STEREO = "a second distance, or check points of known position across the whole frame"
+
+
+@dataclass(frozen=True)
+class Named:
+    """One effect as it stands in gap.json. name: with the sensor's prefix; entry: of a model's `effects`; std: of the parameters."""
+
+    name: str
+    kind: str
+    entry: dict[str, Any]
+    std: dict[str, float]
+    alike: tuple[str, ...]
+    p_value: float
+    gain: float
+
+    @property
+    def split_by(self) -> str:
+        """The measurement that would split the class; "" for a class of one."""
+        if not self.alike:
+            return ""
+        sensor, _, name = self.name.partition(".")
+        others = {each.partition(".")[2] for each in self.alike}
+        found = [text for pair, text in _SPLITS.items() if name in pair and pair & others]
+        return found[0] if found else (_SPLIT_TLS if sensor == "tls" else _SPLIT_STEREO)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As gap.json holds it."""
+        parameters = {
+            key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"
+        }
+        return {
+            "name": self.name,
+            "cannot_be_told_from": list(self.alike),
+            "split_by": self.split_by,
+            "kind": self.kind,
+            "parameters": parameters,
+            "p_value": self.p_value,
+            "held_out_log_score_gain": self.gain,
+        }
+
+
+def with_effects(model: TlsModel | StereoModel, entries: list[dict[str, Any]]) -> TlsModel | StereoModel:
+    """The model with further effects, checked as a config is."""
+    values = model.model_dump(mode="json")
+    return parse(type(model), {**values, "effects": [*values["effects"], *entries]}, "model_after.yaml")
+
+
+def from_comb(comb: Comb, part: Residuals) -> Named:
+    """Steps of the range. Gain: of the probability that all ranges lie on the comb, an e-fold each at the least."""
+    entry = {"name": "range_quantization", "step_m": comb.step_m}
+    return Named("tls.range_quantization", "physical", entry, {"step_m": comb.std_m}, (), 1 / 2000, float(len(part)) * comb.strength)
+
+
+def from_spread(found: SpreadFound) -> Named:
+    """An effect on the spread of laser ranges or disparities."""
+    sensor = "stereo" if found.name == "parallax_noise" else "tls"
+    alike = tuple(f"{sensor}.{name}" for name in found.alike)
+    kind = "empirical" if found.empirical else "physical"
+    entry = {"name": found.effect, **found.parameters}
+    name = f"{sensor}.{found.effect}"
+    return Named(name, kind, entry, found.std, () if found.empirical else alike, found.p_value, found.gain)
+
+
+def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:
+    """An effect on the returns; a detection limit shows as the smallest recorded power."""
+    parameters, std = dict(found.parameters), dict(found.std)
+    if found.name == "detection_limit" and intensity is not None:
+        low = np.sort(intensity)[: max(len(intensity) // 200, 2)]
+        parameters["minimum_power"], std["minimum_power"] = float(low[0]), float(low[1] - low[0])
+    p_value = max(float(np.exp(-found.score)), 1 / 2000)
+    return Named(f"tls.{found.name}", "physical", {"name": found.name, **parameters}, std, (), p_value, found.gain)
+
+
+def from_mean(search: MeanSearch, chosen: list[Chosen], part: Residuals) -> list[Named]:
+    """Effects on the mean, fitted together with pose and correlated error."""
+    if not chosen:
+        return []
+    candidates, coefficients, covariance = search.refined(chosen)
+    named, start = [], 0
+    for item, candidate in zip(chosen, candidates, strict=True):
+        stop = start + candidate.columns.shape[1]
+        values, spread = coefficients[start:stop], covariance[start:stop, start:stop]
+        named.append(_empirical(candidate, values, item, part) if candidate.empirical else _physical(candidate, values, spread, item, part))
+        start = stop
+    return named
+
+
+def _physical(candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals) -> Named:
+    fixed = {key: value for key, value in candidate.fixed.items() if key not in _ONLY_OURS}
+    entry = {"name": candidate.name, **candidate.parameters(values), **fixed}
+    std = _uncertainty(candidate, values, covariance)
+    alike = tuple(f"{part.sensor}.{name}" for name in item.alike)
+    return Named(f"{part.sensor}.{candidate.name}", "physical", _plain(entry), std, alike, item.p_value, item.gain)
+
+
+def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
+    """Standard deviations of the parameters, by finite differences of what the coefficients mean."""
+    base = candidate.parameters(values)
+    steps = np.sqrt(np.maximum(np.diag(covariance), 1e-300)) * 1e-3
+    std = {}
+    for key in base:
+        slopes = [(candidate.parameters(values + step * unit)[key] - base[key]) / step for step, unit in zip(steps, np.eye(len(values)), strict=True)]
+        std[key] = float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
+    return std | candidate.errors
+
+
+def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:
+    """A free form as a polynomial: of the lowest degree that leaves 2 % of its variance, at most 5."""
+    x = part.covariates[candidate.name]
+    curve = candidate.columns @ values
+    centre, scale = float(x.mean()), float(x.std()) or 1.0
+    t = np.clip((x - centre) / scale, -4, 4)
+    fits = [np.linalg.lstsq(np.stack([t**k for k in range(degree + 1)], axis=1), curve, rcond=None)[0] for degree in range(1, _DEGREES + 1)]
+    left = [float(np.var(curve - sum(c * t**k for k, c in enumerate(fit)))) for fit in fits]
+    degree = next((number for number, variance in enumerate(left) if variance < 0.02 * np.var(curve)), len(fits) - 1)
+    unit, name = ("m", "range_empirical") if part.sensor == "tls" else ("px", "disparity_empirical")
+    entry = {
+        "name": name,
+        "covariate": candidate.name,
+        "centre": centre,
+        "scale": scale,
+        f"coefficients_{unit}": [float(value) for value in fits[degree][1:]],
+    }
+    return Named(f"{part.sensor}.{name}", "empirical", entry, {}, (), item.p_value, item.gain)
+
+
+def _plain(entry: dict[str, Any]) -> dict[str, Any]:
+    return {key: float(value) if isinstance(value, np.floating) else value for key, value in entry.items()}
+
+

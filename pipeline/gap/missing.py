@@ -1,0 +1,72 @@
+"""Which effects explain the returns that are missing: a loss that is the same for all, or one that grows with range or falls with power."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+from pipeline.gap.residuals import Missing
+from scene.mesh import FloatArray
+
+_LEAST_GAIN = 9.0
+_EARLY_SIGMAS, _EARLY_M = 8.0, 0.5
+
+
+@dataclass(frozen=True)
+class MissingFound:
+    """An effect on the returns. gain: in log-likelihood over a constant share of losses."""
+
+    name: str
+    gain: float
+    score: float
+    parameters: dict[str, float]
+    std: dict[str, float]
+    tried: tuple[tuple[str, float], ...]
+
+
+def find_missing(missing: Missing, early: int, points: int) -> MissingFound | None:
+    """The effect that the losses ask for, if any. early: returns far before the surface, of `points`."""
+    lost = missing.lost
+    share = float(np.clip(lost.mean(), 1e-9, 1 - 1e-9))
+    plain = float(lost.sum() * np.log(share) + (~lost).sum() * np.log1p(-share))
+    limit, rain = _limit(lost, missing.covariates["log_power"], plain), _rain(lost, missing.covariates["range"], plain, early, points)
+    best, other = (limit, rain) if limit.score >= rain.score else (rain, limit)
+    if best.score < _LEAST_GAIN:
+        return None
+    return MissingFound(best.name, best.gain, best.score, best.parameters, best.std, ((best.name, best.score), (other.name, other.score)))
+
+
+def _limit(lost: FloatArray, log_power: FloatArray, plain: float) -> MissingFound:
+    """P = p0 + (1 - p0) Phi((ln P_min - ln rho - ln(cos i / R^2)) / s): the albedo is unknown, log-normal."""
+    best = (-np.inf, 0.0, 0.0)
+    for spread in (0.05, 0.2, 0.4, 0.7):
+        for level in np.quantile(log_power, [0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4]) - spread:
+            steep = ndtr((level - log_power) / spread)
+            for base in (1e-4, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1):
+                best = max(best, (_likelihood(lost, base + (1 - base) * steep) - plain, float(level), spread))
+    gain, level, spread = best
+    value = float(np.exp(level) * 0.5)
+    return MissingFound("detection_limit", gain, gain - 3.0, {"minimum_power": value}, {"minimum_power": value * spread}, ())
+
+
+def _rain(lost: FloatArray, range_m: FloatArray, plain: float, early: int, points: int) -> MissingFound:
+    """P = 1 - (1 - p0) exp(-2 beta R); early returns count as drops where they are more than a few."""
+    rates = np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 40)])
+    bases = (0.0, 0.003, 0.006, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1)
+    gains = np.array([[_likelihood(lost, 1 - (1 - base) * np.exp(-2 * rate * range_m)) - plain for base in bases] for rate in rates])
+    drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
+    profile = gains.max(axis=1)
+    rate = float(rates[int(np.argmax(profile))])
+    near = rates[profile > profile.max() - 0.5]
+    share = min(early / max(float(lost.sum()) + early, 1.0), 1.0)
+    parameters = {"rate_per_m": max(rate, 1e-6), "early_share": share}
+    std = {"rate_per_m": float(max(np.ptp(near) / 2, 0.1 * rate)), "early_share": float(np.sqrt(share / max(early, 1)))}
+    gain = float(profile.max()) + drops
+    return MissingFound("precipitation", gain, gain - 2.0, parameters, std, ())
+
+
+def _likelihood(lost: FloatArray, chance: FloatArray) -> float:
+    p = np.clip(chance, 1e-9, 1 - 1e-9)
+    return float(np.sum(np.log(np.where(lost, p, 1 - p))))

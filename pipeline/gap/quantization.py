@@ -1,0 +1,56 @@
+"""Steps in the recorded ranges: a comb in their histogram, which is a line in its Fourier transform."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scene.mesh import FloatArray
+
+_BIN_M = 1e-5
+_SMALLEST_STEP_M, _LARGEST_STEP_M = 5e-5, 0.05
+_STRONG = 0.2
+"""Mean resultant length of the ranges' phases that a comb has and noise never."""
+
+
+@dataclass(frozen=True)
+class Comb:
+    """step_m of the recorded ranges; std_m: of the step, by the grid it was searched on; strength: mean resultant length of the ranges modulo the step."""
+
+    step_m: float
+    std_m: float
+    strength: float
+
+
+def find_comb(ranges: FloatArray) -> Comb | None:
+    """The step to which ranges (n,), m, are rounded (multiples of it, from 0), if any.
+
+    Where a file holds coordinates in steps of its own, ranges computed from them are smooth again.
+    """
+    low, reach = float(ranges.min()), float(np.ptp(ranges))
+    if len(ranges) < 200 or reach < 20 * _LARGEST_STEP_M:
+        return None
+    counts = np.bincount(((ranges - low) / _BIN_M).astype(np.int64))
+    size = int(2 ** np.ceil(np.log2(len(counts) + 1)))
+    strength = np.abs(np.fft.rfft(counts, size)) / len(ranges)
+    frequency = np.arange(len(strength)) / (size * _BIN_M)
+    allowed = (frequency > 1 / _LARGEST_STEP_M) & (frequency < 1 / _SMALLEST_STEP_M)
+    candidates = np.flatnonzero(allowed & (strength > _STRONG))
+    if not len(candidates):
+        return None
+    first = candidates[0]  # the fundamental; its multiples come later
+    near = slice(first, first + int(0.1 * first) + 2)
+    peak = first + int(np.argmax(strength[near]))
+    step = _refined(ranges, 1 / float(frequency[peak]), reach)
+    coherence = float(np.abs(np.exp(2j * np.pi * ranges / step).mean()))
+    return Comb(step, 1e-4 * step**2 / reach, coherence) if coherence > _STRONG else None
+
+
+def _refined(ranges: FloatArray, step: float, reach: float) -> float:
+    """The step of the largest resultant at phase 0: multiples are counted from range 0, which fixes the step far better."""
+    some = ranges[:: max(len(ranges) // 4000, 1)]
+    for width in (step**2 / reach, 0.05 * step**2 / float(ranges.max())):
+        trial = step + np.linspace(-width, width, 401)
+        step = float(trial[np.argmax([np.cos(2 * np.pi * some / each).mean() for each in trial])])
+    return step

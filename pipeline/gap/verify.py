@@ -1,0 +1,148 @@
+"""The gap before and after, on blocks that no step has used, by simulating again through the sensor's own code.
+
+Measure: the continuous ranked probability score of the measured residuals against an ensemble of simulated ones, in metres; a
+proper score, which neither a wrong mean nor an inflated spread can lower (Gneiting & Raftery 2007, eq. 21, fair ensemble form).
+Floor: the same score of a draw of the model itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap.directed import simulate_ranges
+from pipeline.gap.measurement import Measurement
+from pipeline.gap.residuals import Residuals
+from pipeline.gap.stereo_residuals import NominalPair, project
+from pipeline.rigid import rotation_matrix
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.model import StereoModel, TlsModel
+from sensors.stereo import REDUCTION, StereoPair
+
+MEASURE = "mean continuous ranked probability score of the residuals against an ensemble simulated with the model"
+_DRAWS = 6
+_MOST_POINTS = 30_000
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Scores in m on held-out points. error: standard error of before - after; floor_error: of after - floor."""
+
+    before: float
+    after: float
+    floor: float
+    error: float
+    floor_error: float
+    points: int
+
+    @property
+    def closed(self) -> float | None:
+        """Share of the gap that the new model closes; None where the gap is within its own uncertainty."""
+        return None if self.uncertain else (self.before - self.after) / (self.before - self.floor)
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether before - floor is within its own uncertainty."""
+        return self.before - self.floor <= 2 * self.floor_error
+
+    def to_dict(self) -> dict[str, Any]:
+        """As gap.json holds it."""
+        note = "before - floor is within its own uncertainty" if self.uncertain else ""
+        return {
+            "measure": MEASURE,
+            "unit": "m",
+            "before": self.before,
+            "after": self.after,
+            "floor": self.floor,
+            "closed": self.closed,
+            "evaluated_on": "held-out blocks",
+            "points": self.points,
+            "standard_error": {"before_minus_after": self.error, "before_minus_floor": self.floor_error},
+            "note": note,
+        }
+
+
+@dataclass(frozen=True)
+class Version:
+    """A model with its registration (6,), by which the sensor stands shifted (m) and turned (rad) against the survey."""
+
+    model: TlsModel | StereoModel
+    pose: FloatArray
+
+
+def simulated(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+    """(n,) simulated minus geometric observable of the residuals' points, registered, NaN without a return."""
+    if isinstance(version.model, TlsModel):
+        assert measurement.station is not None
+        position, rotation = measurement.station
+        moved = position + version.pose[:3], rotation_matrix(version.pose[3:]) @ rotation
+        there = replace(measurement, station=moved)
+        ranges = simulate_ranges(there, version.model, residuals.geometry, random, measurement.scene)
+        return ranges - np.asarray(residuals.geometry.range_m)
+    return _simulated_disparities(measurement, version.model, residuals, random) + residuals.pose @ version.pose
+
+
+def _simulated_disparities(measurement: Measurement, model: StereoModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+    """Of the depth map's cell that holds each pixel; the finest depth map of whose grid the pixels are."""
+    nominal, g = NominalPair.of(measurement), residuals.geometry
+    assert measurement.cameras is not None
+    quality = min(REDUCTION, key=lambda name: float(np.mean(np.abs(np.mod(g.u, REDUCTION[name]) - REDUCTION[name] / 2))))
+    step = REDUCTION[quality]
+    pair = StereoPair(measurement.cameras, measurement.frame, model, quality)
+    points = pair.observe(measurement.scene, random).points
+    rows = np.clip((g.v / step).astype(int), 0, points.shape[0] - 1)
+    columns = np.clip((g.u / step).astype(int), 0, points.shape[1] - 1)
+    seen = points[rows, columns]
+    found = nominal.disparity(project(nominal.pair.left, seen), project(nominal.pair.right, seen))
+    return np.asarray(found - g.disparity)
+
+
+def observed(residuals: Residuals) -> FloatArray:
+    """(n,) measured minus geometric observable, without any effect of the model."""
+    g = residuals.geometry
+    return np.asarray(g.measured_m - g.range_m if residuals.sensor == "tls" else g.found - g.disparity)
+
+
+def measure_gap(
+    measurement: Measurement, before: Version, after: Version, residuals: Residuals, reference_sigma: float, random: KeyedRandom
+) -> Gap:
+    """Score two versions of the model on held-out residuals, with common random numbers.
+
+    reference_sigma: standard deviation of the reference's own error in the observable's unit, which is part of every draw.
+    """
+    versions = [_draws(measurement, version, residuals, reference_sigma, random.child("ensemble")) for version in (before, after)]
+    truth = _draws(measurement, after, residuals, reference_sigma, random.child("floor"))
+    usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
+    value, unit = observed(residuals)[usable], residuals.unit_m[usable]
+    old, new = (_scores(draws[:, usable], value) * unit for draws in versions)
+    floor = np.mean([_scores(versions[1][:, usable], draw[usable]) for draw in truth], axis=0) * unit
+    count = max(int(usable.sum()), 1)
+    return Gap(
+        before=float(old.mean()),
+        after=float(new.mean()),
+        floor=float(floor.mean()),
+        error=float((old - new).std() / np.sqrt(count)),
+        floor_error=float(np.hypot(old.std(), floor.std()) / np.sqrt(count)),
+        points=count,
+    )
+
+
+def _draws(measurement: Measurement, version: Version, residuals: Residuals, sigma: float, random: KeyedRandom) -> FloatArray:
+    error = sigma * random.child("reference").generator().standard_normal((_DRAWS, len(residuals)))
+    return error + np.stack([simulated(measurement, version, residuals, random.child(number)) for number in range(_DRAWS)])
+
+
+def _scores(draws: FloatArray, value: FloatArray) -> FloatArray:
+    """(n,) fair ensemble CRPS: mean |x - y| - mean |x - x'| / 2."""
+    ordered, count = np.sort(draws, axis=0), len(draws)
+    weight = (2 * np.arange(count) - count + 1)[:, None]
+    spread = 2 * np.sum(weight * ordered, axis=0) / (count * (count - 1))
+    return np.asarray(np.abs(draws - value).mean(axis=0) - spread / 2)
+
+
+def thinned(count: int) -> slice:
+    """Every how-manieth held-out point is simulated."""
+    return slice(None, None, max(count // _MOST_POINTS, 1))
