@@ -73,4 +73,6 @@ def free_form(covariate: str, values: FloatArray) -> Candidate:
     matrix = np.stack(columns, axis=1)
     matrix = matrix / np.maximum(matrix.std(axis=0), 1e-12)
     names = tuple(f"c{index}" for index in range(matrix.shape[1]))
-    return Candidate(covariate, matrix, lambda c: dict(zip(names, map(float, c), strict=True)), names, (1.0,) * len(names), empirical=True)
+    return Candidate(
+        covariate, matrix, lambda c: dict(zip(names, map(float, c), strict=True)), names, (1.0,) * len(names), empirical=True
+    )

@@ -52,7 +52,9 @@ class _Raster:
     error: FloatArray
 
 
-def find_changes(residuals: Residuals, points: FloatArray, eligible: NDArray[np.bool_]) -> tuple[list[SceneChange], NDArray[np.bool_]]:
+def find_changes(
+    residuals: Residuals, points: FloatArray, eligible: NDArray[np.bool_]
+) -> tuple[list[SceneChange], NDArray[np.bool_]]:
     """Regions that moved, and (n,) the points in or beside them.
 
     residuals: registered roughly; points: (n, 3) measured, wall frame; eligible: (n,) points away from depth edges. A region is a

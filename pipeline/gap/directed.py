@@ -62,7 +62,9 @@ def simulated_ranges(measurement: Measurement, geometry: Any) -> FloatArray:
     """
     model = measurement.model
     assert isinstance(model, TlsModel)
-    by_intensity = [effect for effect in model.effects if effect.name == "range_intensity_bias"] if geometry.power is not None else []
+    by_intensity = (
+        [effect for effect in model.effects if effect.name == "range_intensity_bias"] if geometry.power is not None else []
+    )
     kept = [effect for effect in model.effects if effect.name not in _SPREAD and effect.stage != Stage.RETURN]
     kept = [effect for effect in kept if effect not in by_intensity]
     mean = model.model_copy(update={"noise": _NO_NOISE, "effects": tuple(kept)})

@@ -24,7 +24,9 @@ _SPLITS = {
     frozenset({"range_offset", "range_scale"}): "a second station at another range",
     frozenset({"collimation", "trunnion_tilt"}): "a scan with steeper lines of sight, or in two faces",
     frozenset({"principal_point_x", "camera_phi"}): "a surface with more relief, or a second distance",
-    frozenset({"focal_length", "affinity_skew"}): "one of the cameras turned by 90 degrees, or check points across the whole frame",
+    frozenset(
+        {"focal_length", "affinity_skew"}
+    ): "one of the cameras turned by 90 degrees, or check points across the whole frame",
 }
 _SPLIT_TLS = "a second station at another range and azimuth, or targets of known position"
 _SPLIT_STEREO = "a second distance, or check points of known position across the whole frame"
@@ -54,9 +56,7 @@ class Named:
 
     def to_dict(self) -> dict[str, Any]:
         """As gap.json holds it."""
-        parameters = {
-            key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"
-        }
+        parameters = {key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"}
         return {
             "name": self.name,
             "cannot_be_told_from": list(self.alike),
@@ -77,7 +77,9 @@ def with_effects(model: TlsModel | StereoModel, entries: list[dict[str, Any]]) -
 def from_comb(comb: Comb, part: Residuals) -> Named:
     """Steps of the range. Gain: of the probability that all ranges lie on the comb, an e-fold each at the least."""
     entry = {"name": "range_quantization", "step_m": comb.step_m}
-    return Named("tls.range_quantization", "physical", entry, {"step_m": comb.std_m}, (), 1 / 2000, float(len(part)) * comb.strength)
+    return Named(
+        "tls.range_quantization", "physical", entry, {"step_m": comb.std_m}, (), 1 / 2000, float(len(part)) * comb.strength
+    )
 
 
 def from_spread(found: SpreadFound) -> Named:
@@ -109,7 +111,9 @@ def from_mean(search: MeanSearch, chosen: list[Chosen], part: Residuals) -> list
     for item, candidate in zip(chosen, candidates, strict=True):
         stop = start + candidate.columns.shape[1]
         values, spread = coefficients[start:stop], covariance[start:stop, start:stop]
-        named.append(_empirical(candidate, values, item, part) if candidate.empirical else _physical(candidate, values, spread, item, part))
+        named.append(
+            _empirical(candidate, values, item, part) if candidate.empirical else _physical(candidate, values, spread, item, part)
+        )
         start = stop
     return named
 
@@ -128,7 +132,10 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
     steps = np.sqrt(np.maximum(np.diag(covariance), 1e-300)) * 1e-3
     std = {}
     for key in base:
-        slopes = [(candidate.parameters(values + step * unit)[key] - base[key]) / step for step, unit in zip(steps, np.eye(len(values)), strict=True)]
+        slopes = [
+            (candidate.parameters(values + step * unit)[key] - base[key]) / step
+            for step, unit in zip(steps, np.eye(len(values)), strict=True)
+        ]
         std[key] = float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
     return std | candidate.errors
 
@@ -139,7 +146,10 @@ def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Res
     curve = candidate.columns @ values
     centre, scale = float(x.mean()), float(x.std()) or 1.0
     t = np.clip((x - centre) / scale, -4, 4)
-    fits = [np.linalg.lstsq(np.stack([t**k for k in range(degree + 1)], axis=1), curve, rcond=None)[0] for degree in range(1, _DEGREES + 1)]
+    fits = [
+        np.linalg.lstsq(np.stack([t**k for k in range(degree + 1)], axis=1), curve, rcond=None)[0]
+        for degree in range(1, _DEGREES + 1)
+    ]
     left = [float(np.var(curve - sum(c * t**k for k, c in enumerate(fit)))) for fit in fits]
     degree = next((number for number, variance in enumerate(left) if variance < 0.02 * np.var(curve)), len(fits) - 1)
     unit, name = ("m", "range_empirical") if part.sensor == "tls" else ("px", "disparity_empirical")
@@ -155,5 +165,3 @@ def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Res
 
 def _plain(entry: dict[str, Any]) -> dict[str, Any]:
     return {key: float(value) if isinstance(value, np.floating) else value for key, value in entry.items()}
-
-

@@ -31,11 +31,16 @@ def find_missing(missing: Missing, early: int, points: int) -> MissingFound | No
     lost = missing.lost
     share = float(np.clip(lost.mean(), 1e-9, 1 - 1e-9))
     plain = float(lost.sum() * np.log(share) + (~lost).sum() * np.log1p(-share))
-    limit, rain = _limit(lost, missing.covariates["log_power"], plain), _rain(lost, missing.covariates["range"], plain, early, points)
+    limit, rain = (
+        _limit(lost, missing.covariates["log_power"], plain),
+        _rain(lost, missing.covariates["range"], plain, early, points),
+    )
     best, other = (limit, rain) if limit.score >= rain.score else (rain, limit)
     if best.score < _LEAST_GAIN:
         return None
-    return MissingFound(best.name, best.gain, best.score, best.parameters, best.std, ((best.name, best.score), (other.name, other.score)))
+    return MissingFound(
+        best.name, best.gain, best.score, best.parameters, best.std, ((best.name, best.score), (other.name, other.score))
+    )
 
 
 def _limit(lost: FloatArray, log_power: FloatArray, plain: float) -> MissingFound:
@@ -55,7 +60,9 @@ def _rain(lost: FloatArray, range_m: FloatArray, plain: float, early: int, point
     """P = 1 - (1 - p0) exp(-2 beta R); early returns count as drops where they are more than a few."""
     rates = np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 40)])
     bases = (0.0, 0.003, 0.006, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1)
-    gains = np.array([[_likelihood(lost, 1 - (1 - base) * np.exp(-2 * rate * range_m)) - plain for base in bases] for rate in rates])
+    gains = np.array(
+        [[_likelihood(lost, 1 - (1 - base) * np.exp(-2 * rate * range_m)) - plain for base in bases] for rate in rates]
+    )
     drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
     profile = gains.max(axis=1)
     rate = float(rates[int(np.argmax(profile))])

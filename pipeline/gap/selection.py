@@ -128,7 +128,13 @@ class MeanSearch:
             best = int(np.argmax(gains))
             penalty = 2 * float(self._nulls[name].mean())
             found.append(
-                Tried(name.removeprefix("free "), name.startswith("free "), float(gains[best]) - penalty, float(gains[best]), variants[best])
+                Tried(
+                    name.removeprefix("free "),
+                    name.startswith("free "),
+                    float(gains[best]) - penalty,
+                    float(gains[best]),
+                    variants[best],
+                )
             )
         return sorted(found, key=lambda item: -item.score)
 
@@ -226,7 +232,12 @@ class MeanSearch:
         width = step / 20
         curvature = (2 * explained(centre) - explained(centre - width) - explained(centre + width)) / width**2
         error = 1 / np.sqrt(max(curvature, 1e-12)) / centre**2
-        return replace(candidate, columns=wave.columns(1 / centre), fixed={**candidate.fixed, wave.key: 1 / centre}, errors={wave.key: float(error)})
+        return replace(
+            candidate,
+            columns=wave.columns(1 / centre),
+            fixed={**candidate.fixed, wave.key: 1 / centre},
+            errors={wave.key: float(error)},
+        )
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of the families, cosines of their signatures after the pose fit, and the share that survives the pose fit."""

@@ -99,7 +99,9 @@ def _both_angles(theta: float) -> dict[str, float]:
 def stereo_candidates(residuals: Residuals) -> list[SpreadCandidate]:
     """The catalogue's forms of a disparity's variance that need no image."""
     return [
-        SpreadCandidate("parallax_noise", np.ones(len(residuals)), lambda theta: {"sigma_px": float(np.sqrt(theta))}, ("sigma_px",))
+        SpreadCandidate(
+            "parallax_noise", np.ones(len(residuals)), lambda theta: {"sigma_px": float(np.sqrt(theta))}, ("sigma_px",)
+        )
     ]
 
 
@@ -119,14 +121,25 @@ def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: K
     if gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
         return None
     free_name, free_score = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()}, residuals.sensor)
-    alike = {c.name for c, s in zip(candidates, scores, strict=True) if s > scores[best] - _CLASS_MARGIN} - {candidates[best].name}
+    alike = {c.name for c, s in zip(candidates, scores, strict=True) if s > scores[best] - _CLASS_MARGIN} - {
+        candidates[best].name
+    }
     tried = tuple(sorted(((c.name, float(s)) for c, s in zip(candidates, scores, strict=True)), key=lambda item: -item[1]))
     parameters = candidates[best].parameters(theta)
     std = {key: abs(parameters[key]) * error / (2 * theta) for key in candidates[best].names}
     empirical = free_score > scores[best] + _FREE_MARGIN
     name = f"spread by {free_name}" if empirical else candidates[best].name
     return SpreadFound(
-        name, candidates[best].name, tuple(sorted(alike)), p_value, gain, parameters, std, empirical, theta * candidates[best].variance, tried
+        name,
+        candidates[best].name,
+        tuple(sorted(alike)),
+        p_value,
+        gain,
+        parameters,
+        std,
+        empirical,
+        theta * candidates[best].variance,
+        tried,
     )
 
 

@@ -251,7 +251,9 @@ def _variance(model: StereoModel) -> float:
     return float(max(total, 1e-8))
 
 
-def _covariates(nominal: NominalPair, geometry: StereoGeometry, depth: FloatArray, curvature: FloatArray) -> dict[str, FloatArray]:
+def _covariates(
+    nominal: NominalPair, geometry: StereoGeometry, depth: FloatArray, curvature: FloatArray
+) -> dict[str, FloatArray]:
     ray = geometry.point - nominal.pair.left.position
     cosine = np.abs(np.einsum("ni,ni->n", ray, geometry.normal)) / np.linalg.norm(ray, axis=1)
     return {

@@ -102,7 +102,12 @@ def _locking(geometry: StereoGeometry) -> list[Candidate]:
         fixed = {"reduction": float(reduction)}
         found.append(
             Candidate(
-                "pixel_locking", column[:, None], lambda values: {"amplitude_px": float(values[0])}, ("amplitude_px",), (1.0,), fixed
+                "pixel_locking",
+                column[:, None],
+                lambda values: {"amplitude_px": float(values[0])},
+                ("amplitude_px",),
+                (1.0,),
+                fixed,
             )
         )
     return found

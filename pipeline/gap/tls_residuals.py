@@ -166,7 +166,11 @@ def _covariates(geometry: TlsGeometry, curvature: FloatArray) -> dict[str, Float
         "incidence": np.arccos(np.clip(geometry.cos_incidence, 0, 1)),
         "edge_step": np.minimum(curvature, 10.0),
     }
-    optional = {"intensity": None if geometry.power is None else log_over_median(geometry.power), "line": geometry.line, "time": geometry.share}
+    optional = {
+        "intensity": None if geometry.power is None else log_over_median(geometry.power),
+        "line": geometry.line,
+        "time": geometry.share,
+    }
     return found | {name: values for name, values in optional.items() if values is not None}
 
 

@@ -5,7 +5,6 @@ An error d of a recorded angle makes the beam leave by -d, so the recorded range
 
 from __future__ import annotations
 
-
 from typing import Any
 
 import numpy as np
@@ -77,7 +76,10 @@ def _cyclic(geometry: Any) -> list[Candidate]:
     """Periods on a grid as fine as the spread of the ranges can tell apart."""
     reach = max(float(np.ptp(np.quantile(geometry.range_m, [0.01, 0.99]))), 1.0)
     wave = Wave("period_m", np.ones_like(geometry.range_m), geometry.range_m)
-    return [searched("range_cyclic", "amplitude_m", wave, float(1 / f)) for f in _frequencies(1 / min(12.0, reach), 1 / 0.4, 0.5 / reach)]
+    return [
+        searched("range_cyclic", "amplitude_m", wave, float(1 / f))
+        for f in _frequencies(1 / min(12.0, reach), 1 / 0.4, 0.5 / reach)
+    ]
 
 
 def _wobble(geometry: Any) -> list[Candidate]:
@@ -85,7 +87,9 @@ def _wobble(geometry: Any) -> list[Candidate]:
     if lines < 4 * _FEWEST_LINES:
         return []
     wave = Wave("lines_per_cycle", -geometry.by_zenith, geometry.line)
-    return [searched("wobble", "amplitude_rad", wave, float(1 / f)) for f in _frequencies(2 / lines, 1 / _FEWEST_LINES, 0.5 / lines)]
+    return [
+        searched("wobble", "amplitude_rad", wave, float(1 / f)) for f in _frequencies(2 / lines, 1 / _FEWEST_LINES, 0.5 / lines)
+    ]
 
 
 def _frequencies(low: float, high: float, step: float) -> FloatArray:
@@ -98,6 +102,6 @@ def _drift(geometry: Any) -> Candidate:
     by_x = -geometry.share * (-cot * cos_a * geometry.by_azimuth - sin_a * geometry.by_zenith)
     by_y = -geometry.share * (-cot * sin_a * geometry.by_azimuth + cos_a * geometry.by_zenith)
     names = ("rate_x_rad", "rate_y_rad")
-    return Candidate("tilt_drift", np.stack([by_x, by_y], axis=1), lambda values: dict(zip(names, values, strict=True)), names, (1.0, 1.0))
-
-
+    return Candidate(
+        "tilt_drift", np.stack([by_x, by_y], axis=1), lambda values: dict(zip(names, values, strict=True)), names, (1.0, 1.0)
+    )

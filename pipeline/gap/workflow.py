@@ -160,17 +160,14 @@ def _pose(residuals: Residuals) -> FloatArray:
     return np.asarray(np.linalg.lstsq(weighted, residuals.value / residuals.sigma, rcond=None)[0])
 
 
-def _candidates(measurement: Measurement, part: Residuals) -> list[Candidate]:
-    named = (
-        tls_signatures.mean_candidates(part) if part.sensor == "tls" else stereo_signatures.mean_candidates(part, measurement)
-    )
+def candidates_of(measurement: Measurement, part: Residuals) -> list[Candidate]:
+    """Every explanation that the fields of `part` allow, the catalogue's and free forms."""
+    named = tls_signatures.mean_candidates(part) if part.sensor == "tls" else stereo_signatures.mean_candidates(part, measurement)
     free = [free_form(name, values) for name, values in part.covariates.items() if name not in _NOT_FREE and np.ptp(values) > 0]
     return [*named, *free]
 
 
-def _name(
-    measurement: Measurement, part: Residuals, scale: float, random: KeyedRandom
-) -> tuple[list[Named], _Naming]:
+def _name(measurement: Measurement, part: Residuals, scale: float, random: KeyedRandom) -> tuple[list[Named], _Naming]:
     """Effects on the mean and on the spread, from the selection blocks alone."""
     comb = find_comb(part.geometry.measured_m) if part.sensor == "tls" and not _names(measurement, "range_quantization") else None
     named: list[Named] = []
@@ -178,7 +175,7 @@ def _name(
         named.append(from_comb(comb, part))
         part = replace(part, sigma=np.sqrt(part.sigma**2 + comb.step_m**2 / 12))
         scale = 1.0
-    candidates = _candidates(measurement, part)
+    candidates = candidates_of(measurement, part)
     search = MeanSearch(replace(part, sigma=part.sigma * scale), candidates, random)
     chosen, tried = search.select()
     value = search.without(chosen)
