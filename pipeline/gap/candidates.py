@@ -26,7 +26,7 @@ class Wave:
         return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """One explanation. columns: (n, k) observable per unit of each coefficient; parameters: coefficients to the effect's values.
 

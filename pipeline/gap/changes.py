@@ -27,7 +27,7 @@ _LARGEST_SHARE = 0.25
 
 @dataclass(frozen=True)
 class SceneChange:
-    """A region that moved. bounds: (2, 3) wall frame, m; volume_m3: of the missing (or added) rock; offset_m: median along the ray."""
+    """A region that moved. bounds: (2, 3) wall frame, m; volume_m3: missing or added; offset_m: median along the ray."""
 
     bounds: FloatArray
     volume_m3: float

@@ -1,4 +1,4 @@
-"""What was found as entries of a config and of gap.json: parameters with their uncertainty, the class, and what would split it."""
+"""What was found as entries of a config and of gap.json: parameters with uncertainty, class, and what would split it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SPLIT_STEREO = "a second distance, or check points of known position across the
 
 @dataclass(frozen=True)
 class Named:
-    """One effect as it stands in gap.json. name: with the sensor's prefix; entry: of a model's `effects`; std: of the parameters."""
+    """One effect of gap.json. name: with the sensor's prefix; entry: of a model's `effects`; std: of the parameters."""
 
     name: str
     kind: str
@@ -137,7 +137,7 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
             for step, unit in zip(steps, np.eye(len(values)), strict=True)
         ]
         std[key] = float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
-    return std | candidate.errors
+    return {**std, **candidate.errors}
 
 
 def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:

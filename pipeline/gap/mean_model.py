@@ -1,10 +1,10 @@
 """Mean effects by generalised least squares, with a correlated error of the reference.
 
-The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over metres,
-white noise e of the predicted spread. Points are gathered in cells. The means of the cells follow a Gaussian process with a
+The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over
+metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process with a
 Matern 3/2 covariance of unknown amplitude and length plus the noise of a mean; the deviations within cells are white. Both parts
-add their information on b. For each length one eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that the
-likelihood of each candidate is maximised over the covariance too, and the null distribution of the largest gain over all
+add their information on b. For each length one eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that
+the likelihood of each candidate is maximised over the covariance too, and the null distribution of the largest gain over all
 candidates is simulated with the same maximisation.
 """
 

@@ -1,4 +1,4 @@
-"""Which effects explain the returns that are missing: a loss that is the same for all, or one that grows with range or falls with power."""
+"""Which effects explain the returns that are missing: losses that grow with range, or that fall on weak echoes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from pipeline.gap.residuals import Missing
+from pipeline.gap.residuals import BoolArray, Missing
 from scene.mesh import FloatArray
 
 _LEAST_GAIN = 9.0
@@ -43,7 +43,7 @@ def find_missing(missing: Missing, early: int, points: int) -> MissingFound | No
     )
 
 
-def _limit(lost: FloatArray, log_power: FloatArray, plain: float) -> MissingFound:
+def _limit(lost: BoolArray, log_power: FloatArray, plain: float) -> MissingFound:
     """P = p0 + (1 - p0) Phi((ln P_min - ln rho - ln(cos i / R^2)) / s): the albedo is unknown, log-normal."""
     best = (-np.inf, 0.0, 0.0)
     for spread in (0.05, 0.2, 0.4, 0.7):
@@ -56,7 +56,7 @@ def _limit(lost: FloatArray, log_power: FloatArray, plain: float) -> MissingFoun
     return MissingFound("detection_limit", gain, gain - 3.0, {"minimum_power": value}, {"minimum_power": value * spread}, ())
 
 
-def _rain(lost: FloatArray, range_m: FloatArray, plain: float, early: int, points: int) -> MissingFound:
+def _rain(lost: BoolArray, range_m: FloatArray, plain: float, early: int, points: int) -> MissingFound:
     """P = 1 - (1 - p0) exp(-2 beta R); early returns count as drops where they are more than a few."""
     rates = np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 40)])
     bases = (0.0, 0.003, 0.006, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1)
@@ -74,6 +74,6 @@ def _rain(lost: FloatArray, range_m: FloatArray, plain: float, early: int, point
     return MissingFound("precipitation", gain, gain - 2.0, parameters, std, ())
 
 
-def _likelihood(lost: FloatArray, chance: FloatArray) -> float:
+def _likelihood(lost: BoolArray, chance: FloatArray) -> float:
     p = np.clip(chance, 1e-9, 1 - 1e-9)
     return float(np.sum(np.log(np.where(lost, p, 1 - p))))

@@ -16,7 +16,7 @@ _STRONG = 0.2
 
 @dataclass(frozen=True)
 class Comb:
-    """step_m of the recorded ranges; std_m: of the step, by the grid it was searched on; strength: mean resultant length of the ranges modulo the step."""
+    """step_m of the recorded ranges; std_m: by the grid it was searched on; strength: mean resultant length modulo the step."""
 
     step_m: float
     std_m: float

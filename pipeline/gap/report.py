@@ -23,7 +23,7 @@ _WORDS = {
     "named": "One effect explains where measurement and model disagree.",
     "several": "More than one effect is needed to explain where measurement and model disagree.",
     "ambiguous": "An effect is there, but this measurement cannot tell it from others that would look the same.",
-    "unknown": "The model is rejected, and no effect of the catalogue passes its own test: an empirical term describes what is left.",
+    "unknown": "The model is rejected, and no effect of the catalogue passes its own test; an empirical term describes it.",
     "insufficient_data": "There are too few points on smooth parts of the reference to say anything.",
 }
 
@@ -49,7 +49,7 @@ def to_dict(found: Diagnosis, measurement: Measurement) -> dict[str, Any]:
 
 def where(found: Diagnosis) -> list[dict[str, Any]]:
     """Covariates along which mean or spread of the residuals depart from the model, the clearest first."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, x, z in _standardised(found):
         edges = np.unique(np.quantile(x, np.linspace(0, 1, _BINS // 2 + 1)))
         if len(edges) < 3:
@@ -86,7 +86,7 @@ def write(out: Path, found: Diagnosis, measurement: Measurement) -> Path:
     write_text(out / "model_after.yaml", text)
     points = measurement.frame.to_world(measurement.cloud.points[found.residuals.index])
     for name, values in (("before", found.before), ("after", found.after)):
-        extra = {"residual_m": values * found.residuals.unit_m, "held_out": found.held_out.astype(np.uint8)}
+        extra: dict[str, Any] = {"residual_m": values * found.residuals.unit_m, "held_out": found.held_out.astype(np.uint8)}
         write_laz(out / f"{name}.laz", points, extra=extra)
     pictures = {"maps.png": _maps(found), "profiles.png": _profiles(found), "gap.png": _bars(found)}
     for file, png in pictures.items():
@@ -109,9 +109,8 @@ def summary(found: Diagnosis) -> str:
         lines.append(f"  {len(found.changes)} regions where the scene itself moved were set aside")
     if found.gap is not None:
         closed = "within its uncertainty" if found.gap.closed is None else f"{found.gap.closed:.0%} closed"
-        lines.append(
-            f"  gap {1e3 * found.gap.before:.3f} mm before, {1e3 * found.gap.after:.3f} after, {1e3 * found.gap.floor:.3f} floor: {closed}"
-        )
+        scores = ", ".join(f"{1e3 * value:.3f} mm {name}" for name, value in found.gap.scores.items())
+        lines.append(f"  gap {scores}: {closed}")
     return "\n".join(lines)
 
 

@@ -20,8 +20,9 @@ class Residuals:
     value, sigma: (n,), m of range (TLS) or px of disparity (stereo), sigma being what the model predicts; unit_m: (n,) metres of
     range or depth per unit of the observable; smooth: (n,) where the surface around the point is smooth enough for a mean to make
     sense; pose: (n, 6) derivatives by translation (m) and rotation (rad) of the sensor in the wall frame; at: (n, 2) wall frame
-    x, y of the reference's point, which unlike the measured one does not move with the noise, m; covariates: named (n,) arrays; index: (n,) rows of the measurement's points; missing: of the pulses that were sent
-    and should have met the wall, None where the pattern is not known.
+    x, y of the reference's point, which unlike the measured one does not move with the noise, m; covariates: named (n,) arrays;
+    index: (n,) rows of the measurement's points; missing: of the pulses that were sent and should have met the wall, None where
+    the pattern is not known.
     """
 
     sensor: str

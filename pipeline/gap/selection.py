@@ -167,7 +167,7 @@ class MeanSearch:
                 return chosen, self.tried(self.columns(variants))
 
     def _best(self, tried: list[Tried], variants: list[int]) -> Tried | None:
-        """The explanation to add next: the catalogue's best unless a free form clearly beats it and any pair that starts with it."""
+        """What to add next: the catalogue's best unless a free form clearly beats it and any pair that starts with it."""
         top = tried[0]
         if top.score < _LEAST_SCORE or self.p_value(top) > ALPHA:
             return None

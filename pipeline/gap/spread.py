@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.gap.cells import Cells, block_numbers
 from pipeline.gap.residuals import Residuals
@@ -40,7 +41,11 @@ class SpreadCandidate:
 
 @dataclass(frozen=True)
 class SpreadFound:
-    """An effect on the spread. effect: the catalogue's that comes nearest, which carries an empirical one; std: of the parameters by the curvature of the likelihood; variance: (n,) that it adds."""
+    """An effect on the spread.
+
+    effect: the catalogue's that comes nearest, which carries an empirical one; std: of the parameters by the curvature of the
+    likelihood; variance: (n,) that it adds.
+    """
 
     name: str
     effect: str
@@ -161,7 +166,7 @@ def _gain(squared: FloatArray, added: FloatArray) -> float:
     return float(0.5 * np.sum(squared * added / (1 + added) - np.log1p(added)))
 
 
-def _p_value(squared: FloatArray, forms: list[FloatArray], block: FloatArray, random: KeyedRandom) -> float:
+def _p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
     """Of the largest standardised score over the forms, by signs drawn block by block: (1 + b) / (1 + N)."""
     _, number = np.unique(block, return_inverse=True)
     scores = np.stack([np.bincount(number, (squared - 1) * form) for form in forms])

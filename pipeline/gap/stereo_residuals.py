@@ -1,4 +1,4 @@
-"""Disparity residuals of a reconstructed surface: measured and reference disparity of each pixel in the nominal rectified pair."""
+"""Disparity residuals of a reconstructed surface: measured and reference disparity of each pixel, nominally rectified."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ def on_their_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray
     for _ in range(_REGISTRATION_STEPS):
         moved = found.apply(points[some])
         miss = _miss(left, moved, u[some], v[some])
-        steps = np.concatenate([_NUDGE * np.eye(3), np.zeros((3, 3))]), np.concatenate([np.zeros((3, 3)), _NUDGE * np.eye(3)])
-        nudges = [RigidTransform.about(centre, turn, shift) for shift, turn in zip(*steps, strict=True)]
+        units = _NUDGE * np.eye(6)
+        nudges = [RigidTransform.about(centre, unit[3:], unit[:3]) for unit in units]
         slopes = np.stack([(_miss(left, nudge.apply(moved), u[some], v[some]) - miss) / _NUDGE for nudge in nudges], axis=1)
-        change = np.linalg.lstsq(slopes, -miss, rcond=None)[0]
+        change = np.asarray(np.linalg.lstsq(slopes, -miss, rcond=None)[0], dtype=np.float64)
         step = RigidTransform.about(centre, change[3:], change[:3])
         found = RigidTransform(step.rotation @ found.rotation, step.rotation @ found.translation + step.translation)
     before, after = (np.sqrt(np.mean(_miss(left, each, u, v) ** 2)) for each in (points, found.apply(points)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,13 +75,17 @@ def _camera_variants(
         Candidate(
             name,
             np.stack([columns[key] for key in names], axis=1),
-            lambda values, names=names: dict(zip(names, map(float, values), strict=True)),
+            partial(_by_name, names),
             names,
             (1.0,) * len(names),
             {"camera": side},
         )
         for names in sets
     ]
+
+
+def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
+    return dict(zip(names, map(float, values), strict=True))
 
 
 def _row_jitter(geometry: StereoGeometry) -> list[Candidate]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -45,8 +45,8 @@ class TlsGeometry:
 
     def part(self, rows: Any) -> TlsGeometry:
         """The same of some of the points."""
-        values = {column.name: getattr(self, column.name) for column in fields(self)}
-        return TlsGeometry(**{name: None if value is None else value[rows] for name, value in values.items()})
+        values: dict[str, Any] = {column.name: getattr(self, column.name) for column in fields(self)}
+        return replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
 
 
 def tls_residuals(measurement: Measurement) -> Residuals:
@@ -217,4 +217,4 @@ def _missing(measurement: Measurement, geometry: TlsGeometry) -> Missing | None:
 
 def _sweep(values: tuple[float, float, float]) -> FloatArray:
     start, stop, step = values
-    return start + step * np.arange(int(np.floor((stop - start) / step + 1e-6)) + 1)
+    return np.asarray(start + step * np.arange(int(np.floor((stop - start) / step + 1e-6)) + 1), dtype=np.float64)

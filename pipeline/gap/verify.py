@@ -39,6 +39,11 @@ class Gap:
     points: int
 
     @property
+    def scores(self) -> dict[str, float]:
+        """The three scores by name, m."""
+        return {"before": self.before, "after": self.after, "floor": self.floor}
+
+    @property
     def closed(self) -> float | None:
         """Share of the gap that the new model closes; None where the gap is within its own uncertainty."""
         return None if self.uncertain else (self.before - self.after) / (self.before - self.floor)

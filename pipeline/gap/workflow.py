@@ -36,8 +36,11 @@ _NOT_FREE = ("edge_step", "line")
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found. mask: (n,) of the residuals that the scene's changes or their rims take; held_out: (n,) never used in naming;
-    before, after: (n,) residuals with registration taken off, in the observable's unit."""
+    """What was found.
+
+    held_out: (n,) points never used in naming; before, after: (n,) residuals with registration taken off, in the observable's
+    unit; pose: (6,) shift (m) and turn (rad) of the sensor, wall frame; timings: s by step.
+    """
 
     verdict: str
     effects: tuple[Named, ...]

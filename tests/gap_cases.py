@@ -1,0 +1,174 @@
+"""Measurements for the tests of `gap`, made in closed form with NumPy alone: nothing here comes from `sensors` or `pipeline`.
+
+The wall is a height field, linear on the triangles of a regular grid, in the world's xz plane; rays meet it by Newton's method on
+that function. The reference is the wall plus an error that is correlated over metres; poses are off; returns are lost at random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
+STEP = 0.35
+WIDTH, HEIGHT = 42.0, 30.0
+SIGMA, ANGLE_SIGMA = 0.003, 4e-5
+
+
+@dataclass(frozen=True)
+class Field:
+    """Depth y of the wall at the nodes of a grid over x and z, linear on triangles cut along x - z = constant."""
+
+    nodes: Array
+
+    def at(self, x: Array, z: Array) -> tuple[Array, Array, Array, Array]:
+        """Depth, its slopes by x and z, and whether the point is inside."""
+        rows, columns = self.nodes.shape
+        i, j = np.clip(np.floor(x / STEP).astype(int), 0, rows - 2), np.clip(np.floor(z / STEP).astype(int), 0, columns - 2)
+        a, b = x / STEP - i, z / STEP - j
+        n00, n10, n01, n11 = self.nodes[i, j], self.nodes[i + 1, j], self.nodes[i, j + 1], self.nodes[i + 1, j + 1]
+        lower = a >= b
+        by_x, by_z = np.where(lower, n10 - n00, n11 - n01), np.where(lower, n11 - n10, n01 - n00)
+        inside = (x >= 0) & (z >= 0) & (x <= (rows - 1) * STEP) & (z <= (columns - 1) * STEP)
+        return n00 + a * by_x + b * by_z, by_x / STEP, by_z / STEP, inside
+
+    def cast(self, origin: Array, ray: Array) -> tuple[Array, Array]:
+        """Distance along unit rays, NaN where Newton's method does not settle, and the cosine of the incidence."""
+        t = (self.nodes.mean() - origin[1]) / ray[:, 1]
+        for _ in range(25):
+            point = origin + t[:, None] * ray
+            depth, by_x, by_z, inside = self.at(point[:, 0], point[:, 2])
+            t = t - (point[:, 1] - depth) / (ray[:, 1] - by_x * ray[:, 0] - by_z * ray[:, 2])
+        left = np.abs((origin + t[:, None] * ray)[:, 1] - self.at(*(origin + t[:, None] * ray)[:, [0, 2]].T)[0])
+        cosine = np.abs(ray[:, 1] - by_x * ray[:, 0] - by_z * ray[:, 2]) / np.sqrt(1 + by_x**2 + by_z**2)
+        return np.where(inside & (left < 1e-7) & (t > 0), t, np.nan), cosine
+
+    def write(self, path: Path) -> None:
+        """As a binary PLY mesh whose faces look to -y."""
+        rows, columns = self.nodes.shape
+        x, z = np.meshgrid(STEP * np.arange(rows), STEP * np.arange(columns), indexing="ij")
+        vertices = np.stack([x, self.nodes, z], axis=-1).reshape(-1, 3)
+        number = np.arange(rows * columns).reshape(rows, columns)
+        a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+        faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+        record = np.zeros(len(faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
+        record["n"], record["v"] = 3, faces
+        head = (
+            f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\nproperty double x\nproperty double y\n"
+            f"property double z\nelement face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        path.write_bytes(head.encode() + vertices.astype("<f8").tobytes() + record.tobytes())
+
+
+def smooth_noise(shape: tuple[int, int], length_m: float, rng: np.random.Generator) -> Array:
+    """Random waves of about one wavelength, standard deviation 1."""
+    x, z = np.meshgrid(*(STEP * np.arange(size) for size in shape), indexing="ij")
+    total = np.zeros(shape)
+    for _ in range(40):
+        angle, phase, k = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), 2 * np.pi / (length_m * rng.uniform(0.7, 2.5))
+        total += np.sin(k * (np.cos(angle) * x + np.sin(angle) * z) + phase)
+    return total / np.sqrt(20)
+
+
+@dataclass
+class Scan:
+    """What an effect may change before the points are written. R: ranges to be recorded; daz, dz: recorded minus true angle."""
+
+    R: Array
+    az: Array
+    z: Array
+    cos_i: Array
+    power: Array
+    line: Array
+    share: Array
+    rng: np.random.Generator
+
+
+def write_scan(
+    folder: Path,
+    seed: int,
+    angles: Callable[[Array, Array, Array], tuple[Array, Array]] | None = None,
+    ranges: Callable[[Scan], Array] | None = None,
+    lost: Callable[[Scan], Array] | None = None,
+    fall: tuple[float, float, float] | None = None,
+    step_rad: float = 0.0045,
+    intensity: bool = True,
+) -> None:
+    """A laser scan. angles: (azimuth, zenith, line) to recorded minus true angles; ranges: recorded ranges; lost: returns lost;
+    fall: x, z and depth of a niche of 1.2 m that the reference does not have."""
+    rng = np.random.default_rng(seed)
+    shape = int(WIDTH / STEP) + 1, int(HEIGHT / STEP) + 1
+    nodes = 0.5 * smooth_noise(shape, 9.0, rng) + 0.08 * smooth_noise(shape, 2.5, rng)
+    x, z = np.meshgrid(*(STEP * np.arange(size) for size in shape), indexing="ij")
+    real = nodes.copy()
+    if fall is not None:
+        real += fall[2] * ((np.abs(x - fall[0]) < 0.6) & (np.abs(z - fall[1]) < 0.6))
+    wall = Field(real)
+    position, turn = np.array([WIDTH * 0.42, -34.0, 2.5]), 0.01
+    azimuth = np.arange(0.5 * np.pi - 0.62, 0.5 * np.pi + 0.68, step_rad)
+    zenith = np.arange(0.85, 1.63, step_rad)
+    az, ze = (grid.ravel() for grid in np.meshgrid(azimuth, zenith, indexing="ij"))
+    line = np.repeat(np.arange(len(azimuth)), len(zenith)).astype(float)
+    daz, dz = (np.zeros_like(az),) * 2 if angles is None else angles(az, ze, line)
+    true_az, true_z = (nominal - error - ANGLE_SIGMA * rng.standard_normal(len(az)) for nominal, error in ((az, daz), (ze, dz)))
+    pose = 0.002 * rng.standard_normal(3), 3e-5 * rng.standard_normal(3)
+    rotation = _turned(turn)
+    skew = np.array([[0, -pose[1][2], pose[1][1]], [pose[1][2], 0, -pose[1][0]], [-pose[1][1], pose[1][0], 0]])
+    true_range, cosine = wall.cast(position + pose[0], unit(true_az, true_z) @ (rotation.T @ (np.eye(3) + skew).T))
+    hit = np.isfinite(true_range) & (cosine > 0.15)
+    albedo = 0.4 * np.exp(0.35 * np.interp(az, azimuth, smooth_noise((len(azimuth), 2), 8.0, rng)[:, 0]))
+    albedo = albedo * np.exp(0.3 * rng.standard_normal(len(az)))
+    power = albedo * cosine * (100 / np.where(hit, true_range, 1e3)) ** 2
+    scan = Scan(true_range + SIGMA * rng.standard_normal(len(az)), az, ze, cosine, power, line, np.arange(len(az)) / len(az), rng)
+    recorded = scan.R if ranges is None else ranges(scan)
+    keep = hit & (rng.uniform(size=len(az)) > 0.01)
+    keep &= True if lost is None else ~lost(scan)
+    columns = [*(unit(az, ze) * recorded[:, None]).T, power, 5e-5 * np.arange(len(az))]
+    _points(folder / "scan.ply", [column[keep] for column in columns], ["x", "y", "z", "intensity", "gps_time"], intensity)
+    Field(nodes + 0.0004 * smooth_noise(shape, 3.0, rng)).write(folder / "wall.ply")
+    _yaml(
+        folder / "model.yaml", {"sensor": "tls", "noise": {"range_sigma_m": SIGMA, "angle_sigma_rad": ANGLE_SIGMA}, "effects": []}
+    )
+    _yaml(
+        folder / "measurement.yaml",
+        {
+            "sensor": "tls",
+            "reference": "wall.ply",
+            "points": "scan.ply",
+            "frame": "scanner",
+            "scanner": {"position_m": position.tolist(), "rotation": rotation.tolist()},
+            "pattern": {
+                "azimuth_rad": [float(azimuth[0]), float(azimuth[-1]) + 1e-9, step_rad],
+                "zenith_rad": [float(zenith[0]), float(zenith[-1]) + 1e-9, step_rad],
+            },
+            "model": "model.yaml",
+        },
+    )
+
+
+def unit(azimuth: Array, zenith: Array) -> Array:
+    """Unit vectors of azimuth = atan2(y, x) and zenith from +z."""
+    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
+
+
+def _turned(angle: float) -> Array:
+    return np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+
+
+def _yaml(path: Path, values: dict[str, Any]) -> None:
+    path.write_text(yaml.safe_dump(values))
+
+
+def _points(path: Path, columns: list[Array], names: list[str], intensity: bool) -> None:
+    kept = [(name, column) for name, column in zip(names, columns, strict=True) if intensity or name != "intensity"]
+    record = np.zeros(len(columns[0]), dtype=[(name, "<f8") for name, _ in kept])
+    for name, column in kept:
+        record[name] = column
+    properties = "".join(f"property double {name}\n" for name, _ in kept)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(record)}\n{properties}end_header\n"
+    path.write_bytes(head.encode() + record.tobytes())
