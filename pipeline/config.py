@@ -86,6 +86,7 @@ class ProductsConfig(Config):
 
     truth_channels: bool = Field(True, description="the true range or depth of each point, as extra dimensions of points.laz")
     world: bool | None = Field(None, description="points and surface in the wall's own coordinates too; none: for imported walls")
+    formats: tuple[Literal["ply", "xyz", "e57"], ...] = Field((), description="points in these formats too, beside points.laz")
     block_meshes: bool = Field(
         False, description="four meshes of each block: wall difference, intersection, niche, removed block"
     )

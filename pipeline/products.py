@@ -14,13 +14,15 @@ from pipeline.annotate import LabelledImage, coco
 from pipeline.config import SimulationConfig
 from pipeline.epoch import Epoch, Reference
 from pipeline.formats.atomic import write_bytes, write_json
+from pipeline.formats.e57 import write_e57
 from pipeline.formats.geotiff import write_geotiff, write_tiff
 from pipeline.formats.laz import write_laz
-from pipeline.formats.ply import write_ply
+from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.xyz import write_xyz
 from pipeline.look import Look
 from pipeline.metashape_export import write_metashape_export
-from pipeline.recorded_points import recorded_points
+from pipeline.recorded_points import recorded_points, scans_of
 from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
 from pipeline.site import Site
 from pipeline.tiles import tiles
@@ -125,6 +127,12 @@ def _write_common(
     """What every epoch has: points, depth map, surface, truth, blocks."""
     cloud = recorded_points(seen.observations)
     _write_cloud(folder / "points.laz", cloud)
+    if "ply" in config.products.formats:
+        write_ply_points(folder / "points.ply", cloud)
+    if "xyz" in config.products.formats:
+        write_xyz(folder / "points.xyz", cloud)
+    if "e57" in config.products.formats:
+        write_e57(folder / "points.e57", scans_of(seen.observations))
     if seen.observation.sensor == "stereo":
         depth = seen.observation.depth.astype(np.float32)
         write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
@@ -148,6 +156,7 @@ def _write_cloud(path: Path, cloud: PointCloud) -> None:
         gps_time=cloud.gps_time,
         return_number=extra.pop("return_number", None),
         number_of_returns=extra.pop("number_of_returns", None),
+        scan_angle_rad=extra.pop("scan_angle_rad", None),
         extra=extra,
     )
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from pipeline.formats.e57 import E57Scan
 from pipeline.formats.point_cloud import PointCloud
 from sensors.observation import Observation
 
@@ -15,7 +17,8 @@ def recorded_points(observations: Sequence[Observation]) -> PointCloud:
     """The points of every station, one after another, each in the order of its pulses and their returns; m, their frame.
 
     The extra channels are those of the truth, `block`, where a pulse has several returns `return_number` and `number_of_returns`,
-    and of several stations `station`, counted from 1. Times start with each station's scan.
+    `scan_angle_rad` (nominal, from straight down) of a scanner, and of several stations `station`, counted from 1. Times start
+    with each station's scan.
     """
     clouds = [_of_station(observation) for observation in observations]
     if len(clouds) == 1:
@@ -32,9 +35,27 @@ def recorded_points(observations: Sequence[Observation]) -> PointCloud:
     )
 
 
+def scans_of(observations: Sequence[Observation]) -> list[E57Scan]:
+    """Each observation as an E57 scan: its grid as `row` and `column`, the sensor's place as the pose (the wall frame's axes)."""
+    scans = []
+    for number, seen in enumerate(observations, start=1):
+        cloud = _grid_points(seen)
+        row, column = (axis.astype(np.int32) for axis in np.nonzero(seen.valid))
+        local = PointCloud(cloud.points - seen.viewpoint, cloud.intensity, cloud.gps_time, {"row": row, "column": column})
+        scans.append(E57Scan(f"station {number}", local, seen.viewpoint, np.eye(3)))
+    return scans
+
+
+def _grid_points(seen: Observation) -> PointCloud:
+    """The returns in the grid, one for each cell that has any."""
+    return _of_station(replace(seen, further=None))
+
+
 def _of_station(seen: Observation) -> PointCloud:
     valid, further = seen.valid, seen.further
     channels = {**seen.truth, "block": seen.block}
+    if seen.zenith_rad is not None:
+        channels["scan_angle_rad"] = np.broadcast_to(np.pi - seen.zenith_rad, valid.shape)
     optional = {"intensity": seen.intensity, "gps_time": seen.gps_time}
     values: dict[str, Any] = {name: None if channel is None else channel[valid] for name, channel in optional.items()}
     extra: dict[str, Any] = {name: channel[valid] for name, channel in channels.items()}
@@ -44,6 +65,8 @@ def _of_station(seen: Observation) -> PointCloud:
     number = np.concatenate([further.grid_number[valid], further.number])
     order = np.lexsort((number, cell))
     beside = {**further.truth, "block": further.block}
+    if "scan_angle_rad" in channels:
+        beside["scan_angle_rad"] = channels["scan_angle_rad"].ravel()[further.cell]
     time = seen.gps_time
     return PointCloud(
         points=np.concatenate([seen.points[valid], further.points])[order],

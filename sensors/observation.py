@@ -45,7 +45,8 @@ class Observation:
     block: (h, w) int32, the block whose niche was hit (0: wall); viewpoint: (3,) m, where the sensor stands;
     intensity: (h, w) float32 relative received power; pulse_interval_s: time from one cell to the next, in order of rows; truth:
     named (h, w) channels, such as `true_range_m`, present where the sensor was asked for them; further: returns beside those in
-    the grid, of a scanner that records several; None where no pulse has any.
+    the grid, of a scanner that records several; None where no pulse has any; zenith_rad: (w,) nominal zenith angle of each column
+    of a scanner's grid.
     """
 
     sensor: str
@@ -57,6 +58,7 @@ class Observation:
     pulse_interval_s: float | None = None
     truth: dict[str, NDArray[np.floating]] = field(default_factory=dict)
     further: FurtherReturns | None = None
+    zenith_rad: FloatArray | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:

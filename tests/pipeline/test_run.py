@@ -18,8 +18,10 @@ from pycocotools.coco import COCO
 
 from pipeline import run as pipeline_run
 from pipeline.config import SensorName, SimulationConfig, load_config
+from pipeline.formats.e57 import read_e57
 from pipeline.formats.laz import read_laz
 from pipeline.formats.ply import read_ply, write_ply
+from pipeline.formats.points import read_points
 from pipeline.run import simulate
 from scene.config import parse
 from scene.errors import InputError
@@ -209,6 +211,23 @@ def test_the_four_meshes_of_each_block_are_written_on_request(tmp_path: Path) ->
         removed = trimesh.load(folder / f"block_{label:04d}_intersection.ply")
         assert removed.is_watertight
         assert removed.volume == pytest.approx(volume, rel=1e-3)
+
+
+def test_points_are_written_in_other_formats_on_request(tmp_path: Path) -> None:
+    simulate(config(products={"formats": ["ply", "xyz", "e57"]}), "tls", tmp_path / "run")
+    folder = tmp_path / "run/epoch_000"
+    expected = read_laz(folder / "points.laz")
+    for suffix in ("ply", "xyz", "e57"):
+        np.testing.assert_allclose(read_points(folder / f"points.{suffix}").points, expected.points, rtol=0, atol=2e-6)
+    (scan,) = read_e57(folder / "points.e57")
+    run = json.loads((tmp_path / "run/run.json").read_text())
+    assert np.linalg.norm(scan.position[:2] - expected.points.mean(axis=0)[:2]) < 20
+    assert set(scan.cloud.extra) == {"row", "column"}
+    angle = expected.extra["scan_angle_rad"]  # of the nominal direction, from straight down, in steps of 0.006 degrees
+    vertical = np.array(run["wall_frame"]["rotation"]) @ [0.0, 0.0, 1.0]
+    ray = expected.points - scan.position
+    zenith = np.arccos(ray @ vertical / np.linalg.norm(ray, axis=1))
+    np.testing.assert_allclose(angle, np.pi - zenith, atol=1e-4)
 
 
 def test_tiles_become_the_images_of_the_data_set(tmp_path: Path) -> None:

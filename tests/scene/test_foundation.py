@@ -161,6 +161,16 @@ def test_no_ray_leaks_through_a_closed_fine_mesh() -> None:
     assert (face >= 0).all()
 
 
+def test_triangles_below_a_millimetre_leak_no_ray() -> None:
+    """720,000 triangles with sides of 0.5 mm, seen from 100 m, where float32 resolves 8 um."""
+    patch = heightfield(0.3, 0.3, 0.0005, roughness=0.02)
+    random = np.random.default_rng(5)
+    aims = np.concatenate([random.uniform(0.001, 0.299, (200_000, 2)), np.zeros((200_000, 1))], axis=1)
+    origin = np.array([10.0, -5.0, 100.0])
+    _, face = RayCaster(patch).cast(origin, aims - origin)
+    assert (face >= 0).all()
+
+
 def test_coordinates_far_from_the_origin_are_refused() -> None:
     mesh = plane(np.array([0, 0, 1.0]), np.array([652_000.0, 4_921_000.0, 830.0]))
     with pytest.raises(InputError, match="wall frame"):
