@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.effects.base import Stage
+from sensors.footprint import Beam
 from sensors.model import TlsModel, TlsNoise
 from sensors.pulses import Pulses
 from sensors.tls import LaserScanner, Pattern, ScannerConfig
@@ -27,7 +28,10 @@ _SPREAD = {
 
 @dataclass(frozen=True)
 class DirectedScanner(LaserScanner):
-    """A scanner whose pulses leave in the directions of `geometry` (a TlsGeometry), one after another."""
+    """A scanner whose pulses leave in the directions of `geometry` (a TlsGeometry), one after another.
+
+    Recorded powers, where there are any, take the place of those that the albedo of the reference would give.
+    """
 
     geometry: Any = None
 
@@ -40,6 +44,11 @@ class DirectedScanner(LaserScanner):
         azimuth, zenith = mi.Float64(np.ascontiguousarray(angles.azimuth)), mi.Float64(np.ascontiguousarray(angles.zenith))
         number = mi.UInt32(line.astype(np.uint32))
         return Pulses(number, mi.Float64(share), mi.UInt32(0) + index * 0, index, azimuth, zenith, azimuth, zenith)
+
+    def _trace(self, scene: RayCaster, pulses: Pulses, beam: Beam) -> Pulses:
+        traced = super()._trace(scene, pulses, beam)
+        power = self.geometry.power
+        return traced if power is None else replace(traced, power=mi.Float32(np.maximum(power, 1e-9).astype(np.float32)))
 
 
 def simulate_ranges(
@@ -56,21 +65,9 @@ def simulate_ranges(
 
 
 def simulated_ranges(measurement: Measurement, geometry: Any) -> FloatArray:
-    """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise.
-
-    The intensity bias takes the recorded powers, where there are any, for those that the albedo of the reference would give.
-    """
+    """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise."""
     model = measurement.model
     assert isinstance(model, TlsModel)
-    by_intensity = (
-        [effect for effect in model.effects if effect.name == "range_intensity_bias"] if geometry.power is not None else []
-    )
-    kept = [effect for effect in model.effects if effect.name not in _SPREAD and effect.stage != Stage.RETURN]
-    kept = [effect for effect in kept if effect not in by_intensity]
-    mean = model.model_copy(update={"noise": _NO_NOISE, "effects": tuple(kept)})
-    predicted = simulate_ranges(measurement, mean, geometry, KeyedRandom(0, ("gap", "mean")))
-    for effect in by_intensity:
-        values: Any = effect
-        reference = values.reference_power or float(np.median(geometry.power))
-        predicted = predicted + values.coefficient_m * np.log(np.maximum(geometry.power, 1e-12) / reference)
-    return predicted
+    kept = tuple(effect for effect in model.effects if effect.name not in _SPREAD and effect.stage != Stage.RETURN)
+    mean = model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
+    return simulate_ranges(measurement, mean, geometry, KeyedRandom(0, ("gap", "mean")))

@@ -157,7 +157,8 @@ class MeanSearch:
         chosen: list[Chosen] = []
         variants: list[int] = []
         while True:
-            tried = self.tried(self.columns(variants))
+            had = {item.candidate.name for item in chosen}
+            tried = [item for item in self.tried(self.columns(variants)) if item.name not in had]
             best = self._best(tried, variants)
             if best is None or len(chosen) == _MOST_EFFECTS:
                 return chosen, tried

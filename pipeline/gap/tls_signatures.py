@@ -78,7 +78,7 @@ def _cyclic(geometry: Any) -> list[Candidate]:
     wave = Wave("period_m", np.ones_like(geometry.range_m), geometry.range_m)
     return [
         searched("range_cyclic", "amplitude_m", wave, float(1 / f))
-        for f in _frequencies(1 / min(12.0, reach), 1 / 0.4, 0.5 / reach)
+        for f in _frequencies(1 / min(12.0, reach), 1 / 0.4, 0.3 / reach)
     ]
 
 
@@ -88,13 +88,13 @@ def _wobble(geometry: Any) -> list[Candidate]:
         return []
     wave = Wave("lines_per_cycle", -geometry.by_zenith, geometry.line)
     return [
-        searched("wobble", "amplitude_rad", wave, float(1 / f)) for f in _frequencies(2 / lines, 1 / _FEWEST_LINES, 0.5 / lines)
+        searched("wobble", "amplitude_rad", wave, float(1 / f)) for f in _frequencies(2 / lines, 1 / _FEWEST_LINES, 0.3 / lines)
     ]
 
 
 def _frequencies(low: float, high: float, step: float) -> FloatArray:
     """From low to high by `step`, at most some hundreds."""
-    return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, 160)))
+    return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, 200)))
 
 
 def _drift(geometry: Any) -> Candidate:

@@ -84,10 +84,12 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     named = sorted([*named, *_missing(measurement, residuals, rough, changed)], key=lambda item: -item.gain)
     clock.lap("naming")
     after = with_effects(measurement.model, [item.entry for item in named])
-    corrected = residuals_of(replace(measurement, model=after)) if named else residuals
-    if len(corrected) != len(residuals):  # a point beside the reference's rim
-        corrected = residuals
-    versions = Version(measurement.model, _pose(residuals.part(chosen))), Version(after, _pose(corrected.part(chosen)))
+    corrected = _corrected(measurement, after, residuals) if named else residuals.value
+    sound = chosen[np.isfinite(corrected[chosen])]
+    versions = tuple(
+        Version(model, _pose(replace(residuals, value=value).part(sound)))
+        for model, value in ((measurement.model, residuals.value), (after, corrected))
+    )
     gap = _gap(measurement, versions, residuals, usable & held_out, naming.reference_sigma, random)
     clock.lap("verification")
     return Diagnosis(
@@ -97,7 +99,7 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
         residuals=residuals,
         held_out=held_out,
         before=residuals.value - residuals.pose @ versions[0].pose,
-        after=corrected.value - residuals.pose @ versions[1].pose,
+        after=np.where(np.isfinite(corrected), corrected, residuals.value) - residuals.pose @ versions[1].pose,
         pose=versions[1].pose,
         model_after=after,
         gap=gap,
@@ -117,6 +119,14 @@ class _Naming:
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
     reference_sigma: float
+
+
+def _corrected(measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals) -> FloatArray:
+    """(n,) residuals of the same points against another model; NaN where that one misses the reference."""
+    found = residuals_of(replace(measurement, model=model))
+    value = np.full(len(measurement.cloud.points), np.nan)
+    value[found.index] = found.value
+    return np.asarray(value[residuals.index])
 
 
 class _Clock:
@@ -212,7 +222,7 @@ def _missing(measurement: Measurement, residuals: Residuals, rough: FloatArray, 
 
 def _gap(
     measurement: Measurement,
-    versions: tuple[Version, Version],
+    versions: tuple[Version, ...],
     residuals: Residuals,
     rows: BoolArray,
     reference_sigma: float,
@@ -222,7 +232,7 @@ def _gap(
     if len(chosen) < 100:
         return None
     part = residuals.part(chosen[thinned(len(chosen))])
-    return measure_gap(measurement, *versions, part, reference_sigma, random.child("verify"))
+    return measure_gap(measurement, versions[0], versions[1], part, reference_sigma, random.child("verify"))
 
 
 def _verdict(named: list[Named]) -> str:

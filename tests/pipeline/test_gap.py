@@ -1,0 +1,104 @@
+"""`scarpsim gap` on measurements of an independent generator (tests/gap_cases.py): verdicts, values, files, its own output."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from gap_cases import Scan, write_scan
+
+from pipeline.cli.main import main
+from pipeline.gap.measurement import read_measurement
+from pipeline.gap.workflow import Diagnosis, diagnose
+
+ROOT = Path(__file__).parents[2]
+
+
+def found_in(folder: Path, seed: int, **case: Any) -> Diagnosis:
+    write_scan(folder, seed, **case)
+    return diagnose(read_measurement(folder))
+
+
+def test_the_generator_shares_no_code_with_what_it_tests() -> None:
+    tree = ast.parse((ROOT / "tests/gap_cases.py").read_text())
+    modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    modules |= {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    assert not {str(module).split(".")[0] for module in modules} & {"scene", "sensors", "pipeline"}
+
+
+def test_nothing_is_found_where_there_is_nothing(tmp_path: Path) -> None:
+    assert found_in(tmp_path, 1).verdict == "no_gap"
+
+
+def test_a_rockfall_is_a_change_of_the_scene(tmp_path: Path) -> None:
+    found = found_in(tmp_path, 16, fall=(20.0, 12.0, 0.4))
+    assert found.verdict == "no_gap"
+    (change,) = found.changes
+    x0, _, z0, x1, _, z1 = change.to_dict(read_measurement(tmp_path).frame)["bbox_m"]
+    assert x0 - 0.5 < 20.0 < x1 + 0.5
+    assert z0 - 0.5 < 12.0 < z1 + 0.5
+    assert 0.2 < change.volume_m3 < 1.2  # 1.2 x 1.2 x 0.4 m
+
+
+def test_a_wobble_is_named_with_its_values_and_closes_the_gap(tmp_path: Path) -> None:
+    def angles(azimuth: Any, zenith: Any, line: Any) -> Any:
+        return 0 * azimuth, 8e-5 * np.sin(2 * np.pi * line / 37 + 1)
+
+    found = found_in(tmp_path, 11, angles=angles)
+    (effect,) = found.effects
+    assert (found.verdict, effect.name) == ("named", "tls.wobble")
+    assert abs(effect.entry["amplitude_rad"] - 8e-5) < 4 * effect.std["amplitude_rad"]
+    assert abs(effect.entry["lines_per_cycle"] - 37) < 0.5
+    assert found.gap is not None
+    assert (found.gap.closed or 0.0) > 0.7
+
+
+def test_noise_that_falls_with_intensity_is_named(tmp_path: Path) -> None:
+    def ranges(scan: Scan) -> Any:
+        return scan.R + 0.004 * scan.power**-0.5 * scan.rng.standard_normal(len(scan.R))
+
+    found = found_in(tmp_path, 10, ranges=ranges)
+    assert [effect.name for effect in found.effects] == ["tls.range_noise_intensity"]
+    assert found.effects[0].entry["a_m"] == pytest.approx(0.004, rel=0.1)
+
+
+def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
+    found = found_in(tmp_path, 18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0))
+    assert found.verdict == "unknown"
+    assert found.effects[0].kind == "empirical"
+
+
+def test_steps_of_the_range_are_found_to_a_micrometre(tmp_path: Path) -> None:
+    found = found_in(tmp_path, 21, ranges=lambda scan: 0.004 * np.rint(scan.R / 0.004))
+    assert [effect.name for effect in found.effects] == ["tls.range_quantization"]
+    assert found.effects[0].entry["step_m"] == pytest.approx(0.004, abs=1e-6)
+
+
+def test_losses_of_weak_echoes_are_a_detection_limit(tmp_path: Path) -> None:
+    found = found_in(tmp_path, 14, lost=lambda scan: scan.power < 1.2)
+    assert [effect.name for effect in found.effects] == ["tls.detection_limit"]
+    assert found.effects[0].entry["minimum_power"] == pytest.approx(1.2, rel=0.01)
+
+
+def test_too_few_points_are_no_data(tmp_path: Path) -> None:
+    assert found_in(tmp_path, 1, step_rad=0.05).verdict == "insufficient_data"
+
+
+def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: Path) -> None:
+    case, out = tmp_path / "case", tmp_path / "out"
+    case.mkdir()
+    write_scan(case, 8, ranges=lambda scan: scan.R + 0.004 * (1 / scan.cos_i - 1), intensity=False)
+    assert main(["gap", str(case), "--out", str(out)]) == 0
+    result = json.loads((out / "gap.json").read_text())
+    assert result["verdict"] == "named"
+    assert result["effects"][0]["name"] == "tls.range_incidence_bias"
+    assert "intensity" in result["remaining"]["note"]
+    assert {path.name for path in out.iterdir()} >= {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}
+    (case / "model.yaml").write_text((out / "model_after.yaml").read_text())
+    assert yaml.safe_load((case / "model.yaml").read_text())["effects"][0]["name"] == "range_incidence_bias"
+    assert diagnose(read_measurement(case)).verdict == "no_gap"
