@@ -13,7 +13,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.effects.base import Stage
-from sensors.footprint import Beam
+from sensors.footprint import Echo
 from sensors.model import TlsModel, TlsNoise
 from sensors.pulses import Pulses
 from sensors.tls import LaserScanner, Pattern, ScannerConfig
@@ -43,12 +43,21 @@ class DirectedScanner(LaserScanner):
         share = zero if angles.share is None else angles.share
         azimuth, zenith = mi.Float64(np.ascontiguousarray(angles.azimuth)), mi.Float64(np.ascontiguousarray(angles.zenith))
         number = mi.UInt32(line.astype(np.uint32))
-        return Pulses(number, mi.Float64(share), mi.UInt32(0) + index * 0, index, azimuth, zenith, azimuth, zenith)
+        return Pulses(
+            line=number,
+            share=mi.Float64(share),
+            line_key=index * 0,
+            pulse_key=index,
+            azimuth=azimuth,
+            zenith=zenith,
+            aim_azimuth=azimuth,
+            aim_zenith=zenith,
+        )
 
-    def _trace(self, scene: RayCaster, pulses: Pulses, beam: Beam) -> Pulses:
-        traced = super()._trace(scene, pulses, beam)
+    def _measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         power = self.geometry.power
-        return traced if power is None else replace(traced, power=mi.Float32(np.maximum(power, 1e-9).astype(np.float32)))
+        recorded = echo if power is None else replace(echo, power=mi.Float32(np.maximum(power, 1e-9).astype(np.float32)))
+        return super()._measured(pulses, recorded, random)
 
 
 def simulate_ranges(
