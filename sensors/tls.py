@@ -255,7 +255,7 @@ class LaserScanner:
             intensity=found.intensity.reshape(shape),
             pulse_interval_s=1.0 / self.config.pulse_rate_hz,
             truth={name: channel.reshape(shape) for name, channel in found.truth.items()},
-            zenith_rad=self.pattern.zenith_start + self.pattern.zenith_step * np.arange(self.pattern.pulses),
+            zenith_rad=self.pattern.zenith_start + self.pattern.zenith_step * np.arange(self.pattern.pulses, dtype=np.float64),
         )
 
     def _recorded(self, pulses: Pulses) -> Recorded:
