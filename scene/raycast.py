@@ -64,7 +64,7 @@ class RayCaster:
         parameters = mi.traverse(shape)
         self._vertices = mi.Float64(mesh.vertices.ravel())
         self._face_vertices = mi.UInt32(mesh.faces.astype(np.uint32, copy=False).ravel())
-        parameters["vertex_positions"] = mi.Float(self._vertices)
+        parameters["vertex_positions"] = mi.Float(mesh.vertices.ravel())  # not from _vertices: see test_memory_end.py
         parameters["faces"] = self._face_vertices
         parameters.update()
         self._scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surface": shape})

@@ -1,0 +1,40 @@
+"""Dr.Jit takes NumPy's memory as it is, and its kernels read whole packets of 16: nothing may be read past an array's end.
+
+Seldom does the memory end there, and then the process dies. Here it always does: the page after the array is forbidden.
+"""
+
+import subprocess
+import sys
+
+import pytest
+
+from scene.backend import LLVM, VARIANT
+
+SCRIPT = """
+import ctypes, mmap
+import numpy as np
+from scene.mesh import TriangleMesh
+from scene.raycast import RayCaster
+
+def at_the_end_of_a_page(values):
+    pages = -(-values.nbytes // mmap.PAGESIZE)
+    memory = mmap.mmap(-1, (pages + 1) * mmap.PAGESIZE)
+    start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    forbidden = ctypes.c_void_p(start + pages * mmap.PAGESIZE)
+    assert ctypes.CDLL(None).mprotect(forbidden, ctypes.c_size_t(mmap.PAGESIZE), 0) == 0
+    array = np.frombuffer(memory, values.dtype, values.size, pages * mmap.PAGESIZE - values.nbytes)
+    array[:] = values.ravel()
+    return array.reshape(values.shape)
+
+fan = np.array([[0.0, 0, 0]] + [[np.cos(a), np.sin(a), 0] for a in np.linspace(0, 6, 602)])
+faces = np.stack([np.zeros(601, int), np.arange(1, 602), np.arange(2, 603)], axis=1)
+caster = RayCaster(TriangleMesh(at_the_end_of_a_page(fan), faces))
+distance, _ = caster.cast(np.array([0.3, 0.2, 5.0]), np.array([[0.0, 0.0, -1.0]]))
+print(distance[0])
+"""
+
+
+@pytest.mark.skipif(VARIANT != LLVM or sys.platform != "linux", reason="of the LLVM backend's packets")
+def test_a_ray_caster_reads_no_further_than_the_vertices() -> None:
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "5.0"), done.stderr
