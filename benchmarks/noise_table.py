@@ -1,9 +1,10 @@
 """Noise of simulated difference maps of the Glendale site, after ICP and without blocks, against the thesis's tables 5-1 to 5-3.
 
-    python benchmarks/noise_table.py [--maps 45] [--levels high medium low] [--parameters]
+    python benchmarks/noise_table.py [--maps 45] [--levels high medium low] [--parameters | --readings]
 
 Each map differs two observations of one wall with noise drawn anew in both. Finished maps are kept under --out, so an interrupted
-run goes on where it was. --parameters: the noise of each parameter alone instead. Tables are printed and put into docs/noise.md.
+run goes on where it was. --parameters: the noise of each parameter alone instead; --readings: the printed noise drawn in
+other ways. Tables are printed and put into docs/noise.md.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import hashlib
 import json
 import re
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from pipeline.site import Site, prepare_site
 from scene.config import load_yaml, parse
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
-from sensors.model import StereoModel
+from sensors.model import OrientationNoise, StereoModel, StereoNoise
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "noise.md"
 LEVELS = ("high", "medium", "low")
@@ -43,6 +45,36 @@ FIRST_SEED = 1000
 Figures = dict[str, Any]
 
 
+@dataclass(frozen=True)
+class Reading:
+    """A way to read the thesis: noise in both epochs or in the later one only, drawn for each camera or for both at once."""
+
+    name: str
+    noisy_reference: bool = True
+    each_camera: bool = True
+
+    def models(self, model: StereoModel, random: KeyedRandom) -> tuple[StereoModel, StereoModel]:
+        """The models of the two observations of one map."""
+        before, after = (model if self.each_camera else _for_both(model, random.child(epoch)) for epoch in ("before", "after"))
+        return before if self.noisy_reference else SILENT, after
+
+
+def _for_both(model: StereoModel, random: KeyedRandom) -> StereoModel:
+    """The model with one draw of its orientation, the same for both cameras, as effects."""
+    matching = model.noise.model_copy(update={"orientation": OrientationNoise()})
+    return model.model_copy(update={"noise": matching, "effects": model.noise.orientation.draw("both", random)})
+
+
+SILENT = StereoModel(noise=StereoNoise(parallax_sigma_px=0.0, regularization_sigma_px=0.0))
+AS_SIMULATED = Reading("")
+READINGS = (
+    Reading("each camera, both epochs"),
+    Reading("each camera, later epoch only", noisy_reference=False),
+    Reading("both cameras alike, both epochs", each_camera=False),
+    Reading("both cameras alike, later epoch only", noisy_reference=False, each_camera=False),
+)
+
+
 class Maps:
     """Statistics of noise maps of one site, each kept in a file of its own."""
 
@@ -50,16 +82,17 @@ class Maps:
         self.config, self.site, self.folder, self.caster = config, site, folder, RayCaster(site.mesh)
         folder.mkdir(parents=True, exist_ok=True)
 
-    def of(self, model: StereoModel, maps: int) -> list[Figures]:
+    def of(self, model: StereoModel, maps: int, reading: Reading = AS_SIMULATED) -> list[Figures]:
         """Statistics, m, of maps 1 to `maps` of a sensor model."""
-        return [self._one(model, number) for number in range(1, maps + 1)]
+        return [self._one(model, number, reading) for number in range(1, maps + 1)]
 
-    def _one(self, model: StereoModel, number: int) -> Figures:
-        identity = self.config.model_dump_json() + model.model_dump_json()
+    def _one(self, model: StereoModel, number: int, reading: Reading) -> Figures:
+        identity = self.config.model_dump_json() + model.model_dump_json() + reading.name
         path = self.folder / f"{hashlib.sha256(identity.encode()).hexdigest()[:16]}_{number:03}.json"
         if not path.exists():
-            change = noise_map(self.config, with_model(self.site, model), self.caster, KeyedRandom(FIRST_SEED + number))
-            path.write_text(json.dumps(statistics(change).to_dict()))
+            random = KeyedRandom(FIRST_SEED + number)
+            before, after = (with_model(self.site, epoch) for epoch in reading.models(model, random))
+            path.write_text(json.dumps(statistics(noise_map(self.config, before, after, self.caster, random)).to_dict()))
         return dict(json.loads(path.read_text()))
 
 
@@ -101,6 +134,18 @@ def parameter_table(measured: Maps, maps: int) -> list[str]:
     return rows
 
 
+def reading_table(measured: Maps, maps: int) -> list[str]:
+    """Mean StD, mm, and its range of the printed noise and of its orientation part alone, under each reading of the thesis."""
+    rows = [f"| noise drawn for ({maps} maps) | printed, all | range | its orientation alone | range |", "|" + "---|" * 5]
+    models = single_parameters(bundled_model("printed"))
+    for reading in READINGS:
+        found = (measured.of(models[name], maps, reading) for name in ("all", "orientation"))
+        cells = (1e3 * np.array([one["standard_deviation_m"] for one in each]) for each in found)
+        rows.append(f"| {reading.name} | " + " | ".join(f"{v.mean():.1f} | {v.min():.1f} - {v.max():.1f}" for v in cells) + " |")
+        print(rows[-1], flush=True)
+    return rows
+
+
 def _root_mean_square(found: list[Figures]) -> str:
     values = (np.array([one[f"{name}_m"] for one in found]) for name in ("standard_deviation", "nmad"))
     return " | ".join(f"{1e3 * np.sqrt(np.mean(value**2)):.1f}" for value in values)
@@ -132,14 +177,20 @@ def main() -> None:
     parser.add_argument("--levels", nargs="+", default=list(LEVELS), choices=[*LEVELS, "worst", "printed"])
     parser.add_argument("--quality", default="medium", choices=["high", "medium", "low"], help="of the depth maps")
     parser.add_argument("--parameters", action="store_true", help="the noise of each parameter alone")
+    parser.add_argument("--readings", action="store_true", help="the printed noise, read in four ways")
     parser.add_argument("--out", type=Path, default=Path("runs/noise_table"))
     asked = parser.parse_args()
     settings = [*SETTINGS, f"depth_map={asked.quality}"]
     config = load_config(bundled_config("sites", "glendale"), settings, "stereo", None)
     measured = Maps(config, prepare_site(config, "stereo", KeyedRandom(config.seed)), asked.out)
     start = time.perf_counter()
-    rows = parameter_table(measured, asked.maps) if asked.parameters else level_table(measured, asked.levels, asked.maps)
-    into_document("parameters" if asked.parameters else "levels", rows)
+    if asked.parameters:
+        name, rows = "parameters", parameter_table(measured, asked.maps)
+    elif asked.readings:
+        name, rows = "readings", reading_table(measured, asked.maps)
+    else:
+        name, rows = "levels", level_table(measured, asked.levels, asked.maps)
+    into_document(name, rows)
     print("\n".join(rows))
     print(f"{time.perf_counter() - start:.0f} s, peak memory {peak_memory_gb():.2f} GB")
 

@@ -28,13 +28,14 @@ def with_model(site: Site, model: StereoModel) -> Site:
     return replace(site, sensor=replace(site.sensor, model=model))
 
 
-def noise_map(config: SimulationConfig, site: Site, caster: RayCaster, random: KeyedRandom) -> NDArray[np.float32]:
+def noise_map(config: SimulationConfig, before: Site, after: Site, caster: RayCaster, random: KeyedRandom) -> NDArray[np.float32]:
     """(h, w) differences, m, of two observations of the untouched wall (`caster`), NaN without data.
 
-    Both observations draw noise of their own from `random`; the second is registered to the first where the config has ICP.
+    before, after: one site, with the sensor as it is at each observation. Both draw noise of their own from `random`; the
+    second is registered to the first where the config has ICP.
     """
-    reference = _surface(config, site, caster, random.child("reference"))
-    later = _surface(config, site, caster, random.child("later"))
+    reference = _surface(config, before, caster, random.child("reference"))
+    later = _surface(config, after, caster, random.child("later"))
     if config.icp is not None:
         target = ReferenceSurface.build(reference.vertices, reference.vertex_normals())
         found = register_to(target, later.vertices, config.icp, random.child("register"))

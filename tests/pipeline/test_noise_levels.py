@@ -17,10 +17,12 @@ from sensors.model import StereoModel, StereoNoise
 
 GLENDALE = bundled_config("sites", "glendale")
 FAST = ["depth_map=low", "wall.resolution_m=0.2", "difference.gsd_m=0.2", "icp.subsample_points=true", "icp.subsample_ratio=0.95"]
-DOCUMENTED_MM = {"high": 22.9, "medium": 15.3, "low": 7.8}
+DOCUMENTED_MM = {"high": 22.5, "medium": 15.1, "low": 7.7}
 """Mean StD over 45 maps (docs/noise.md)."""
 MAPS = 4
 TOLERANCE = 0.25
+"""Share of the documented value. Means of 4 of the 45 maps at high noise (bootstrap) leave it with probability 6e-4; the levels
+share their draws, so about 1e-3 for the three together, 5e-3 if the coarse maps here are 5 % noisier than the documented ones."""
 
 
 def model(name: str) -> StereoModel:
@@ -87,7 +89,7 @@ def test_an_unknown_name_is_told_the_nearest() -> None:
 def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConfig, Site, RayCaster]) -> None:
     config, site, caster = stage
     noisy = with_model(site, model(level))
-    maps = [noise_map(config, noisy, caster, KeyedRandom(50 + number)) for number in range(MAPS)]
+    maps = [noise_map(config, noisy, noisy, caster, KeyedRandom(50 + number)) for number in range(MAPS)]
     deviation = 1e3 * np.mean([statistics(change).standard_deviation for change in maps])
     assert deviation == pytest.approx(DOCUMENTED_MM[level], rel=TOLERANCE)
     assert abs(np.median([statistics(change).median for change in maps])) < 5e-4
@@ -96,5 +98,6 @@ def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConf
 def test_without_noise_a_map_is_null(stage: tuple[SimulationConfig, Site, RayCaster]) -> None:
     config, site, caster = stage
     silent = StereoModel.model_validate({"noise": {"parallax_sigma_px": 0, "regularization_sigma_px": 0}})
-    change = noise_map(config, with_model(site, silent), caster, KeyedRandom(1))
+    silenced = with_model(site, silent)
+    change = noise_map(config, silenced, silenced, caster, KeyedRandom(1))
     assert np.nanmax(np.abs(change)) < 1e-5
