@@ -24,7 +24,7 @@ from measure import peak_memory_gb
 from pipeline.bundled import bundled_config
 from pipeline.config import SimulationConfig, load_config
 from pipeline.difference import statistics
-from pipeline.noise_maps import noise_map, with_model
+from pipeline.noise.maps import noise_map, with_model
 from pipeline.site import Site, prepare_site
 from scene.config import load_yaml, parse
 from scene.keyed_random import KeyedRandom

@@ -8,7 +8,7 @@ import pytest
 from pipeline.bundled import bundled_config
 from pipeline.config import SimulationConfig, load_config
 from pipeline.difference import statistics
-from pipeline.noise_maps import noise_map, with_model
+from pipeline.noise.maps import noise_map, with_model
 from pipeline.site import Site, prepare_site
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom

@@ -1,0 +1,161 @@
+"""How differences are distributed: their size, their tails, against a normal distribution, and against what may explain them.
+
+The size (median, StD, RMSE, NMAD) is `pipeline.difference.statistics`; here is what it leaves out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from pipeline.difference import DifferenceStatistics, statistics
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+
+NORMAL_BEYOND_3 = 0.0027
+"""Share of a normal distribution that lies more than three sigma from its median."""
+_LEAST_SAMPLE = 20
+"""D'Agostino and Pearson's test holds from about this many values."""
+_MOST_SAMPLE = 5000
+"""With more, any departure too small to matter is significant."""
+
+
+@dataclass(frozen=True)
+class Tails:
+    """What the tails hold, of n differences, m.
+
+    quantile_025_m ... quantile_975_m: quantiles at 2.5, 25, 75 and 97.5 %; skewness, excess_kurtosis: 0 for a normal
+    distribution; beyond_3_nmad: share farther than three NMAD from the median (normal: 0.0027); largest_m: largest |difference|.
+    """
+
+    quantile_025_m: float
+    quantile_250_m: float
+    quantile_750_m: float
+    quantile_975_m: float
+    skewness: float
+    excess_kurtosis: float
+    beyond_3_nmad: float
+    largest_m: float
+
+    def to_dict(self) -> dict[str, float | None]:
+        """As JSON holds it: NaN is null."""
+        return {name: None if np.isnan(value) else value for name, value in dataclasses.asdict(self).items()}
+
+
+def tails(values: NDArray[np.floating]) -> Tails:
+    """The tails of the values (any shape, m) that are not NaN; all NaN where there are none."""
+    known = values[~np.isnan(values)].astype(np.float64)
+    if known.size == 0:
+        return Tails(*[float("nan")] * 8)
+    size = statistics(known)
+    spread = size.standard_deviation
+    skewness = float(np.mean(((known - size.mean) / spread) ** 3)) if spread else 0.0
+    kurtosis = float(np.mean(((known - size.mean) / spread) ** 4)) - 3.0 if spread else 0.0
+    low, lower, upper, high = np.quantile(known, [0.025, 0.25, 0.75, 0.975]).tolist()
+    beyond = float(np.mean(np.abs(known - size.median) > 3 * size.nmad))
+    return Tails(low, lower, upper, high, skewness, kurtosis, beyond, float(np.abs(known).max()))
+
+
+@dataclass(frozen=True)
+class Normality:
+    """D'Agostino and Pearson's (1973) test of a sample: K2 of skewness and kurtosis, chi-squared with 2 degrees of freedom.
+
+    sample: how many values were drawn; None where there are too few.
+    """
+
+    statistic: float | None
+    p_value: float | None
+    sample: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return dataclasses.asdict(self)
+
+
+def normality(values: NDArray[np.floating], effective: float, random: KeyedRandom) -> Normality:
+    """Whether the values (any shape, NaN left out) may be normal.
+
+    effective: how many of them are independent, as `variogram.effective_sample_size` gives it: so many, at most 5,000, are drawn
+    at random by `random`, because neighbours are correlated and a test of all pixels rejects every real map.
+    """
+    known = values[~np.isnan(values)]
+    size = int(min(effective, known.size, _MOST_SAMPLE))
+    if size < _LEAST_SAMPLE or np.ptp(known) == 0:
+        return Normality(None, None, size)
+    sample = random.generator().choice(known, size, replace=False).astype(np.float64)
+    found = stats.normaltest(sample)
+    return Normality(float(found.statistic), float(found.pvalue), size)
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Differences where a covariate lies in [low, high); `of` are their statistics."""
+
+    low: float
+    high: float
+    of: DifferenceStatistics
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {"low": self.low, "high": self.high, **self.of.to_dict()}
+
+
+def binned(values: NDArray[np.floating], covariate: NDArray[np.floating], edges: Sequence[float] | FloatArray) -> list[Bin]:
+    """Statistics of the values, m, in each bin of a covariate of the same shape; pixels where either is NaN are left out.
+
+    edges: increasing, one more than bins; the last bin holds its upper edge.
+    """
+    if values.shape != covariate.shape:
+        raise ValueError(f"expected a covariate of shape {values.shape}, got {covariate.shape}")
+    known = ~np.isnan(values) & ~np.isnan(covariate)
+    found, place = values[known], covariate[known]
+    number = np.searchsorted(edges, place, side="right") - 1
+    number[place == edges[-1]] = len(edges) - 2
+    order = np.argsort(number, kind="stable")
+    starts = np.searchsorted(number[order], np.arange(len(edges)))
+    parts = (found[order[start:end]] for start, end in pairwise(starts))
+    return [Bin(float(low), float(high), statistics(part)) for (low, high), part in zip(pairwise(edges), parts, strict=True)]
+
+
+def quantile_edges(covariate: NDArray[np.floating], bins: int = 8) -> FloatArray:
+    """Edges of bins that hold equally many of the covariate's values (NaN left out), fewer where many values are alike."""
+    known = covariate[~np.isnan(covariate)]
+    if known.size == 0:
+        return np.array([0.0, 1.0])
+    edges = np.unique(np.quantile(known, np.linspace(0, 1, bins + 1)))
+    return edges if len(edges) > 1 else np.array([edges[0], np.nextafter(edges[0], np.inf)])
+
+
+@dataclass(frozen=True)
+class DensityHistogram:
+    """Counts of values in bins of equal width and what a normal distribution of the same median and NMAD would hold there.
+
+    edges: (k + 1,), m; counts, normal: (k,).
+    """
+
+    edges: FloatArray
+    counts: NDArray[np.int64]
+    normal: FloatArray
+
+
+def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: float = 6.0) -> DensityHistogram:
+    """The histogram of the values (NaN left out) within some NMADs of their median."""
+    known = values[~np.isnan(values)]
+    size = statistics(known)
+    centre, sigma = (size.median, size.nmad or 1e-6) if size.count else (0.0, 1e-3)
+    edges = centre + sigma * np.linspace(-half_width_nmads, half_width_nmads, bins + 1)
+    counts, _ = np.histogram(known, edges)
+    return DensityHistogram(edges, counts, size.count * np.diff(stats.norm.cdf(edges, centre, sigma)))
+
+
+def without_outliers(values: NDArray[np.floating], nmads: float = 5.0) -> NDArray[np.floating]:
+    """The values with NaN in place of those farther than some NMADs from the median."""
+    size = statistics(values)
+    return np.where(np.abs(values - size.median) <= nmads * size.nmad, values, np.nan)

@@ -1,0 +1,219 @@
+"""How far noise is alike: the variogram of a difference map, a model fitted to it, and how many of its pixels are independent.
+
+The empirical variogram (Matheron 1962) takes every pair of pixels with data,
+
+    gamma(h) = 1 / (2 N(h)) sum (z(x) - z(x + h))^2,
+
+by Fourier transform (Marcotte 1996, "Fast variogram computation with FFT", equation 8), so that no pairs have to be drawn at
+random; then it is averaged over the directions within bins of |h|. The model is a nugget and up to two nested structures,
+
+    gamma(h) = c_0 + sum c_i s(h / a_i),      s: spherical 1.5 t - 0.5 t^3, exponential 1 - exp(-3 t), gaussian 1 - exp(-3 t^2),
+
+where a is the effective range: s(1) = 1 (spherical) or 0.95. Its covariance C(h) = gamma(inf) - gamma(h) gives the standard error
+of a mean over an area of n pixels and the effective sample size (Rolstad et al. 2009; Hugonnet et al. 2022, equations 13 to 18),
+
+    Var(mean) = 1/n^2 sum_ij C(h_ij),      n_eff = C(0) / Var(mean),
+
+which are summed exactly over all pairs, by Fourier transform as well.
+
+Where it fails: noise that is longer than the largest lag looks like a constant and is not in the model, so n_eff is then too
+large; a few gross errors dominate squares, so leave them out first (`statistics.without_outliers`) and say so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, optimize
+
+from scene.errors import InputError
+from scene.mesh import FloatArray
+
+Direction = Literal["all", "x", "y"]
+Family = Literal["spherical", "exponential", "gaussian"]
+_FAMILIES: tuple[Family, ...] = ("spherical", "exponential", "gaussian")
+_LAGS = 24
+_SECTOR = np.tan(np.radians(22.5))
+"""Directions within 22.5 degrees of an axis count as along it."""
+_WORTH = 0.8
+"""A further structure has to bring the cost below this share of what it is without."""
+
+
+@dataclass(frozen=True)
+class Variogram:
+    """An empirical variogram: (k,) mean distance and semivariance of the pairs in each bin, and how many there are."""
+
+    lag_m: FloatArray
+    semivariance_m2: FloatArray
+    pairs: FloatArray
+
+    def to_dict(self) -> dict[str, list[float]]:
+        """As JSON holds it."""
+        return {field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)}
+
+
+def variogram(
+    values: NDArray[np.floating], gsd_m: float, *, largest_lag_m: float | None = None, direction: Direction = "all"
+) -> Variogram:
+    """The empirical variogram of a raster (h, w), m, NaN without data, over all its pairs.
+
+    largest_lag_m: of the bins, which grow geometrically from one pixel; none: half of the raster's larger side; direction: all,
+    or pairs along x (rows) or y (columns) only, within 22.5 degrees. Raises InputError where there are fewer than two pixels
+    with data or none far enough apart.
+    """
+    known = np.isfinite(values)
+    if np.count_nonzero(known) < 2:
+        raise InputError("fewer than two pixels have data", where="variogram")
+    reach = largest_lag_m or gsd_m * max(values.shape) / 2
+    steps = tuple(int(min(np.ceil(reach / gsd_m), size - 1)) for size in values.shape)
+    centred = np.where(known, values - np.mean(values[known], dtype=np.float64), 0.0).astype(np.float64)
+    shape = tuple(fft.next_fast_len(size + step, real=True) for size, step in zip(values.shape, steps, strict=True))
+    ones, first, second = (fft.rfft2(part, shape, workers=-1) for part in (known.astype(np.float64), centred, centred**2))
+    pairs = np.rint(_shifts(fft.irfft2(np.abs(ones) ** 2, shape, workers=-1), steps))
+    squares = _shifts(fft.irfft2(2 * (ones.conj() * second).real - 2 * np.abs(first) ** 2, shape, workers=-1), steps)
+    return _averaged(pairs, np.maximum(squares, 0.0), steps, gsd_m, reach, direction)
+
+
+def _shifts(correlation: FloatArray, steps: tuple[int, ...]) -> FloatArray:
+    """(steps_0 + 1, 2 steps_1 + 1) half of the shifts, which the others repeat: rows from 0, columns from -steps_1."""
+    rows = correlation[: steps[0] + 1]
+    return np.concatenate([rows[:, rows.shape[1] - steps[1] :], rows[:, : steps[1] + 1]], axis=1)
+
+
+def _averaged(
+    pairs: FloatArray, squares: FloatArray, steps: tuple[int, ...], gsd_m: float, reach: float, direction: Direction
+) -> Variogram:
+    """Averages over the bins of distance. squares: sums of (z - z')^2 over each shift's pairs."""
+    row, column = np.arange(steps[0] + 1)[:, None], np.arange(-steps[1], steps[1] + 1)[None]
+    distance: FloatArray = gsd_m * np.hypot(row, column)
+    wanted = (pairs > 0.5) & (distance > 0) & (distance <= reach * (1 + 1e-9)) & ~((row == 0) & (column < 0))
+    if direction != "all":
+        along, across = (np.abs(column), row) if direction == "x" else (row, np.abs(column))
+        wanted &= across <= _SECTOR * along
+    if not wanted.any():
+        raise InputError("no pixels with data are far enough apart", where="variogram", remedy="raise the largest lag")
+    edges = np.geomspace(0.5, max(reach / gsd_m, 1.0) * (1 + 1e-6), _LAGS + 1) * gsd_m
+    number = np.clip(np.searchsorted(edges, distance[wanted], side="right") - 1, 0, _LAGS - 1)
+    count = np.bincount(number, pairs[wanted], _LAGS).astype(np.float64)
+    filled = count > 0
+    lag = np.bincount(number, pairs[wanted] * distance[wanted], _LAGS)[filled] / count[filled]
+    return Variogram(lag, np.bincount(number, squares[wanted], _LAGS)[filled] / (2 * count[filled]), count[filled])
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A part of a variogram: its family, its sill, m2, and its effective range, m."""
+
+    family: Family
+    sill_m2: float
+    range_m: float
+
+    def share(self, distance: FloatArray) -> FloatArray:
+        """The share of the sill that is reached at a distance, m."""
+        t = np.asarray(distance) / self.range_m
+        if self.family == "spherical":
+            return np.where(t < 1, 1.5 * t - 0.5 * t**3, 1.0)
+        return -np.expm1(-3 * (t if self.family == "exponential" else t**2))
+
+
+@dataclass(frozen=True)
+class VariogramModel:
+    """A nugget, m2, and nested structures by rising range. relative_misfit: RMS of model over empirical minus one, if fitted."""
+
+    nugget_m2: float
+    structures: tuple[Structure, ...]
+    relative_misfit: float = 0.0
+
+    @property
+    def sill_m2(self) -> float:
+        """The variance of a pixel."""
+        return self.nugget_m2 + sum(part.sill_m2 for part in self.structures)
+
+    def semivariance(self, distance: FloatArray) -> FloatArray:
+        """m2 at distances, m; 0 at 0."""
+        total = self.nugget_m2 + sum(
+            (part.sill_m2 * part.share(distance) for part in self.structures), np.zeros(np.shape(distance))
+        )
+        return np.where(np.asarray(distance) > 0, total, 0.0)
+
+    def covariance(self, distance: FloatArray) -> FloatArray:
+        """m2 at distances, m; the nugget shows at 0 only."""
+        return self.sill_m2 - self.semivariance(distance)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {**dataclasses.asdict(self), "sill_m2": self.sill_m2}
+
+    def summary(self) -> str:
+        """One line in millimetres (standard deviations) and metres (ranges)."""
+        parts = [f"nugget {np.sqrt(self.nugget_m2) * 1e3:.1f} mm"]
+        parts += [f"{part.family} {np.sqrt(part.sill_m2) * 1e3:.1f} mm over {part.range_m:.2g} m" for part in self.structures]
+        return ", ".join(parts)
+
+
+def fit_variogram(found: Variogram) -> VariogramModel:
+    """The model that makes the relative misfit of all bins least; a second structure, or a first, only where it is worth it.
+
+    All bins count alike: they have so many pairs that the model, not the sampling, limits the fit.
+    """
+    if not found.semivariance_m2.max() > 0:
+        return VariogramModel(0.0, ())
+    best = _fitted(found, ())
+    for count in (1, 2):
+        tried = min((_fitted(found, (family,) * count) for family in _FAMILIES), key=lambda model: model.relative_misfit)
+        if tried.relative_misfit**2 < _WORTH * best.relative_misfit**2:
+            best = tried
+    return best
+
+
+def _fitted(found: Variogram, families: tuple[Family, ...]) -> VariogramModel:
+    """The least relative misfit with structures of these families: ranges by search, sills by non-negative least squares."""
+    lag, gamma = found.lag_m, np.maximum(found.semivariance_m2, 1e-6 * found.semivariance_m2.max())
+
+    def solved(log_ranges: FloatArray) -> VariogramModel:
+        ranges = np.sort(np.exp(log_ranges))
+        units = [Structure(family, 1.0, float(a)) for family, a in zip(families, ranges, strict=True)]
+        columns = np.stack([np.ones(len(lag)), *(unit.share(lag) for unit in units)], axis=1)
+        sills, residual = optimize.nnls(columns / gamma[:, None], np.ones(len(lag)))
+        parts = tuple(dataclasses.replace(unit, sill_m2=float(sill)) for unit, sill in zip(units, sills[1:], strict=True))
+        return VariogramModel(float(sills[0]), parts, float(residual / np.sqrt(len(lag))))
+
+    if not families:
+        return solved(np.zeros(0))
+    starts = np.geomspace(1.5 * lag[0], lag[-1], 6)
+    pairs = [(a, b) for a in starts for b in starts if a < b] if len(families) == 2 else [(a,) for a in starts]
+    begin = min((np.log(pair) for pair in pairs), key=lambda at: solved(at).relative_misfit)
+    low, high = np.log(lag[0] / 2), np.log(3 * lag[-1])
+    result = optimize.minimize(
+        lambda at: solved(np.clip(at, low, high)).relative_misfit,
+        begin,
+        method="Nelder-Mead",
+        options={"xatol": 1e-3, "fatol": 1e-6},
+    )
+    model = solved(np.clip(result.x, low, high))
+    return dataclasses.replace(model, structures=tuple(part for part in model.structures if part.sill_m2 > 0))
+
+
+def variance_of_mean(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
+    """Variance, m2, of the mean over the pixels of a mask (h, w), over all pairs of them. Raises ValueError for an empty mask."""
+    count = int(np.count_nonzero(mask))
+    if count == 0:
+        raise ValueError("the mask is empty")
+    shape = tuple(fft.next_fast_len(2 * size - 1, real=True) for size in mask.shape)
+    pairs = np.rint(fft.irfft2(np.abs(fft.rfft2(mask.astype(np.float64), shape, workers=-1)) ** 2, shape, workers=-1))
+    row, column = (np.minimum(np.arange(size), size - np.arange(size)) for size in shape)
+    distance = gsd_m * np.hypot(row[:, None], column[None])
+    used = pairs > 0
+    return float(np.sum(pairs[used] * model.covariance(distance[used])) / count**2)
+
+
+def effective_sample_size(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
+    """How many independent pixels would give the mean over a mask (h, w) the same variance: 1 to the number of its pixels."""
+    variance = variance_of_mean(model, mask, gsd_m)
+    return (
+        float(np.clip(model.sill_m2 / variance, 1.0, np.count_nonzero(mask))) if variance > 0 else float(np.count_nonzero(mask))
+    )
