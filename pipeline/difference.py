@@ -16,6 +16,7 @@ from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh
 from scene.raycast import RayCaster
+from scene.upload import on_device
 
 _BYTES_PER_PIXEL = 64
 """What reference, epoch, difference, labels and the copies of statistics and pictures take at their peak."""
@@ -79,7 +80,7 @@ def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     if caster.mesh.vertex_block is None:
         return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.full(grid.shape, WALL, dtype=np.int32))
-    label = caster.nearest_vertex_label(hits, point, mi.Int32(caster.mesh.vertex_block))
+    label = caster.nearest_vertex_label(hits, point, on_device(mi.Int32, caster.mesh.vertex_block))
     dr.eval(z, label)  # one kernel
     return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.array(label).reshape(grid.shape))
 

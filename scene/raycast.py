@@ -18,6 +18,7 @@ from scene.backend import dr, mi
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.upload import on_device, vectors_on_device
 
 DEFAULT_ALBEDO = 0.5
 _LARGEST_COORDINATE = 1e4
@@ -62,9 +63,9 @@ class RayCaster:
         self.mesh = mesh
         shape = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))
         parameters = mi.traverse(shape)
-        self._vertices = mi.Float64(mesh.vertices.ravel())
-        self._face_vertices = mi.UInt32(mesh.faces.astype(np.uint32, copy=False).ravel())
-        parameters["vertex_positions"] = mi.Float(mesh.vertices.ravel())  # not from _vertices: see test_memory_end.py
+        self._vertices = on_device(mi.Float64, mesh.vertices)
+        self._face_vertices = on_device(mi.UInt32, mesh.faces)
+        parameters["vertex_positions"] = on_device(mi.Float32, mesh.vertices)
         parameters["faces"] = self._face_vertices
         parameters.update()
         self._scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surface": shape})
@@ -78,7 +79,8 @@ class RayCaster:
         d high, d low, albedo, 6 block + 2 axis + (1 where n's largest component is negative).
         """
         index = dr.arange(mi.UInt32, len(self.mesh.faces))
-        labels = mi.Int32(WALL) if self.mesh.face_block is None else dr.gather(mi.Int32, mi.Int32(self.mesh.face_block), index)
+        blocks = self.mesh.face_block
+        labels = mi.Int32(WALL) if blocks is None else on_device(mi.Int32, blocks)
         vertex = [dr.gather(mi.UInt32, self._face_vertices, 3 * index + corner) for corner in range(3)]
         corner, second, third = (dr.gather(mi.Array3f64, self._vertices, number) for number in vertex)
         normal = dr.cross(second - corner, third - corner)
@@ -98,7 +100,7 @@ class RayCaster:
         """Mean albedo of each face's three vertices."""
         if self.mesh.vertex_albedo is None:
             return mi.Float32(DEFAULT_ALBEDO)
-        albedo = mi.Float32(self.mesh.vertex_albedo)
+        albedo = on_device(mi.Float32, self.mesh.vertex_albedo)
         return sum((dr.gather(mi.Float32, albedo, number) for number in vertex), mi.Float32(0)) / 3
 
     def intersect(self, origin: mi.Array3f64, direction: mi.Array3f64, *, coherent: bool = True, exact: bool = False) -> Hits:
@@ -174,8 +176,8 @@ class RayCaster:
 
     def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
         """Cast rays given as NumPy arrays, (n, 3) each, m; returns distance and face (n,); a miss is NaN and -1."""
-        columns = (np.ascontiguousarray(np.broadcast_to(array, directions.shape).T) for array in (origins, directions))
-        hits = self.intersect(*(mi.Array3f64(column) for column in columns), coherent=False)
+        rays = (vectors_on_device(np.broadcast_to(array, directions.shape)) for array in (origins, directions))
+        hits = self.intersect(*rays, coherent=False)
         distance = dr.select(hits.valid, hits.distance, np.nan)
         face = dr.select(hits.valid, mi.Int32(hits.face), -1)
         dr.eval(distance, face)

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 from pydantic import Field
 
-from scene.backend import mi
 from scene.config import Config
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import DEFAULT_ALBEDO
 from scene.texture import solid_noise
+from scene.upload import vectors_on_device
 
 _RAMP = 0.2
 """From dry to wet, in standard deviations of the noise: a hem of some hundredths of a patch."""
@@ -50,7 +50,7 @@ class WetnessConfig(Config):
 
 def _noise(points: FloatArray, key: int) -> FloatArray:
     """(n,) smooth noise at (n, 3) points in units of its grain."""
-    return solid_noise(mi.Array3f64(np.ascontiguousarray(points.T)), 1.0, key).numpy().astype(np.float64)
+    return solid_noise(vectors_on_device(points), 1.0, key).numpy().astype(np.float64)
 
 
 @cache

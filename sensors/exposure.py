@@ -20,6 +20,7 @@ from scene.illumination import Illumination
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
 from scene.texture import RockTexture
+from scene.upload import on_device
 from sensors.camera import Camera
 from sensors.device import bounded, opaque, rotated, vector
 
@@ -104,7 +105,7 @@ def expose(radiance: Radiance, white: float, step: int, config: ExposureConfig, 
     Electrons N = N_full L / white 2^EV with N_full = step^2 full wells (binning); their noise is Gaussian with variance
     N + step^2 read^2 (shot noise, near enough above a hundred electrons); beyond N_full a pixel is clipped.
     """
-    level = mi.Float32(radiance.ravel()) * dr.opaque(mi.Float32, 2.0**config.compensation_ev / white)
+    level = on_device(mi.Float32, radiance) * dr.opaque(mi.Float32, 2.0**config.compensation_ev / white)
     full, read = (dr.opaque(mi.Float32, value) for value in (config.full_well_e * step**2, config.read_noise_e * step))
     noise = random.normals(dr.arange(mi.UInt32, radiance.size)).x * dr.sqrt(level / full + dr.square(read / full))
     level = bounded(level + noise, 0, 1)

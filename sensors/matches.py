@@ -14,6 +14,7 @@ import numpy as np
 
 from scene.backend import dr, mi
 from scene.mesh import FloatArray
+from scene.upload import on_device
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,7 @@ class Matches:
 
     def with_raster(self, disparity: FloatArray) -> Matches:
         """The same cells with these (rows, columns) disparities, px, matched where they are not NaN."""
-        values = np.ascontiguousarray(disparity, dtype=np.float64).ravel()
-        return replace(self, disparity=mi.Float64(values), matched=mi.Bool(~np.isnan(values)))
+        return replace(self, disparity=on_device(mi.Float64, disparity), matched=on_device(mi.Bool, ~np.isnan(disparity)))
 
     def _evaluate(self) -> None:
         """Everything that comes out of the ray tracing at once, so that no later evaluation traces the rays again."""

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator
 
 from scene.backend import dr, mi
 from scene.config import Config
+from scene.upload import on_device
 from sensors.device import bounded
 from sensors.rectified import Disparity, Picture
 
@@ -54,11 +55,11 @@ def refine(left: Picture, right: Picture, disparity: Disparity, config: Refineme
     alike than the config wants, or more than 1.5 cells from where they were.
     """
     cell = np.flatnonzero(~np.isnan(disparity))
-    slopes = [mi.Float32(slope.ravel()[cell]) for slope in _slopes(disparity)]
-    start = mi.Float32(disparity.ravel()[cell])
+    slopes = [on_device(mi.Float32, slope.ravel()[cell]) for slope in _slopes(disparity)]
+    start = on_device(mi.Float32, disparity.ravel()[cell])
     smooth = (cv2.GaussianBlur(picture, (0, 0), PREFILTER_PX) for picture in (left, right))
     pictures, found, kept = _Pictures.on_device(*smooth), mi.Float32(start), mi.Bool(True)
-    row, column = mi.Int32((cell // left.shape[1]).astype(np.int32)), mi.Int32((cell % left.shape[1]).astype(np.int32))
+    row, column = (on_device(mi.Int32, place) for place in np.divmod(cell, left.shape[1]))
     sigma, correlation = (dr.opaque(mi.Float32, value) for value in (config.largest_sigma_px, config.least_correlation))
     for _ in range(config.steps):
         fit = pictures.fit(row, column, found, slopes, config.window_px // 2)
@@ -93,7 +94,7 @@ class _Pictures:
     @classmethod
     def on_device(cls, left: Picture, right: Picture) -> _Pictures:
         sizes = (dr.opaque(mi.Int32, size) for size in (left.shape[0], left.shape[1], right.shape[1]))
-        return cls(mi.Float32(left.ravel()), mi.Float32(right.ravel()), *sizes)
+        return cls(on_device(mi.Float32, left), on_device(mi.Float32, right), *sizes)
 
     def fit(self, row: mi.Int32, column: mi.Int32, disparity: mi.Float32, slopes: list[mi.Float32], half: int) -> _Fit:
         """One Gauss-Newton step at each of n cells."""

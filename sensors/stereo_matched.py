@@ -24,6 +24,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from scene.texture import RockTexture
+from scene.upload import on_device
 from sensors.camera import Camera, CameraPair
 from sensors.device import vector
 from sensors.effects.base import Effect, Stage, apply_stage
@@ -141,7 +142,7 @@ def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
 def _sampled(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
     """(n,) disparities at fractional columns and rows: bilinear on one surface, the nearest cell's at a depth step."""
     height, width = disparity.shape
-    values = mi.Float32(disparity.ravel())
+    values = on_device(mi.Float32, disparity)
     columns, rows = dr.opaque(mi.Int32, width), dr.opaque(mi.Int32, height)
     left, top = mi.Int32(dr.floor(column)), mi.Int32(dr.floor(row))
     inside = (left >= 0) & (top >= 0) & (left + 1 < columns) & (top + 1 < rows)

@@ -22,6 +22,7 @@ OF_SCENE_FOR_SENSORS = {
     "mesh",
     "raycast",
     "texture",
+    "upload",
 }
 """The modules of `scene` that a sensor may know: what it looks at, not how walls and blocks are made."""
 HEAVY = ("numpy", "scipy", "mitsuba", "drjit", "pydantic", "matplotlib", "open3d", "cv2", "rich")

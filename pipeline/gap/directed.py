@@ -12,6 +12,7 @@ from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
+from scene.upload import on_device
 from sensors.effects.base import Stage
 from sensors.footprint import Echo
 from sensors.model import TlsModel, TlsNoise
@@ -41,11 +42,11 @@ class DirectedScanner(LaserScanner):
         zero = np.zeros(count)
         line = zero if angles.line is None else np.maximum(angles.line, 0)
         share = zero if angles.share is None else angles.share
-        azimuth, zenith = mi.Float64(np.ascontiguousarray(angles.azimuth)), mi.Float64(np.ascontiguousarray(angles.zenith))
-        number = mi.UInt32(line.astype(np.uint32))
+        azimuth, zenith = (on_device(mi.Float64, angle) for angle in (angles.azimuth, angles.zenith))
+        number = on_device(mi.UInt32, line)
         return Pulses(
             line=number,
-            share=mi.Float64(share),
+            share=on_device(mi.Float64, share),
             line_key=index * 0,
             pulse_key=index,
             azimuth=azimuth,
@@ -56,7 +57,7 @@ class DirectedScanner(LaserScanner):
 
     def _measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         power = self.geometry.power
-        recorded = echo if power is None else replace(echo, power=mi.Float32(np.maximum(power, 1e-9).astype(np.float32)))
+        recorded = echo if power is None else replace(echo, power=on_device(mi.Float32, np.maximum(power, 1e-9)))
         return super()._measured(pulses, recorded, random)
 
 

@@ -12,6 +12,7 @@ from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
+from scene.upload import vectors_on_device
 from sensors.device import vector
 from sensors.stereo import SHADOW_MARGIN
 
@@ -76,7 +77,7 @@ def seen_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolA
     """(n,) whether each place turns its front to `viewpoint` ((3,), m) with nothing in between."""
     facing = np.einsum("ni,ni->n", places.normals, places.points - viewpoint) < 0
     origin = vector(viewpoint)
-    sight = mi.Array3f64(np.ascontiguousarray(places.points.T)) - origin
+    sight = vectors_on_device(places.points) - origin
     hidden = caster.occluded(origin, sight, dr.opaque(mi.Float64, 1.0 - SHADOW_MARGIN), coherent=False)
     return facing & ~np.array(hidden)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
+from scene.upload import on_device
 from sensors.effects.base import Effect, Stage, parameter
 from sensors.matches import Matches
 
@@ -29,7 +30,7 @@ class RegularizationNoise(Effect):
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         columns, rows = (int(np.ceil(size / self.step_px)) + 1 for size in (state.width, state.height))
-        nodes = mi.Float(random.generator().normal(0.0, self.sigma_px, (rows, columns)).astype(np.float32).ravel())
+        nodes = on_device(mi.Float32, random.generator().normal(0.0, self.sigma_px, (rows, columns)))
         step = dr.opaque(mi.Float64, self.step_px)
         x, y = state.u / step, state.v / step
         left, top = mi.UInt32(x), mi.UInt32(y)

@@ -6,12 +6,12 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
 from scene.backend import mi
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from scene.upload import on_device
 from sensors.effects.base import Effect, Stage, parameter
 from sensors.matches import Matches
 
@@ -49,7 +49,7 @@ class TextureNoise(Effect):
         with np.errstate(divide="ignore"):
             sigma = np.minimum(np.sqrt(self.coefficient / information), LARGEST_SIGMA_PX)
         noise = mi.Float64(random.normals(state.index).x)
-        return replace(state, disparity=state.disparity + mi.Float64(sigma.ravel()) * noise)
+        return replace(state, disparity=state.disparity + on_device(mi.Float64, sigma) * noise)
 
 
 def texture(image: FloatArray, reduction: int) -> FloatArray:
@@ -57,6 +57,8 @@ def texture(image: FloatArray, reduction: int) -> FloatArray:
 
     image: grey values, NaN where unknown; gradients that need an unknown value count as 0. reduction: frame px per cell.
     """
+    from scipy.ndimage import correlate1d
+
     gradient = np.zeros_like(image)
     gradient[:, 1:-1] = (image[:, 2:] - image[:, :-2]) / (2 * reduction)
     squared = np.square(np.nan_to_num(gradient))

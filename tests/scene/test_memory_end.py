@@ -10,11 +10,9 @@ import pytest
 
 from scene.backend import LLVM, VARIANT
 
-SCRIPT = """
+FORBIDDEN_PAGE = """
 import ctypes, mmap
 import numpy as np
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
 
 def at_the_end_of_a_page(values):
     pages = -(-values.nbytes // mmap.PAGESIZE)
@@ -26,15 +24,43 @@ def at_the_end_of_a_page(values):
     array[:] = values.ravel()
     return array.reshape(values.shape)
 
+"""
+RAY_CASTER = """
+from scene.mesh import TriangleMesh
+from scene.raycast import RayCaster
+
 fan = np.array([[0.0, 0, 0]] + [[np.cos(a), np.sin(a), 0] for a in np.linspace(0, 6, 602)])
 faces = np.stack([np.zeros(601, int), np.arange(1, 602), np.arange(2, 603)], axis=1)
 caster = RayCaster(TriangleMesh(at_the_end_of_a_page(fan), faces))
 distance, _ = caster.cast(np.array([0.3, 0.2, 5.0]), np.array([[0.0, 0.0, -1.0]]))
 print(distance[0])
 """
+UPLOAD = """
+from types import SimpleNamespace
+import scene.upload
+from scene.backend import dr, mi
+
+scene.upload.np = SimpleNamespace(empty=lambda size, dtype: at_the_end_of_a_page(np.zeros(size, dtype)))
+for kind in (mi.Float32, mi.Float64, mi.Int32, mi.UInt32, mi.Bool):
+    for size in (1, 7, 1001, 4096):
+        values = scene.upload.on_device(kind, np.arange(size) % 2)
+        assert dr.sum(mi.Float64(dr.select(values == kind(1), 1, 0)))[0] == size // 2
+print("read")
+"""
 
 
-@pytest.mark.skipif(VARIANT != LLVM or sys.platform != "linux", reason="of the LLVM backend's packets")
+pytestmark = pytest.mark.skipif(VARIANT != LLVM or sys.platform != "linux", reason="of the LLVM backend's packets")
+
+
+def printed(script: str) -> str:
+    done = subprocess.run([sys.executable, "-c", FORBIDDEN_PAGE + script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (done.returncode, done.stderr)
+    return done.stdout.strip()
+
+
 def test_a_ray_caster_reads_no_further_than_the_vertices() -> None:
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout.strip()) == (0, "5.0"), done.stderr
+    assert printed(RAY_CASTER) == "5.0"
+
+
+def test_kernels_stay_within_the_memory_of_an_uploaded_array() -> None:
+    assert printed(UPLOAD) == "read"
