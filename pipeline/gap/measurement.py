@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -96,6 +96,12 @@ class Measurement:
     @cached_property
     def scene(self) -> RayCaster:
         return RayCaster(self.reference)
+
+    def changed(self, **values: Any) -> Measurement:
+        """The same with other points, cameras or pose, in front of the same ray caster."""
+        other = replace(self, **values)
+        other.__dict__["scene"] = self.scene  # where cached_property keeps it
+        return other
 
 
 def read_model(path: Path) -> TlsModel | StereoModel:

@@ -203,12 +203,13 @@ def _pose(nominal: NominalPair, geometry: StereoGeometry) -> FloatArray:
     for axis in range(6):
         vector = np.zeros(3)
         vector[axis % 3] = step
-        moved = _moved(nominal.pair, centre, vector, turned=axis >= 3)
+        moved = moved_pair(nominal.pair, centre, vector, turned=axis >= 3)
         columns.append((seen_disparity(nominal, moved, geometry) - base) / step)
     return np.stack(columns, axis=1)
 
 
-def _moved(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
+def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
+    """The pair shifted by `vector` (m) or turned by it (rad, small) about `centre`, in the frame that it is given in."""
     if not turned:
         return pair.shifted("both", vector)
     x, y, z = vector
