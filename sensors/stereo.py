@@ -82,9 +82,15 @@ class StereoPair:
     def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
         """Number of each cell and its centre (u, v) in the left image, px of the full-resolution frame."""
         rows, columns = self.shape
-        index, step = dr.arange(mi.UInt32, rows * columns), float(REDUCTION[self.quality])
+        index = dr.arange(mi.UInt32, rows * columns)
+        return index, *self.centres(index)
+
+    def centres(self, index: mi.UInt32) -> tuple[mi.Float64, mi.Float64]:
+        """Centre (u, v), px of the full-resolution frame, of the cells of these numbers, which count by row over the frame."""
+        step = REDUCTION[self.quality]
+        columns = self.cameras.left.width // step
         row, column = index // columns, index % columns
-        return index, (mi.Float64(column) + 0.5) * step, (mi.Float64(row) + 0.5) * step
+        return (mi.Float64(column) + 0.5) * float(step), (mi.Float64(row) + 0.5) * float(step)
 
     def recorded(self, matches: Matches, camera_point: mi.Array3f64, left: Camera) -> Observation:
         """The observation of matches whose points, 3 x (n,) m, are given in the frame of the nominal left camera."""

@@ -198,10 +198,18 @@ class LaserScanner:
             pulses = apply_stage(self.model.chain(), stage, pulses, random)
         return pulses
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(lines, pulses of a line) of an observation."""
+        return self.pattern.lines, self.pattern.pulses
+
     def emit(self) -> Pulses:
         """The pattern's pulses, in order of lines, before any effect."""
+        return self.pulses_at(dr.arange(mi.UInt32, self.pattern.lines * self.pattern.pulses))
+
+    def pulses_at(self, index: mi.UInt32) -> Pulses:
+        """The pulses of these numbers, which count along the lines of the pattern, before any effect."""
         pattern = self.pattern
-        index = dr.arange(mi.UInt32, pattern.lines * pattern.pulses)
         line = index // dr.opaque(mi.UInt32, pattern.pulses)
         pulse = index - line * dr.opaque(mi.UInt32, pattern.pulses)
         start_azimuth, step_azimuth, start_zenith, step_zenith = opaque(
@@ -240,7 +248,7 @@ class LaserScanner:
 
     def _record(self, pulses: Pulses) -> Observation:
         """The scan's grid."""
-        shape = self.pattern.lines, self.pattern.pulses
+        shape = self.shape
         found = self._recorded(pulses)
         if np.isnan(found.depth).all():
             raise InputError(

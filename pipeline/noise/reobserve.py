@@ -1,0 +1,234 @@
+"""Noise maps in windows of a wall, fast: the sensor's own code traces only the cells that the windows and the registration need.
+
+A whole epoch of the Glendale site traces two million cells, meshes them and looks at five million pixels, to compare a hundred
+thousand of them. Here the wall is seen once without noise, which tells the cells that surround each window; an observation then
+is the sensor's own (`sensors.stereo`, `sensors.tls`: all noise, effects, rectification, occlusion) of these cells and of a sparse
+lattice over the whole view, by which it is registered; meshing and rasters are the pipeline's own.
+
+Against the whole simulation (`pipeline.noise.maps`) one thing differs: both epochs are registered to the wall as it is instead
+of the later to the noisy earlier one, from some thousand points instead of all. tests/pipeline/test_calibrate.py compares the
+two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.closest_points import ReferenceSurface
+from pipeline.config import SimulationConfig
+from pipeline.mesh import mesh_observation
+from pipeline.noise.parameters import Model
+from pipeline.noise.windows import Windows
+from pipeline.register import register_to
+from pipeline.rigid import RigidTransform
+from pipeline.site import Site
+from scene.backend import mi
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray, TriangleMesh
+from scene.raycast import RayCaster
+from scene.upload import on_device
+from sensors.model import StereoModel, TlsModel
+from sensors.observation import Observation
+from sensors.pulses import Pulses
+from sensors.stereo import StereoPair
+from sensors.tls import LaserScanner
+
+_LATTICE_POINTS = 3000
+"""Points by which an observation is registered: their noise moves a plane by a fiftieth of it."""
+_MARGIN_CELLS = 3
+_MARGIN_M = 0.05
+"""Around a window, so that it stays covered when noise moves the cells."""
+_OF_THE_WHOLE = {"edge_fattening", "smoothing", "occlusion_fill", "texture_noise", "range_intensity_bias"}
+"""Effects that look at neighbouring cells or at the whole scan."""
+
+
+@dataclass(frozen=True)
+class ChosenCells(StereoPair):
+    """A stereo pair that is asked for some cells of the left depth map only. chosen: (n,) their numbers, counted by row."""
+
+    chosen: NDArray[np.uint32] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        assert self.chosen is not None
+        return len(self.chosen), 1
+
+    def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
+        index = on_device(mi.UInt32, self.chosen)
+        return index, *self.centres(index)
+
+
+@dataclass(frozen=True)
+class ChosenPulses(LaserScanner):
+    """A laser scanner that sends some pulses of its pattern only. chosen: (n,) their numbers, counted along the lines."""
+
+    chosen: NDArray[np.uint32] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        assert self.chosen is not None
+        return len(self.chosen), 1
+
+    def emit(self) -> Pulses:
+        return self.pulses_at(on_device(mi.UInt32, self.chosen))
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """The block of cells around a window: where it begins in the flat list of cells, and its rows and columns."""
+
+    start: int
+    shape: tuple[int, int]
+
+
+class Reobserver:
+    """Simulates difference maps of noise alone in windows.
+
+    config, site: as a simulation takes them; windows: on the grid of the measured maps. Raises InputError for what cannot be
+    simulated cell by cell.
+    """
+
+    def __init__(self, config: SimulationConfig, site: Site, windows: Windows) -> None:
+        _check(config, site)
+        self.config, self.site, self.windows = config, site, windows
+        self.caster = RayCaster(site.mesh)
+        self.observations = 0
+        whole = _with_model(site.sensor, _silent(site.sensor.model)).observe(self.caster, KeyedRandom(0))
+        self._viewpoint = whole.viewpoint
+        self._patches, patch_cells = self._surround(whole)
+        lattice = _lattice(whole)
+        self._lattice_start = len(patch_cells)
+        self.cells = np.concatenate([patch_cells, lattice]).astype(np.uint32)
+
+    @cached_property
+    def target(self) -> ReferenceSurface:
+        """The wall as it is, to register to."""
+        return ReferenceSurface.build(self.site.mesh.vertices, self.site.mesh.vertex_normals())
+
+    def maps(self, model: Model, epochs: int, random: KeyedRandom, *, exact_reference: bool = False) -> FloatArray:
+        """(epochs, k, n, n) differences, m, of a noisy reference and later epochs, in the windows; NaN where not stable.
+
+        exact_reference: the maps are differences to the wall as it is.
+        """
+        reference = self.true_heights if exact_reference else self.heights(model, random.child("epoch", 0))
+        later = [self.heights(model, random.child("epoch", number)) for number in range(1, epochs + 1)]
+        return np.where(self.windows.stable, reference - np.stack(later), np.nan)
+
+    def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
+        """(k, n, n) heights, m, of one noisy observation's surface after registration, NaN where it has none."""
+        self.observations += 1
+        points = self._observe(model, random.child("observe"))
+        if self.config.icp is not None:
+            points = self._registration(points, random.child("register")).apply(points)
+        return self._raster(self._surface(points))
+
+    @cached_property
+    def true_heights(self) -> FloatArray:
+        """(k, n, n) heights, m, of the wall as it is."""
+        return self._raster(self.site.mesh, self.caster)
+
+    @cached_property
+    def silent_heights(self) -> FloatArray:
+        """(k, n, n) heights, m, of the surface that the sensor would give without noise."""
+        return self._raster(self._surface(self._observe(_silent(self.site.sensor.model), KeyedRandom(0))))
+
+    def _observe(self, model: Model, random: KeyedRandom) -> FloatArray:
+        """(cells, 3) points, m."""
+        sensor = self.site.sensor
+        own = {name: getattr(sensor, name) for name in sensor.__dataclass_fields__} | {"model": model, "truth": False}
+        kind = ChosenCells if isinstance(sensor, StereoPair) else ChosenPulses
+        return kind(**own, chosen=self.cells).observe(self.caster, random).points.reshape(-1, 3)
+
+    def _registration(self, points: FloatArray, random: KeyedRandom) -> RigidTransform:
+        lattice = points[self._lattice_start :]
+        config = self.config.icp.model_copy(update={"subsample_points": False})
+        return register_to(self.target, lattice[~np.isnan(lattice[:, 0])], config, random, threads=1).transform
+
+    def _surface(self, points: FloatArray) -> TriangleMesh:
+        """The patches as one mesh."""
+        vertices, faces, count = [], [], 0
+        for patch in self._patches:
+            rows, columns = patch.shape
+            block = points[patch.start : patch.start + rows * columns].reshape(rows, columns, 3)
+            depth = block[..., 2]
+            seen = Observation(self.site.sensor.__class__.__name__, block, depth, np.zeros(depth.shape, dtype=np.int32), self._viewpoint)
+            mesh = mesh_observation(seen, self.config.surface)
+            vertices.append(mesh.vertices)
+            faces.append(mesh.faces + count)
+            count += len(mesh.vertices)
+        return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
+
+    def _raster(self, mesh: TriangleMesh, caster: RayCaster | None = None) -> FloatArray:
+        x, y = self.windows.places()
+        top = float(mesh.bounds[1, 2]) + 1.0
+        origin = np.stack([x.ravel(), y.ravel(), np.full(x.size, top)], axis=1)
+        distance, _ = (caster or RayCaster(mesh)).cast(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
+        return (top - distance).reshape(x.shape)
+
+    def _surround(self, whole: Observation) -> tuple[list[_Patch], NDArray[np.int64]]:
+        """The cells around each window, as the noiseless observation shows them."""
+        grid, side = self.windows.grid, self.windows.side * self.windows.grid.gsd
+        x, y = whole.points[..., 0], whole.points[..., 1]
+        patches, numbers, start = [], [], 0
+        for row, column in self.windows.corner:
+            left, up = grid.x_min + column * grid.gsd - _MARGIN_M, grid.y_max - row * grid.gsd + _MARGIN_M
+            inside = (x >= left) & (x <= left + side + 2 * _MARGIN_M) & (y <= up) & (y >= up - side - 2 * _MARGIN_M)
+            rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+            if len(rows) == 0:
+                raise InputError(
+                    "a window of the measured maps is not seen by the sensor", where="cameras, station", remedy="check the site"
+                )
+            span = [
+                slice(max(int(place[0]) - _MARGIN_CELLS, 0), min(int(place[-1]) + _MARGIN_CELLS + 1, size))
+                for place, size in zip((rows, columns), whole.depth.shape, strict=True)
+            ]
+            block = np.arange(whole.depth.size).reshape(whole.depth.shape)[span[0], span[1]]
+            patches.append(_Patch(start, block.shape))
+            numbers.append(block.ravel())
+            start += block.size
+        return patches, np.concatenate(numbers)
+
+
+
+def _lattice(whole: Observation) -> NDArray[np.int64]:
+    """Numbers of cells in equal steps over the view that have a point."""
+    step = max(int(np.sqrt(np.count_nonzero(whole.valid) / _LATTICE_POINTS)), 1)
+    number = np.arange(whole.depth.size).reshape(whole.depth.shape)[::step, ::step]
+    return number[whole.valid[::step, ::step]]
+
+
+def _with_model(sensor: StereoPair | LaserScanner, model: Model) -> StereoPair | LaserScanner:
+    return replace(sensor, model=model, truth=False)
+
+
+def _silent(model: Model) -> Model:
+    """The model's effects without its noise."""
+    zero = {name: 0.0 for name in type(model.noise).model_fields if "sigma" in name or "ppm" in name}
+    if isinstance(model, StereoModel):
+        return StereoModel(noise=type(model.noise)(**zero), effects=model.effects)
+    return TlsModel(noise=type(model.noise)(**zero), effects=model.effects)
+
+
+def _check(config: SimulationConfig, site: Site) -> None:
+    if not isinstance(site.sensor, StereoPair | LaserScanner):
+        raise InputError("the noise of real matching is its own", where="matcher", allowed="simulated")
+    if site.further_stations:
+        raise InputError("maps of several stations are not calibrated", where="station", remedy="give the station of the maps alone")
+    if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
+        raise InputError(
+            "windows are reconstructed from the sensor's own grid",
+            where="reconstruction, surface",
+            allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
+        )
+    names = sorted({effect.name for effect in site.sensor.model.effects} & _OF_THE_WHOLE)
+    if names:
+        raise InputError(
+            f"{', '.join(names)}: looks at the whole picture or scan, and only windows of it are simulated",
+            where="sensor.effects",
+            remedy="leave it out of the model to be calibrated",
+        )
