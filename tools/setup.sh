@@ -67,8 +67,8 @@ if ! uv_is_recent "$uv"; then
     fi
 fi
 
-# --inexact keeps extras that somebody added by hand, such as `uv sync --extra detect --inexact`.
-"$uv" sync --quiet --locked --inexact --python "$python" || fail "the environment could not be made from uv.lock"
+# dataset: `scarpsim dataset --workers`. --inexact keeps extras added by hand, such as `uv sync --extra detect --inexact`.
+"$uv" sync --quiet --locked --inexact --extra dataset --python "$python" || fail "the environment could not be made from uv.lock"
 
 # -P: the script's folder stays off the path, where modules have names of the standard library's.
 missing_packages() { "$python" -P pipeline/cli/system_libraries.py || fail "the check of the system libraries failed"; }
