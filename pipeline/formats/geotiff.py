@@ -19,19 +19,24 @@ from scene.grid import Grid
 
 _PIXEL_SCALE, _TIEPOINT, _GEO_KEYS, _GEO_ASCII, _NODATA = 33550, 33922, 34735, 34737, 42113
 _ASCII, _SHORT, _DOUBLE = 2, 3, 12
+_MASK_PAGE = 4
+"""TIFF's NewSubfileType of a transparency mask."""
 _CITATION = "wall frame: x along the wall, y up the wall, z towards the sensors, metres"
 _MODEL_TYPE, _RASTER_TYPE, _CITATION_KEY, _LINEAR_UNITS = 1024, 1025, 1026, 3076
 _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
 
 
-def write_geotiff(path: Path, raster: NDArray[np.floating], grid: Grid, *, description: str = "") -> None:
+def write_geotiff(
+    path: Path, raster: NDArray[np.floating], grid: Grid, *, description: str = "", with_mask: bool = False
+) -> None:
     """Write a raster (h, w), m, NaN where there is no data, as float32 at the place and scale of `grid` in the wall frame.
 
-    The coordinate system is a local one in metres (GeoTIFF 1.1, user-defined model, pixel is area). description: ASCII.
+    The coordinate system is a local one in metres (GeoTIFF 1.1, user-defined model, pixel is area). description: ASCII;
+    with_mask: a second page says which pixels have data, a TIFF transparency mask of one bit a pixel, as GDAL reads it.
     """
     if raster.shape != grid.shape:
         raise ValueError(f"expected a raster of shape {grid.shape}, got {raster.shape}")
-    _write(path, raster, description, _georeference(grid))
+    _write(path, raster, description, _georeference(grid), with_mask=with_mask)
 
 
 def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = "") -> None:
@@ -76,19 +81,21 @@ def _georeference(grid: Grid) -> list[tuple[int, int, int, Any, bool]]:
     ]
 
 
-def _write(path: Path, raster: NDArray[np.floating], description: str, tags: list[tuple[int, int, int, Any, bool]]) -> None:
+def _write(
+    path: Path,
+    raster: NDArray[np.floating],
+    description: str,
+    tags: list[tuple[int, int, int, Any, bool]],
+    *,
+    with_mask: bool = False,
+) -> None:
     """Without metadata of tifffile's, software and date: equal rasters give equal bytes."""
     data = np.ascontiguousarray(raster, dtype=np.float32)
-    with writing(path) as temporary:
-        tifffile.imwrite(
-            temporary,
-            data,
-            photometric="minisblack",
-            description=description or None,
-            metadata=None,
-            software=False,
-            extratags=tags,
-        )
+    plain: dict[str, Any] = {"metadata": None, "software": False}
+    with writing(path) as temporary, tifffile.TiffWriter(temporary) as file:
+        file.write(data, photometric="minisblack", description=description or None, extratags=tags, **plain)
+        if with_mask:
+            file.write(~np.isnan(data), photometric="mask", subfiletype=_MASK_PAGE, **plain)
 
 
 def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
