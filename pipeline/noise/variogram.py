@@ -41,6 +41,8 @@ _SECTOR = np.tan(np.radians(22.5))
 """Directions within 22.5 degrees of an axis count as along it."""
 _WORTH = 0.8
 """A further structure has to bring the cost below this share of what it is without."""
+_GOOD_ENOUGH = 0.01
+"""Relative misfit from which a further structure is not looked for."""
 
 
 @dataclass(frozen=True)
@@ -59,23 +61,34 @@ class Variogram:
 def variogram(
     values: NDArray[np.floating], gsd_m: float, *, largest_lag_m: float | None = None, direction: Direction = "all"
 ) -> Variogram:
-    """The empirical variogram of a raster (h, w), m, NaN without data, over all its pairs.
+    """The empirical variogram of a raster (h, w), m, NaN without data, over all its pairs; of several (e, h, w), over the pairs
+    within each.
 
     largest_lag_m: of the bins, which grow geometrically from one pixel; none: half of the raster's larger side; direction: all,
     or pairs along x (rows) or y (columns) only, within 22.5 degrees. Raises InputError where there are fewer than two pixels
     with data or none far enough apart.
     """
-    known = np.isfinite(values)
-    if np.count_nonzero(known) < 2:
+    rasters = values[None] if values.ndim == 2 else values
+    if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
         raise InputError("fewer than two pixels have data", where="variogram")
-    reach = largest_lag_m or gsd_m * max(values.shape) / 2
-    steps = tuple(int(min(np.ceil(reach / gsd_m), size - 1)) for size in values.shape)
+    size = rasters.shape[1:]
+    reach = largest_lag_m or gsd_m * max(size) / 2
+    steps = tuple(int(min(np.ceil(reach / gsd_m), extent - 1)) for extent in size)
+    pairs, squares = (np.sum(parts, axis=0) for parts in zip(*(_by_shift(raster, steps) for raster in rasters), strict=True))
+    return _averaged(pairs, np.maximum(squares, 0.0), steps, gsd_m, reach, direction)
+
+
+def _by_shift(values: NDArray[np.floating], steps: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    """The number of pairs of a raster and the sum of their (z - z')^2 at each shift."""
+    known = np.isfinite(values)
+    if not known.any():
+        return (np.zeros((steps[0] + 1, 2 * steps[1] + 1)),) * 2
     centred = np.where(known, values - np.mean(values[known], dtype=np.float64), 0.0).astype(np.float64)
     shape = tuple(fft.next_fast_len(size + step, real=True) for size, step in zip(values.shape, steps, strict=True))
     ones, first, second = (fft.rfft2(part, shape, workers=-1) for part in (known.astype(np.float64), centred, centred**2))
     pairs = np.rint(_shifts(fft.irfft2(np.abs(ones) ** 2, shape, workers=-1), steps))
     squares = _shifts(fft.irfft2(2 * (ones.conj() * second).real - 2 * np.abs(first) ** 2, shape, workers=-1), steps)
-    return _averaged(pairs, np.maximum(squares, 0.0), steps, gsd_m, reach, direction)
+    return pairs, squares
 
 
 def _shifts(correlation: FloatArray, steps: tuple[int, ...]) -> FloatArray:
@@ -164,6 +177,8 @@ def fit_variogram(found: Variogram) -> VariogramModel:
         return VariogramModel(0.0, ())
     best = _fitted(found, ())
     for count in (1, 2):
+        if best.relative_misfit < _GOOD_ENOUGH:
+            break
         tried = min((_fitted(found, (family,) * count) for family in _FAMILIES), key=lambda model: model.relative_misfit)
         if tried.relative_misfit**2 < _WORTH * best.relative_misfit**2:
             best = tried

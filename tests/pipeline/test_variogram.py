@@ -92,3 +92,12 @@ def test_variance_of_a_mean_by_simulation() -> None:
 def test_nothing_to_compare_is_said() -> None:
     with pytest.raises(InputError, match="fewer than two pixels"):
         variogram(np.full((4, 4), np.nan), 0.1)
+
+
+def test_several_rasters_are_pooled_within_each() -> None:
+    """Constants that differ from raster to raster make no semivariance; pairs add up."""
+    noise = KeyedRandom(4).generator().normal(0, 1, (3, 20, 30))
+    one, three = variogram(noise[0], 1.0), variogram(noise + np.array([0.0, 50.0, -9.0])[:, None, None], 1.0)
+    assert three.pairs == pytest.approx(3 * one.pairs)
+    mean = np.mean([variogram(raster, 1.0).semivariance_m2 for raster in noise], axis=0)
+    assert three.semivariance_m2 == pytest.approx(mean)

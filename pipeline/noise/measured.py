@@ -1,0 +1,133 @@
+"""Real epochs as difference maps over a wall's plane: out of a measurement's points, or GeoTIFFs that exist already.
+
+Of a point p the difference is z of the reference at p's place in the wall's plane minus p's z; a pixel holds the mean of its
+points' differences, so what is compared is never interpolated between points. Missing rock is positive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.closest_points import ReferenceSurface
+from pipeline.difference import DifferenceConfig, raster_grid
+from pipeline.formats.geotiff import read_geotiff
+from pipeline.gap.measurement import FILE, MeasurementConfig, read_measurement
+from pipeline.register import IcpConfig, Registration, register_to
+from scene.backend import mi
+from scene.config import load_yaml, parse
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from scene.upload import on_device
+
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MeasuredMaps:
+    """Difference maps of real epochs. name: of the folder; maps: (e, h, w) float32, m, NaN without data; stable: (h, w), where
+    nothing has changed, as drawn; None where nobody drew it; points: of each epoch, none for maps out of files."""
+
+    name: str
+    grid: Grid
+    maps: NDArray[np.float32]
+    stable: BoolArray | None
+    points: tuple[int, ...] = ()
+    registrations: tuple[Registration, ...] = ()
+
+
+def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
+    """The difference maps of a folder with measurement.yaml, or of one with GeoTIFFs difference_*.tif (all *.tif where none is
+    so called) that share a grid.
+
+    icp: registration of each epoch's points to the reference, none: they are where they should be. Raises InputError where the
+    folder holds neither.
+    """
+    if (folder / FILE).is_file():
+        return _from_points(folder, config, icp, random)
+    files = sorted(folder.glob("difference_*.tif")) or sorted(folder.glob("*.tif"))
+    if not files:
+        remedy = f"name a folder with {FILE} or with difference maps (*.tif)"
+        raise InputError("holds no measured epochs", where=str(folder), remedy=remedy)
+    maps, grids = zip(*map(read_geotiff, files), strict=True)
+    for file, grid in zip(files, grids, strict=True):
+        if grid != grids[0]:
+            raise InputError(f"{grid} is not {grids[0]} of {files[0].name}", where=str(file), remedy="bring the maps to one grid")
+    return MeasuredMaps(folder.name, grids[0], np.stack(maps), None)
+
+
+def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
+    measurement = read_measurement(folder)
+    grid = raster_grid(measurement.reference.bounds, config)
+    cloud = measurement.cloud
+    epoch = cloud.extra.get("epoch", np.zeros(len(cloud.points), dtype=np.int64))
+    clouds = [cloud.points[epoch == number] for number in np.unique(epoch)]
+    target = ReferenceSurface.build(measurement.reference.vertices, measurement.reference.vertex_normals()) if icp else None
+    registrations = []
+    for number, points in enumerate(clouds):
+        if target is not None and icp is not None:
+            registrations.append(register_to(target, points, icp, random.child("register", number)))
+            clouds[number] = registrations[-1].apply(points)
+    maps = np.stack([point_differences(measurement.scene, points, grid) for points in clouds])
+    areas = parse(MeasurementConfig, load_yaml(folder / FILE), str(folder / FILE)).stable_areas
+    stable = area_mask(areas, grid, str(folder / FILE)) if areas else None
+    return MeasuredMaps(folder.name, grid, maps, stable, tuple(map(len, clouds)), tuple(registrations))
+
+
+def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> NDArray[np.float32]:
+    """(h, w) mean over each pixel of reference minus point in z, m; points: (n, 3), wall frame; NaN where there is none."""
+    top = float(reference.mesh.bounds[1, 2]) + 1.0
+    x, y = (on_device(mi.Float64, np.ascontiguousarray(points[:, axis])) for axis in (0, 1))
+    hits = reference.intersect(mi.Array3f64(x, y, top), mi.Array3f64(0.0, 0.0, -1.0), coherent=False)
+    below = np.where(np.array(hits.valid), top - np.array(hits.distance), np.nan) - points[:, 2]
+    column, row = np.floor(grid.columns(points[:, 0])), np.floor(grid.rows(points[:, 1]))
+    inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height) & np.isfinite(below)
+    place = (row[inside] * grid.width + column[inside]).astype(np.int64)
+    size = grid.width * grid.height
+    count, total = np.bincount(place, minlength=size), np.bincount(place, below[inside], size)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32).reshape(grid.shape)
+
+
+def area_mask(areas: Sequence[Any], grid: Grid, where: str) -> BoolArray:
+    """(h, w) the pixels whose centre lies in one of the areas: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame, m.
+
+    Raises InputError, naming `where`, for an area that is neither.
+    """
+    x: FloatArray = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
+    y: FloatArray = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
+    mask = np.zeros(grid.shape, dtype=bool)
+    for number, area in enumerate(areas):
+        try:
+            corners = np.array(area, dtype=np.float64)
+        except (TypeError, ValueError):
+            corners = np.zeros(0)
+        if corners.shape == (4,):
+            x0, y0, x1, y1 = corners
+            mask |= (y >= y0)[:, None] & (y <= y1)[:, None] & (x >= x0) & (x <= x1)
+        elif corners.ndim == 2 and corners.shape[0] >= 3 and corners.shape[1] == 2:
+            mask |= _inside(corners, x, y)
+        else:
+            raise InputError(
+                f"area {number + 1} is neither a box nor a polygon",
+                where=f"{where}: stable_areas",
+                allowed="[x0, y0, x1, y1] or [[x, y], [x, y], [x, y], ...]",
+            )
+    return mask
+
+
+def _inside(corners: FloatArray, x: FloatArray, y: FloatArray) -> BoolArray:
+    """(len(y), len(x)) even-odd rule: how many sides a ray to the right crosses."""
+    result = np.zeros((len(y), len(x)), dtype=bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        crosses = (y0 > y) != (y1 > y)
+        at = x0 + (y[crosses] - y0) * (x1 - x0) / (y1 - y0) if crosses.any() else np.zeros(0)
+        result[crosses] ^= x[None] < at[:, None]
+    return result
