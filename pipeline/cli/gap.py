@@ -5,34 +5,64 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.parser import at_least
+from pipeline.cli.parser import at_least, one_of
 
 SUMMARY = "find where a measurement and the model disagree, name the effect, add it, show the gap shrink"
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
-  scarpsim gap my_measurement --identifiability"""
+  scarpsim gap --identifiability my_site.yaml --sensor tls --out plans/gap"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("measurement", type=Path, metavar="MEASUREMENT", help="folder with measurement.yaml")
+    parser.add_argument(
+        "measurement",
+        type=Path,
+        metavar="MEASUREMENT",
+        help="folder with measurement.yaml; with --identifiability also the config of a simulation",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument("--seed", type=at_least(0), default=1, metavar="N", help="seed of the null distributions (default: 1)")
     parser.add_argument(
         "--identifiability", action="store_true", help="only say what this geometry can tell apart; looks at no residual"
     )
+    parser.add_argument(
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="with --identifiability: of a config's sensors"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
+    )
+    parser.add_argument(
+        "--reference-error",
+        type=float,
+        metavar="M",
+        help="with --identifiability: error of the known surface, correlated over 3 m (default: 0.001 tls, 0.005 stereo)",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     from pipeline.cli.simulate import new_folder
-    from pipeline.gap.identifiability import identifiability, table
+
+    out = arguments.out or new_folder(Path("runs"), "gap")
+    return _identifiability(arguments, out) if arguments.identifiability else _diagnosis(arguments, out)
+
+
+def _diagnosis(arguments: argparse.Namespace, out: Path) -> int:
     from pipeline.gap.measurement import read_measurement
     from pipeline.gap.report import summary, write
     from pipeline.gap.workflow import diagnose
 
     measurement = read_measurement(arguments.measurement)
-    if arguments.identifiability:
-        print(table(identifiability(measurement)))
-        return 0
     found = diagnose(measurement, arguments.seed)
-    report = write(arguments.out or new_folder(Path("runs"), "gap"), found, measurement)
-    print(f"{summary(found)}\nreport: {report}")
+    print(f"{summary(found)}\nreport: {write(out, found, measurement)}")
+    return 0
+
+
+def _identifiability(arguments: argparse.Namespace, out: Path) -> int:
+    from pipeline.gap.identifiability import identifiability, table
+    from pipeline.gap.identifiability_report import in_words, write_identifiability
+    from pipeline.gap.surveys import surveys
+
+    wanted = surveys(arguments.measurement, arguments.overrides, arguments.sensor)
+    found = [identifiability(survey, arguments.reference_error) for survey in wanted]
+    report = write_identifiability(out, found)
+    print("\n\n".join(f"{in_words(each)}\n{table(each)}" for each in found) + f"\nreport: {report}")
     return 0

@@ -1,0 +1,14 @@
+"""What the pictures of a diagnosis share."""
+
+from __future__ import annotations
+
+import io
+
+from matplotlib.figure import Figure
+
+
+def png(figure: Figure, dpi: int = 110) -> bytes:
+    """The figure as PNG; equal figures give equal bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
