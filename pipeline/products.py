@@ -126,7 +126,7 @@ def _write_common(
 ) -> None:
     """What every epoch has: points, depth map, surface, truth, blocks."""
     cloud = recorded_points(seen.observations)
-    _write_cloud(folder / "points.laz", cloud)
+    write_cloud(folder / "points.laz", cloud)
     if "ply" in config.products.formats:
         write_ply_points(folder / "points.ply", cloud)
     if "xyz" in config.products.formats:
@@ -141,13 +141,14 @@ def _write_common(
     write_json(folder / "blocks.json", blocks)
     wanted = config.products.world
     if wanted or (wanted is None and isinstance(config.wall, ImportedWall)):
-        _write_cloud(folder / "points_world.laz", replace(cloud, points=site.frame.to_world(cloud.points)))
+        write_cloud(folder / "points_world.laz", replace(cloud, points=site.frame.to_world(cloud.points)))
         write_ply(folder / "surface_world.ply", _in_world(surface, site))
     if config.products.metashape and seen.depth_maps is not None:
         write_metashape_export(folder / "metashape", *seen.depth_maps)
 
 
-def _write_cloud(path: Path, cloud: PointCloud) -> None:
+def write_cloud(path: Path, cloud: PointCloud) -> None:
+    """Write points.laz, with the channels that the format has a place of its own for in theirs."""
     extra = dict(cloud.extra)
     write_laz(
         path,

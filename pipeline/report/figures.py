@@ -26,20 +26,20 @@ from scene.mesh import WALL, IntArray
 SCALE_SIGMAS = 6.0
 """A difference map's colours end at this many sigma on either side of zero."""
 _WIDEST_PX = 2000
-_DPI = 150
+DPI = 150
 _MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.6, 9.0
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.7, 1.25, 0.6, 0.4
 _OUTSIDE, _INSIDE = "#0072B2", "#D55E00"
-_FAMILY = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+FAMILY = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito's colours for families of curves."""
-_NO_DATA, _NO_DATA_HILLSHADE = "#b5b5b5", "#c9dced"
+NO_DATA, _NO_DATA_HILLSHADE = "#b5b5b5", "#c9dced"
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
 """Towards the light: from the upper left, 45 degrees above the wall's plane."""
 _BINS = 120
-_COLOURS = colormaps["RdBu_r"].resampled(49)
+COLOURS = colormaps["RdBu_r"].resampled(49)
 """In steps of a quarter of a sigma, which cannot be told apart by eye and make a smaller file."""
 _GREYS = colormaps["gray"].resampled(64)
-_SEQUENTIAL = colormaps["viridis"].resampled(48)
+SEQUENTIAL = colormaps["viridis"].resampled(48)
 
 
 class Iteration(Protocol):
@@ -66,61 +66,61 @@ class CurvePanel:
 
 def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "") -> bytes:
     """A raster of heights (h, w), m, NaN without data, lit from the upper left."""
-    heights, pixel = _mean_pooled(heights, _pooling(grid)), grid.gsd * _pooling(grid)
+    heights, pixel = mean_pooled(heights, pooling(grid)), grid.gsd * pooling(grid)
     down, right = np.gradient(heights, pixel) if min(heights.shape) > 1 else (0 * heights, 0 * heights)
     shade = (-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / np.sqrt(
         1 + right**2 + down**2
     )  # the normal is (-dz/dx, -dz/dy, 1)
     figure, axes = _map_figure(grid, title, right_in=0.2)
     axes.set_facecolor(_NO_DATA_HILLSHADE)
-    axes.imshow(shade, cmap=_GREYS, vmin=-0.1, vmax=1.0, extent=_extent(grid, shade.shape), interpolation="nearest")
+    axes.imshow(shade, cmap=_GREYS, vmin=-0.1, vmax=1.0, extent=raster_extent(grid, shade.shape), interpolation="nearest")
     _no_data_legend(axes, heights, _NO_DATA_HILLSHADE)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, title: str = "") -> bytes:
     """A difference map (h, w), m, NaN without data, on a scale of +-6 `sigma_m`, with outlines of the labels `block` (h, w)."""
     if not sigma_m > 0:
         raise ValueError(f"sigma_m must be positive, got {sigma_m}")
-    values = _mean_pooled(difference, _pooling(grid)) * 1e3
-    limit, extent = SCALE_SIGMAS * sigma_m * 1e3, _extent(grid, values.shape)
+    values = mean_pooled(difference, pooling(grid)) * 1e3
+    limit, extent = SCALE_SIGMAS * sigma_m * 1e3, raster_extent(grid, values.shape)
     figure, axes = _map_figure(grid, title)
-    axes.set_facecolor(_NO_DATA)
-    image = axes.imshow(values, cmap=_COLOURS, vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
-    inside = _max_pooled(block != WALL, _pooling(grid))
+    axes.set_facecolor(NO_DATA)
+    image = axes.imshow(values, cmap=COLOURS, vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
+    inside = _max_pooled(block != WALL, pooling(grid))
     if inside.any() and min(inside.shape) > 1:
         axes.contour(inside, levels=[0.5], colors="black", linewidths=0.6, origin="upper", extent=extent)
     _colour_bar(figure, axes, image, sigma_m * 1e3)
-    _no_data_legend(axes, values, _NO_DATA, "outline: block" if inside.any() else "")
-    return _png(figure)
+    _no_data_legend(axes, values, NO_DATA, "outline: block" if inside.any() else "")
+    return png_bytes(figure)
 
 
 def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str = "") -> bytes:
     """Any quantity (h, w) over the wall, NaN without data, in the unit of `label`; colours span its 1 to 99 % quantiles."""
-    pooled = _mean_pooled(values, _pooling(grid))
+    pooled = mean_pooled(values, pooling(grid))
     known = pooled[np.isfinite(pooled)]
     low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
     margin = max(1e-3 * abs(low), 1e-12) if high - low <= 1e-6 * abs(high) else 0.0
     figure, axes = _map_figure(grid, title)
-    axes.set_facecolor(_NO_DATA)
-    extent = _extent(grid, pooled.shape)
-    image = axes.imshow(pooled, cmap=_SEQUENTIAL, vmin=low - margin, vmax=high + margin, extent=extent, interpolation="nearest")
+    axes.set_facecolor(NO_DATA)
+    extent = raster_extent(grid, pooled.shape)
+    image = axes.imshow(pooled, cmap=SEQUENTIAL, vmin=low - margin, vmax=high + margin, extent=extent, interpolation="nearest")
     bar = figure.colorbar(
         image, cax=_beside(figure, axes), extend="both" if known.size and np.ptp(known) > high - low else "neither"
     )
     bar.ax.tick_params(labelsize=8)
     bar.set_label(label, fontsize=9)
-    _no_data_legend(axes, pooled, _NO_DATA)
-    return _png(figure)
+    _no_data_legend(axes, pooled, NO_DATA)
+    return png_bytes(figure)
 
 
 def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -> bytes:
     """Families of curves side by side, all in per cent; a dashed line marks where the set-up is."""
-    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.0), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.0), dpi=DPI, layout="constrained")
     figure.suptitle(title, fontsize=11)
     row = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
     for axes, panel in zip(row, panels, strict=True):
-        for colour, (name, values) in zip(_FAMILY * len(panel.curves), panel.curves.items(), strict=False):
+        for colour, (name, values) in zip(FAMILY * len(panel.curves), panel.curves.items(), strict=False):
             axes.plot(panel.x, 100 * np.asarray(values), color=colour, linewidth=1.5, label=name)
         axes.axvline(panel.at, color="0.3", linewidth=0.8, linestyle="--", label="this set-up")
         if panel.logarithmic:
@@ -129,18 +129,18 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
             axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylim(-2, 102)
-        _dress(axes, panel.label, y_label)
+        dress(axes, panel.label, y_label)
         axes.label_outer()
         axes.grid(color="0.9", linewidth=0.6)
     figure.legend(*row[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9, frameon=False)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating], title: str = "") -> bytes:
     """Histograms of differences, m, outside and inside the blocks: the noise on a linear scale, all on a logarithmic one."""
     groups = [("outside the blocks", outside, _OUTSIDE), ("inside the blocks", inside, _INSIDE)]
     samples = [(name, values[~np.isnan(values)] * 1e3, colour) for name, values, colour in groups]
-    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.6), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.6), dpi=DPI, layout="constrained")
     figure.suptitle(title, fontsize=11)
     noise, whole = figure.subplots(1, 2)
     _histogram(noise, samples, _noise_range(samples[0][1]))
@@ -151,13 +151,13 @@ def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating]
     whole.set_ylim(bottom=0)
     handles = [Patch(color=colour, label=f"{name}\n{_in_words(statistics(values))}") for name, values, colour in samples]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def convergence_figure(history: Sequence[Iteration], title: str = "") -> bytes:
     """RMS of the inliers' residuals and share of inliers over the iterations of the registration."""
     iteration = np.arange(1, len(history) + 1)
-    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 3.4), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 3.4), dpi=DPI, layout="constrained")
     figure.suptitle(title, fontsize=11)
     panels = [
         ("RMS of the inliers, mm", [step.rms_m * 1e3 for step in history], _OUTSIDE),
@@ -166,9 +166,9 @@ def convergence_figure(history: Sequence[Iteration], title: str = "") -> bytes:
     for axes, (label, values, colour) in zip(figure.subplots(1, 2), panels, strict=True):
         axes.plot(iteration, values, color=colour, marker="o", markersize=3.5, linewidth=1.2)
         axes.xaxis.get_major_locator().set_params(integer=True)
-        _dress(axes, "iteration", label)
+        dress(axes, "iteration", label)
         axes.grid(color="0.9", linewidth=0.6)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def _histogram(axes: Axes, samples: Sequence[tuple[str, NDArray[np.floating], str]], limits: tuple[float, float]) -> None:
@@ -179,7 +179,7 @@ def _histogram(axes: Axes, samples: Sequence[tuple[str, NDArray[np.floating], st
         axes.stairs(counts, edges, color=colour, linewidth=1.2)
     axes.axvline(0, color="0.3", linewidth=0.8)
     axes.set_xlim(limits)
-    _dress(axes, "reference minus epoch, mm (missing rock is positive)", f"pixels per {edges[1] - edges[0]:.3g} mm")
+    dress(axes, "reference minus epoch, mm (missing rock is positive)", f"pixels per {edges[1] - edges[0]:.3g} mm")
 
 
 def _noise_range(values: NDArray[np.floating]) -> tuple[float, float]:
@@ -213,14 +213,15 @@ def _map_figure(grid: Grid, title: str, right_in: float = _RIGHT_IN) -> tuple[Fi
     width = min(_MAP_WIDTH_IN, _MAP_HEIGHT_IN / aspect)
     height = width * aspect
     full_width, full_height = _LEFT_IN + width + right_in, _BOTTOM_IN + height + _TOP_IN
-    figure = Figure(figsize=(full_width, full_height), dpi=_DPI)
+    figure = Figure(figsize=(full_width, full_height), dpi=DPI)
     axes = figure.add_axes((_LEFT_IN / full_width, _BOTTOM_IN / full_height, width / full_width, height / full_height))
     axes.set_title(title, fontsize=11, loc="left")
-    _dress(axes, "x along the wall, m", "y up the wall, m")
+    dress(axes, "x along the wall, m", "y up the wall, m")
     return figure, axes
 
 
-def _dress(axes: Axes, x_label: str, y_label: str) -> None:
+def dress(axes: Axes, x_label: str, y_label: str) -> None:
+    """The labels of the axes, in the size that all pictures share."""
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(y_label, fontsize=9)
     axes.tick_params(labelsize=8)
@@ -253,14 +254,14 @@ def _no_data_legend(axes: Axes, values: NDArray[np.floating], colour: str, outli
         axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=8, frameon=False, borderpad=0.1)
 
 
-def _pooling(grid: Grid) -> int:
+def pooling(grid: Grid) -> int:
     """How many pixels of the raster, each way, become one of the picture."""
     return max(1, int(np.ceil(max(grid.width, grid.height) / _WIDEST_PX)))
 
 
-def _extent(grid: Grid, shape: tuple[int, ...]) -> tuple[float, float, float, float]:
+def raster_extent(grid: Grid, shape: tuple[int, ...]) -> tuple[float, float, float, float]:
     """Left, right, bottom, top of a pooled raster, wall frame, m."""
-    pixel = grid.gsd * _pooling(grid)
+    pixel = grid.gsd * pooling(grid)
     return grid.x_min, grid.x_min + shape[1] * pixel, grid.y_max - shape[0] * pixel, grid.y_max
 
 
@@ -271,7 +272,7 @@ def _cells(raster: NDArray[Any], factor: int) -> NDArray[Any]:
     return raster[: height * rows, : width * columns].reshape(height, rows, width, columns)
 
 
-def _mean_pooled(raster: NDArray[np.floating], factor: int) -> NDArray[np.float32]:
+def mean_pooled(raster: NDArray[np.floating], factor: int) -> NDArray[np.float32]:
     """Means over cells, of what is not NaN in them."""
     if factor == 1:
         return raster.astype(np.float32)
@@ -286,7 +287,8 @@ def _max_pooled(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
     return np.asarray(_cells(mask, factor).any(axis=(1, 3)))
 
 
-def _png(figure: Figure) -> bytes:
+def png_bytes(figure: Figure) -> bytes:
+    """The figure as a PNG file that holds no date or version."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()
