@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pycocotools import mask as coco_mask
 from pydantic import Field
-from scipy import ndimage
 
 from scene.config import Config
 from scene.grid import Grid
@@ -80,6 +78,8 @@ def merge(data_sets: Iterable[dict[str, Any]], info: dict[str, Any] | None = Non
 
 def block_annotations(block: IntArray, config: AnnotationConfig) -> Iterator[dict[str, Any]]:
     """One annotation, without ids, per block that shows on enough pixels of the raster of labels (h, w), by rising label."""
+    from scipy import ndimage
+
     for label, box in enumerate(ndimage.find_objects(block), start=1):
         if box is None:
             continue
@@ -104,6 +104,8 @@ def run_length_encoding(crop: NDArray[np.bool_], row: int, column: int, shape: t
     crop: (n, m) bool whose top-left pixel is (row, column) of the frame. The same as encoding the whole frame, in the time
     that the crop takes.
     """
+    from pycocotools import mask as coco_mask
+
     height, width = shape
     columns = np.pad(crop.T, ((0, 0), (1, 1)))  # a zero at both ends of each column, so that every run ends in it
     place, step = np.nonzero(columns[:, 1:] != columns[:, :-1])

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pipeline.rigid import RigidTransform
 from scene.errors import InputError
@@ -46,6 +45,8 @@ class ReferenceSurface:
         points: (m, 3), m; normals: (m, 3) of any length, sign irrelevant, or None. Raises InputError where there are fewer than
         six points, values that are not finite, normals of length zero, or points on one line.
         """
+        from scipy.spatial import cKDTree
+
         points = checked_cloud(points, "reference points")
         unit = None if normals is None else _unit(normals, len(points))
         order = scan_order(points)

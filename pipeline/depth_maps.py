@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from scene.mesh import FloatArray
 from sensors.camera import Camera
@@ -121,6 +120,8 @@ def _covariances(
 
 def _window(values: FloatArray, radius: int, power_j: int = 0, power_i: int = 0) -> FloatArray:
     """Sum of values times j^power_j i^power_i over each pixel's window, j and i the column and row offset from the pixel."""
+    from scipy import ndimage
+
     offset = np.arange(-radius, radius + 1, dtype=float)
     along_rows: FloatArray = ndimage.correlate1d(values, offset**power_j, axis=1, mode="constant")
     sums: FloatArray = ndimage.correlate1d(along_rows, offset**power_i, axis=0, mode="constant")

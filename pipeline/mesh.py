@@ -17,8 +17,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from scene.config import Config
 from scene.errors import InputError
@@ -97,6 +95,8 @@ def labelled_surface(
 
     labels: (n, 3) points and their (n,) blocks; each vertex takes that of the nearest. Raises InputError where nothing is left.
     """
+    from scipy.spatial import cKDTree
+
     near = cKDTree(points).query(vertices, workers=-1)[0] <= config.poisson_trim_spacings * _spacing(points)
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
@@ -119,6 +119,8 @@ def octree_depth(points: FloatArray) -> int:
 
 def _spacing(points: FloatArray) -> float:
     """Median distance of a point to the nearest other one, m."""
+    from scipy.spatial import cKDTree
+
     spacing = float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))
     if not spacing > 0:
         raise InputError("most points of the cloud lie twice in the same place", where="surface", remedy="remove duplicates")
@@ -232,6 +234,8 @@ def _fill_holes(points: FloatArray, block: IntArray, maximum_px: int) -> tuple[F
 
 def _small_holes(missing: BoolArray, maximum_px: int) -> BoolArray:
     """(h, w) the missing samples in 4-connected holes of at most `maximum_px`, away from the border."""
+    from scipy import ndimage
+
     holes, _ = ndimage.label(missing)
     small = np.bincount(holes.ravel()) <= maximum_px
     for border in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):

@@ -8,10 +8,8 @@ from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag
-from scipy.spatial.transform import Rotation
 
 from scene.config import Config
 from scene.distributions import Distribution, Gaussian
@@ -198,6 +196,8 @@ class _Search:
 
 def _shaped(config: RockfallConfig, random: KeyedRandom) -> _Solid:
     """The cascade: a primitive of unit size, scaled along its axes, rotated, then moved radially vertex by vertex."""
+    from scipy.spatial.transform import Rotation
+
     generator = random.child("shape").generator()
     shape = ("cube", "sphere")[generator.integers(2)] if config.shape == "mixed" else config.shape
     size = _drawn(config.size_m, generator)
@@ -219,6 +219,8 @@ def _drawn(distributions: AxisDistributions, generator: np.random.Generator) -> 
 @lru_cache
 def _primitive(shape: str, subdivisions: int) -> tuple[FloatArray, IntArray]:
     """Vertices and faces of a sphere or cube of diameter or side 1 around the origin."""
+    import trimesh
+
     if shape == "sphere":
         mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.5)
         return np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int32)

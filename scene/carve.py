@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from scene.blocks import Blocks
 from scene.errors import InputError
@@ -125,6 +124,8 @@ def _part(whole: Piece, chosen: NDArray[np.bool_], label: int | IntArray) -> Tri
 
 def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
     """(k,) volume of the intersection, block by block; raises InputError where there is none."""
+    from scipy import sparse
+
     links = removed.faces[:, [0, 1]].T, removed.faces[:, [1, 2]].T
     rows, columns = np.concatenate(links, axis=1)
     graph = sparse.coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(removed.vertices),) * 2)

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from scene.errors import InputError
 from scene.mesh import FloatArray, TriangleMesh
@@ -55,7 +54,7 @@ def weld(mesh: TriangleMesh) -> Mended:
     first, inverse = unique_rows(mesh.vertices + 0.0)  # + 0.0: minus zero is zero
     near = _near_pairs(mesh.vertices[first])
     if len(near):
-        group = _groups(near, len(first))
+        group = groups(near, len(first))
         first, inverse = first[np.unique(group, return_index=True)[1]], group[inverse]
     removed = len(mesh.vertices) - len(first)
     if not removed:
@@ -110,7 +109,7 @@ def rewind(mesh: TriangleMesh, where: str) -> Mended:
         return mesh, ""
     flip, none = same * count, np.zeros(len(same), np.int64)
     links = np.concatenate([pair + np.stack([none, flip], axis=1), pair + np.stack([none + count, count - flip], axis=1)])
-    label = _groups(links, 2 * count)
+    label = groups(links, 2 * count)
     if np.any(label[:count] == label[count:]):
         raise InputError("the surface has only one side (a Moebius strip), so it has no outside", where=where)
     size = np.bincount(label[:count], minlength=label.max() + 1)
@@ -146,7 +145,7 @@ def drop_unused(mesh: TriangleMesh) -> Mended:
 
 def pieces(mesh: TriangleMesh) -> str:
     """What a report should say about pieces that are not connected to the main one; "" if there is one."""
-    label = _groups(mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
+    label = groups(mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
     sizes = np.sort(np.bincount(label[mesh.faces[:, 0]]))
     if len(sizes) == 1:
         return ""
@@ -160,7 +159,7 @@ def flipped(mesh: TriangleMesh, which: NDArray[np.bool_]) -> TriangleMesh:
 
 def areas(mesh: TriangleMesh) -> FloatArray:
     """(m,) areas of the triangles, m2."""
-    return _by_parts(mesh, lambda corners: np.sqrt(np.sum(_area_vectors(corners) ** 2, axis=1)), float)
+    return _by_parts(mesh, _areas, float)
 
 
 def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]], kind: type) -> NDArray[Any]:
@@ -172,14 +171,20 @@ def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]]
     return result
 
 
-def _area_vectors(corners: FloatArray) -> FloatArray:
-    """(k, 3) normals of the triangles, as long as their areas, m2."""
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+def _areas(corners: FloatArray) -> FloatArray:
+    """(k,) areas of the triangles, m2."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.sqrt(_squared(np.cross(first, second))) / 2
 
 
 def _has_area(corners: FloatArray) -> NDArray[np.bool_]:
-    longest = np.sqrt(np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2), axis=1))
-    return 2 * np.sqrt(np.sum(_area_vectors(corners) ** 2, axis=1)) > _FLAT_M * longest
+    sides = (_squared(corners[:, start] - corners[:, end]) for start, end in ((0, 1), (1, 2), (2, 0)))
+    return 2 * _areas(corners) > _FLAT_M * np.sqrt(reduce(np.maximum, sides))
+
+
+def _squared(vectors: FloatArray) -> FloatArray:
+    """(k,) squared lengths of (k, 3) vectors."""
+    return np.einsum("ki,ki->k", vectors, vectors)
 
 
 def undirected_edges(mesh: TriangleMesh) -> Index:
@@ -227,10 +232,22 @@ def _near_pairs(vertices: FloatArray) -> Index:
     return np.concatenate(found)
 
 
-def _groups(pairs: NDArray[np.integer], count: int) -> Index:
-    """(count,) number of the connected group of each element, in order of first appearance."""
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+def groups(pairs: NDArray[np.integer], count: int) -> Index:
+    """(count,) number of the connected group of each element, in order of first appearance.
+
+    Every element points to the smallest of its group known so far. A round hooks the groups that a pair joins to the smaller
+    one, then follows the pointers to their ends (Shiloach and Vishkin 1982). SciPy takes as long, and its import longer still.
+    """
+    smallest = np.arange(count)
+    start, end = pairs.T
+    while len(start):
+        low, high = np.minimum(smallest[start], smallest[end]), np.maximum(smallest[start], smallest[end])
+        np.minimum.at(smallest, high, low)
+        while not np.array_equal(further := smallest[smallest], smallest):
+            smallest = further
+        apart = low != high
+        start, end = start[apart], end[apart]
+    return (np.cumsum(smallest == np.arange(count)) - 1)[smallest]
 
 
 def _twins(edges: Index) -> tuple[Index, Index]:
@@ -275,7 +292,7 @@ def _lesser_fans(mesh: TriangleMesh, pinched: NDArray[np.bool_]) -> NDArray[np.b
     corners, count = patch.faces.T.ravel(), len(near)
     one, other = _twins(undirected_edges(patch))  # wound alike, so that one leaves where the other arrives
     links = np.concatenate([np.stack([one, (other + count) % (3 * count)], 1), np.stack([(one + count) % (3 * count), other], 1)])
-    fan = _groups(links, 3 * count)
+    fan = groups(links, 3 * count)
     first, size = np.unique(fan, return_index=True, return_counts=True)[1:]
     centre = corners[first]
     ranked = np.lexsort((-size, centre))

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
-from scipy import special
 
 from scene.config import Config
 from scene.mesh import FloatArray
@@ -47,6 +46,8 @@ class Gaussian(Config):
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
         """(size,) values, by inversion of the (truncated) distribution function's upper tail."""
+        from scipy import special
+
         if self.minimum is None or self.sigma == 0:
             return generator.normal(self.mean, self.sigma, size)
         mass = special.ndtr((self.mean - self.minimum) / self.sigma)  # P(value > minimum)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -15,11 +14,15 @@ from scene.cleaning import clean, flipped
 from scene.config import Config
 from scene.errors import InputError, nearest
 from scene.mesh import TriangleMesh
+from scene.ply import read_elements
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
 """A wall smaller or larger than this is likely to be in another unit."""
 _ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
+_COLOURS = ("red", "green", "blue")
+_TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
+"""Names of vertices' colours in a PLY file, and of what textures hang on."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """ITU-R BT.709, of linear red, green and blue."""
 
@@ -50,8 +53,9 @@ class ImportedWall(Config):
         return mesh.with_vertices(mesh.vertices + origin), repairs
 
     def _check_extent(self, mesh: TriangleMesh) -> None:
-        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
-        extent = float(np.max(corners.max(axis=0) - corners.min(axis=0)))
+        used = np.zeros(len(mesh.vertices), dtype=bool)
+        used[mesh.faces] = True
+        extent = max(float(np.ptp(column[used])) for column in mesh.vertices.T)
         if not _SMALLEST_M <= extent <= _LARGEST_M:
             likely = [unit for unit, metres in _METRES.items() if 2 <= extent / _METRES[self.unit] * metres <= 1000]
             remedy = f"set `unit` to {' or '.join(likely)} if that is the file's unit" if likely else "check the file"
@@ -68,6 +72,10 @@ def _read(path: Path) -> TriangleMesh:
     where, kind = str(path), _format(path)
     if not path.is_file():
         raise InputError("there is no such file", where=where, remedy="check the path")
+    if kind == "ply" and (plain := _plain_ply(path)) is not None:
+        return plain
+    import trimesh
+
     options = {"skip_materials": True} if kind == "obj" else {}
     try:
         loaded = trimesh.load(str(path), file_type=kind, process=False, **options)
@@ -86,10 +94,36 @@ def _read(path: Path) -> TriangleMesh:
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
 
 
+def _plain_ply(path: Path) -> TriangleMesh | None:
+    """A PLY file of triangles, at most with colours of 8 bits per vertex; None where there is more to it, for trimesh to read.
+
+    The same mesh as trimesh's, without the second that the import of trimesh takes.
+    """
+    try:
+        elements = read_elements(path)
+        vertex, face = elements["vertex"], elements["face"]
+        faces = face["vertex_indices" if "vertex_indices" in face else "vertex_index"]
+        vertices = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    except (InputError, KeyError):
+        return None
+    colours = [vertex[name] for name in _COLOURS if name in vertex]
+    more = "edge" in elements or not {*vertex, *face}.isdisjoint(_TEXTURE) or not set(face).isdisjoint(_COLOURS)
+    if more or any(colour.dtype != np.uint8 for colour in colours):
+        return None
+    if faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+        return None
+    albedo = _luminance(np.stack(colours, axis=1)) if len(colours) == 3 else None
+    return TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), albedo)
+
+
 def _format(path: Path) -> str:
     """The file's format by its suffix; InputError where trimesh has no mesh reader for it."""
-    known = sorted(set(trimesh.available_formats()) - _ARCHIVES)
     kind = path.suffix.lower().removeprefix(".")
+    if kind == "ply":
+        return kind
+    import trimesh
+
+    known = sorted(set(trimesh.available_formats()) - _ARCHIVES)
     if kind not in known:
         raise InputError(
             f"'{path.suffix}' is no mesh format that can be read",
@@ -117,6 +151,11 @@ def _albedo(mesh: Any) -> NDArray[np.float32] | None:
     """(n,) relative luminance of the vertex colours (sRGB, IEC 61966-2-1), None where there are none."""
     if getattr(mesh.visual, "kind", None) != "vertex":
         return None
-    colour = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0
+    return _luminance(np.asarray(mesh.visual.vertex_colors)[:, :3])
+
+
+def _luminance(colours: NDArray[np.integer]) -> NDArray[np.float32]:
+    """(n,) relative luminance of (n, 3) sRGB colours of 8 bits."""
+    colour = colours / 255.0
     linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
     return np.einsum("nc,c->n", linear, _LUMINANCE).astype(np.float32)

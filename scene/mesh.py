@@ -34,7 +34,7 @@ class TriangleMesh:
     @property
     def bounds(self) -> FloatArray:
         """(2, 3) smallest and largest coordinates, m."""
-        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        return np.array([[column.min() for column in self.vertices.T], [column.max() for column in self.vertices.T]])
 
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
         """The same triangles over moved vertices."""

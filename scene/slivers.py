@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from scene.mesh import FloatArray, IntArray
 from scene.solid import boundary, prism_volumes
@@ -105,6 +104,8 @@ def mend(vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[n
 
 def _gain(vertices: FloatArray, before: IntArray, label: IntArray, after: IntArray, count: int) -> FloatArray:
     """(count,) the volume that each connected part of a surface has gained, under the largest label in it."""
+    from scipy import sparse
+
     used, number = np.unique(before, return_inverse=True)
     number = number.reshape(-1, 3)
     links = np.concatenate([number[:, :2], number[:, 1:]]).T

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from manifold3d import Error, Manifold, Mesh64
 from numpy.typing import NDArray
-from scipy import sparse
 
 from scene.errors import InputError
 from scene.mesh import FloatArray, IntArray, TriangleMesh
@@ -130,6 +129,8 @@ def _closed(vertices: FloatArray, faces: IntArray, start: IntArray, end: IntArra
 
 def _apexes(low: FloatArray, start: IntArray, end: IntArray) -> tuple[IntArray, FloatArray]:
     """The loop that each edge start -> end belongs to, and for each loop a point below its middle."""
+    from scipy import sparse
+
     graph = sparse.coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(low), len(low)))
     count, loop = sparse.csgraph.connected_components(graph, directed=False)
     size = np.bincount(loop, minlength=count)
@@ -139,6 +140,8 @@ def _apexes(low: FloatArray, start: IntArray, end: IntArray) -> tuple[IntArray, 
 
 def _split_pinched(vertices: FloatArray, faces: IntArray, pinched: NDArray[np.bool_]) -> tuple[FloatArray, IntArray]:
     """Give each fan of faces around a vertex where several boundary loops meet a vertex of its own."""
+    from scipy import sparse
+
     face, corner = np.nonzero(pinched[faces])
     centre = faces[face, corner].astype(np.int64)
     spokes = [centre << 32 | faces[face, (corner + step) % 3] for step in (1, 2)]

@@ -100,3 +100,11 @@ def test_help_loads_nothing_heavy(words: list[str]) -> None:
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
     assert "example:" in result.stdout
     assert set(HEAVY) & set(result.stderr.split()) == set()
+
+
+def test_reading_a_config_loads_none_of_the_slow_libraries() -> None:
+    """What a step alone needs is imported by that step; scipy and trimesh together would take longer than all the rest."""
+    program = "import sys, pipeline.config, pipeline.site; print(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
+    slow = {"scipy", "trimesh", "open3d", "matplotlib", "laspy", "pycocotools", "tensorflow"}
+    assert slow & set(result.stdout.split()) == set()

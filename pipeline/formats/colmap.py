@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from pipeline.formats.atomic import write_bytes, write_text
 from pipeline.formats.opencv import OpencvInterior, shared_distortion
@@ -40,6 +39,8 @@ def read_colmap(folder: Path) -> dict[str, Camera]:
 
     Raises InputError for a missing or malformed file, and for a camera model or parameter that ours does not have.
     """
+    from scipy.spatial.transform import Rotation
+
     interiors = {words[0]: (words, where) for words, where in _records(folder / "cameras.txt", 5, 1)}
     cameras = {}
     for words, where in _records(folder / "images.txt", 10, 2):
@@ -59,6 +60,8 @@ def write_colmap(folder: Path, cameras: Mapping[str, Camera], points: FloatArray
     COLMAP's fusion looks for overlapping images by the points that they share, so it needs some. Raises InputError where COLMAP
     has no camera model with a parameter that is not zero (b2, k4).
     """
+    from scipy.spatial.transform import Rotation
+
     points = np.zeros((0, 3)) if points is None else points
     interiors, images, track = [], [], []
     for number, (name, camera) in enumerate(cameras.items(), start=1):

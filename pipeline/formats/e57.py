@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pye57 import libe57
-from scipy.spatial.transform import Rotation
 
 from pipeline.formats.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
@@ -137,6 +136,8 @@ def _points(columns: dict[str, NDArray[Any]]) -> FloatArray:
 
 
 def _pose(node: Any) -> tuple[FloatArray, FloatArray]:
+    from scipy.spatial.transform import Rotation
+
     if not node.isDefined("pose"):
         return np.zeros(3), np.eye(3)
     pose = node["pose"]
@@ -168,6 +169,8 @@ def _write_header(image: Any) -> Any:
 
 
 def _write_scan(image: Any, data: Any, scan: E57Scan, number: int) -> None:
+    from scipy.spatial.transform import Rotation
+
     columns = _columns(scan.cloud)
     node = libe57.StructureNode(image)
     node.set("guid", libe57.StringNode(image, f"{{{uuid.uuid5(_GUIDS, f'{number} {scan.name}')}}}"))

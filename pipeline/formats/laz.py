@@ -152,7 +152,7 @@ def _quantisation(points: FloatArray, scale_m: float) -> tuple[FloatArray, Float
     """(3,) scales and (3,) offsets, m, with which the coordinates fit int32."""
     if len(points) == 0:
         return np.full(3, scale_m), np.zeros(3)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = (np.array([extreme(column) for column in points.T]) for extreme in (np.min, np.max))
     if not np.isfinite(low + high).all():
         raise ValueError("points must be finite: leave out those without a return")
     offsets = np.rint((low + high) / 2)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,19 +13,12 @@ from pipeline.formats.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import TriangleMesh
+from scene.ply import Columns, read_elements
 
 _CHUNK = 1_000_000
 """Records in memory at a time while writing."""
-_LONGEST_HEADER = 65536
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
-    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
-}  # fmt: skip
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
-_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _FACE_LISTS = ("vertex_indices", "vertex_index")
-
-Columns = Mapping[str, NDArray[Any]]
 
 
 def write_ply(path: Path, mesh: TriangleMesh) -> None:
@@ -38,8 +29,13 @@ def write_ply(path: Path, mesh: TriangleMesh) -> None:
 
 
 def write_ply_points(path: Path, cloud: PointCloud) -> None:
-    """Write a point cloud: x, y, z as double, the other channels in the type they have."""
-    _write(path, {"vertex": _xyz(cloud.points) | _present(intensity=cloud.intensity, gps_time=cloud.gps_time) | cloud.extra})
+    """Write a point cloud: x, y, z as double, the other channels in the type they have, or PLY's nearest (`_storable`).
+
+    Raises InputError for a channel that no type of PLY holds without loss.
+    """
+    channels = _present(intensity=cloud.intensity, gps_time=cloud.gps_time) | cloud.extra
+    stored = {name: _storable(column, f"{path}: {name}") for name, column in channels.items()}
+    _write(path, {"vertex": _xyz(cloud.points) | stored})
 
 
 def read_ply(path: Path) -> TriangleMesh:
@@ -47,7 +43,7 @@ def read_ply(path: Path) -> TriangleMesh:
 
     Raises InputError for a missing or damaged file, faces that are not triangles and indices of vertices that are not there.
     """
-    elements = _read(path)
+    elements = read_elements(path)
     vertex, face = elements.get("vertex"), elements.get("face")
     if vertex is None or face is None:
         raise InputError("holds no mesh, only points" if face is None else "holds no vertices", where=str(path))
@@ -68,7 +64,7 @@ def read_ply(path: Path) -> TriangleMesh:
 
 def read_ply_points(path: Path) -> PointCloud:
     """Read the vertices of any PLY file with all their scalar properties; raises InputError for a missing or damaged file."""
-    vertex = _read(path, only="vertex").get("vertex")
+    vertex = read_elements(path, only="vertex").get("vertex")
     if vertex is None:
         raise InputError("holds no vertices", where=str(path))
     names = [name for name in vertex if name not in ("x", "y", "z") and vertex[name].ndim == 1]
@@ -107,6 +103,18 @@ def _native(column: NDArray[Any]) -> NDArray[Any]:
     return np.array(column, dtype=column.dtype.newbyteorder("="))
 
 
+def _storable(column: NDArray[Any], where: str) -> NDArray[Any]:
+    """The column in a type that PLY has: no truth values, no integers of 64 bits, floats of 32 and 64 bits only."""
+    if column.dtype.str[1:] in _NAMES:
+        return column
+    for kind in {"b": ("u1",), "f": ("f4", "f8")}.get(column.dtype.kind, ("i4", "u4", "f8")):
+        with np.errstate(over="ignore"):
+            stored = column.astype(kind)
+        if np.array_equal(stored.astype(column.dtype), column, equal_nan=column.dtype.kind == "f"):
+            return stored
+    raise InputError(f"values of the type {column.dtype} do not fit any type of PLY", where=where, remedy="write LAZ instead")
+
+
 def _write(path: Path, elements: Mapping[str, Columns]) -> None:
     """Write elements; a column (n,) is a scalar property, (n, k) a list of k with a uchar count."""
     with writing(path) as temporary, temporary.open("wb") as file:
@@ -143,133 +151,3 @@ def _record_type(columns: Columns) -> np.dtype[Any]:
         kind = f"<{column.dtype.str[1:]}"
         fields += [(f"count {name}", "u1"), (name, kind, column.shape[1:])] if column.ndim == 2 else [(name, kind)]
     return np.dtype(fields)
-
-
-@dataclass
-class _Element:
-    """One element of a header. properties: name to (type of the value, type of the list's count or "")."""
-
-    name: str
-    count: int
-    properties: dict[str, tuple[str, str]] = field(default_factory=dict)
-
-
-def _read(path: Path, only: str = "") -> dict[str, Columns]:
-    """The elements of a file, up to the one called `only`."""
-    try:
-        with path.open("rb") as file:
-            order, elements = _header(file)
-            wanted = itertools.islice(elements, _last(elements, only))
-            return {element.name: _columns(file, element, order) for element in wanted}
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except (ValueError, IndexError, KeyError, OverflowError) as error:
-        raise InputError(f"is not a whole PLY file ({error})", where=str(path), remedy="export it again") from None
-
-
-def _last(elements: list[_Element], only: str) -> int:
-    return next((index + 1 for index, element in enumerate(elements) if element.name == only), len(elements))
-
-
-def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
-    """Byte order ("" for ASCII) and elements; leaves the file at the first byte of the data."""
-    elements: list[_Element] = []
-    order = None
-    for words in _header_lines(file):
-        match words:
-            case ["format", kind, "1.0"]:
-                order = _ORDERS[kind]
-            case ["element", name, count]:
-                elements.append(_Element(name, int(count)))
-            case ["property", "list", counter, kind, name]:
-                elements[-1].properties[name] = (_TYPES[kind], _TYPES[counter])
-            case ["property", kind, name]:
-                elements[-1].properties[name] = (_TYPES[kind], "")
-            case ["comment" | "obj_info", *_] | []:
-                pass
-            case _:
-                raise ValueError(f"header line '{' '.join(words)[:80]}'")
-    if order is None or any(element.count < 0 for element in elements):
-        raise ValueError("the header names no format" if order is None else "a negative count")
-    return order, elements
-
-
-def _header_lines(file: BinaryIO) -> Iterator[list[str]]:
-    if file.readline(16).strip() != b"ply":
-        raise ValueError("it does not begin with 'ply'")
-    while (line := file.readline(_LONGEST_HEADER)).strip() != b"end_header":
-        if not line.endswith(b"\n") or file.tell() > _LONGEST_HEADER:
-            raise ValueError("the header has no end")
-        yield line.decode("ascii", errors="replace").split()
-
-
-def _columns(file: BinaryIO, element: _Element, order: str) -> Columns:
-    """Read one element, views of one array of records; lists must have one length throughout. Leaves the file after it."""
-    if not element.count or not element.properties:
-        return {name: np.empty((0, 3) if counter else 0, kind) for name, (kind, counter) in element.properties.items()}
-    rows = _binary_rows(file, element, order) if order else _ascii_rows(file, element)
-    for name, (_, counter) in element.properties.items():
-        if counter and np.any(rows[f"count {name}"] != rows[name].shape[1]):
-            raise ValueError(f"{element.name} lists of different lengths, only triangles can be read")
-    return {name: rows[name] for name in element.properties}
-
-
-def _binary_rows(file: BinaryIO, element: _Element, order: str) -> NDArray[Any]:
-    record = np.dtype(_fields(element, order, _binary_lengths(file, element, order)))
-    left = _size(file) - file.tell()
-    if element.count * record.itemsize > left:
-        raise ValueError(f"{element.count:,} {element.name} records of {record.itemsize} bytes, {left:,} bytes are left")
-    return np.fromfile(file, dtype=record, count=element.count)
-
-
-def _binary_lengths(file: BinaryIO, element: _Element, order: str) -> dict[str, int]:
-    """Length of each list in the first record; the file stays where it is."""
-    start, lengths = file.tell(), {}
-    for name, (kind, counter) in element.properties.items():
-        if counter:
-            lengths[name] = int(np.frombuffer(file.read(np.dtype(counter).itemsize), dtype=order + counter)[0])
-        file.seek(lengths.get(name, 1) * np.dtype(kind).itemsize, 1)
-    file.seek(start)
-    return lengths
-
-
-def _fields(element: _Element, order: str, lengths: Mapping[str, int]) -> list[Any]:
-    fields: list[Any] = []
-    for name, (kind, counter) in element.properties.items():
-        if counter:
-            fields += [(f"count {name}", order + counter), (name, order + kind, (lengths[name],))]
-        else:
-            fields.append((name, order + kind))
-    return fields
-
-
-def _ascii_rows(file: BinaryIO, element: _Element) -> NDArray[Any]:
-    table = np.loadtxt(itertools.islice(file, element.count), ndmin=2, comments=None, encoding="ascii")
-    if len(table) < element.count:
-        raise ValueError(f"{len(table):,} of {element.count:,} {element.name} lines")
-    lengths, column = {}, 0
-    for name, (_, counter) in element.properties.items():
-        if counter:
-            lengths[name] = int(table[0, column])
-        column += lengths.get(name, 0) + 1
-    rows = np.empty(len(table), dtype=_fields(element, "<", lengths))
-    return _filled(rows, table)
-
-
-def _filled(rows: NDArray[Any], table: NDArray[np.float64]) -> NDArray[Any]:
-    """Fill records field by field from the columns of an ASCII table; raises ValueError where there are too few or too many."""
-    column = 0
-    for name in rows.dtype.names or ():
-        width = rows[name].shape[1] if rows[name].ndim == 2 else 1
-        rows[name] = table[:, column : column + width] if rows[name].ndim == 2 else table[:, column]
-        column += width
-    if column != table.shape[1]:
-        raise ValueError(f"{table.shape[1]} numbers a line, {column} properties")
-    return rows
-
-
-def _size(file: BinaryIO) -> int:
-    here = file.tell()
-    size = file.seek(0, 2)
-    file.seek(here)
-    return size

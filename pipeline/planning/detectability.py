@@ -44,8 +44,6 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field
-from scipy.integrate import cumulative_trapezoid
-from scipy.special import erf, ndtr
 
 from scene.config import Config
 from scene.mesh import FloatArray
@@ -159,6 +157,8 @@ def _lines(steps: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, Float
 
 def _hit(width: FloatArray, blur: FloatArray | float) -> FloatArray:
     """The share f_a of the points recorded in a width that really lie in it (step 3 of the module)."""
+    from scipy.special import erf
+
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.maximum(width / (np.sqrt(2) * blur), 1e-9)
         share = erf(ratio) - (1 - np.exp(-(ratio**2))) / (ratio * np.sqrt(np.pi))
@@ -169,6 +169,8 @@ def _exceeds(
     change: FloatArray, points: FloatArray, white: FloatArray, spread: FloatArray, kept: FloatArray, config: PlanningConfig
 ) -> FloatArray:
     """P(detected | N_1, N_2), step 4 of the module; points, white, spread: (2, n) before and after; the latter and kept: m2."""
+    from scipy.special import ndtr
+
     z, registration, number = config.critical_value, config.registration_sigma_m, np.maximum(points, 2.0)
     squared = spread / number
     error = np.maximum(squared.sum(axis=0), 1e-24)  # without noise a step function
@@ -193,9 +195,14 @@ def _averaging() -> tuple[FloatArray, FloatArray]:
     """
     t = np.linspace(0, 2, 4001)
     covariance = np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, (2 - t) ** 3 / 6)
-    first, second = (cumulative_trapezoid(covariance * weight, t, initial=0) for weight in (1.0, t))
+    first, second = (_integral(covariance * weight, t) for weight in (1.0, t))
     widths = np.linspace(0, 40, 4001)
     reach = np.minimum(widths, 2)
     integral = np.interp(reach, t, first) - np.interp(reach, t, second) / np.maximum(widths, 1e-9)
     share = np.where(widths > 1e-6, 2 * integral / np.maximum(widths, 1e-9), 2 / 3) * 1.5
     return widths, share
+
+
+def _integral(values: FloatArray, t: FloatArray) -> FloatArray:
+    """The integral of `values` from the first `t` to each, by the trapezoidal rule."""
+    return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])

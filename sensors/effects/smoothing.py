@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -32,6 +31,8 @@ class Smoothing(Effect):
 
 def smoothed(disparity: FloatArray, sigma: float) -> FloatArray:
     """(rows, columns) disparities, px, NaN where unmatched, low-passed with `sigma` cells over the matched ones."""
+    from scipy.ndimage import gaussian_filter
+
     matched = ~np.isnan(disparity)
     total = gaussian_filter(np.where(matched, disparity, 0.0), sigma, mode="constant")
     weight = gaussian_filter(matched.astype(np.float64), sigma, mode="constant")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.formats.e57 import E57Scan, read_e57, write_e57
 from pipeline.formats.laz import read_laz, write_laz
-from pipeline.formats.ply import write_ply_points
+from pipeline.formats.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import SUFFIXES, read_points
 from pipeline.formats.xyz import read_xyz, write_xyz
@@ -262,3 +262,27 @@ def test_other_suffixes_are_refused_with_the_known_ones(tmp_path: Path) -> None:
 def test_a_missing_file_is_named(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(InputError, match=f"nowhere{suffix}: "):
         read_points(tmp_path / f"nowhere{suffix}")
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [
+        (np.array([-5, 7, 2**31 - 1]), np.int32),
+        (np.array([0, 3, 2**32 - 1], dtype=np.uint64), np.uint32),
+        (np.array([0, 3, 2**52 + 1]), np.float64),
+        (np.array([True, False, True]), np.uint8),
+        (np.array([0.5, np.nan, -2.0], dtype=np.float16), np.float32),
+    ],
+)
+def test_ply_stores_other_types_without_loss(tmp_path: Path, values: Any, kind: Any) -> None:
+    write_ply_points(tmp_path / "a.ply", PointCloud(np.zeros((3, 3)), extra={"label": values}))
+    found = read_ply_points(tmp_path / "a.ply").extra["label"]
+    assert found.dtype == kind
+    np.testing.assert_array_equal(found.astype(values.dtype), values)
+
+
+def test_a_number_that_no_type_of_ply_holds_is_an_error(tmp_path: Path) -> None:
+    labels = np.array([2**62 + 1, 0])
+    with pytest.raises(InputError, match=r"a.ply: label: .*int64"):
+        write_ply_points(tmp_path / "a.ply", PointCloud(np.zeros((2, 3)), extra={"label": labels}))
+    assert not list(tmp_path.iterdir())

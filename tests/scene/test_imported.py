@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from scene.cleaning import clean, unique_rows, weld
+from scene.cleaning import clean, groups, unique_rows, weld
 from scene.errors import InputError
 from scene.imported import ImportedWall
 from scene.keyed_random import KeyedRandom
@@ -310,3 +312,55 @@ def test_a_one_sided_surface_is_refused():
     faces = np.concatenate([np.stack([near, far, next_near], 1), np.stack([far, next_far, next_near], 1)]).astype(np.int32)
     with pytest.raises(InputError, match="only one side"):
         clean(TriangleMesh(vertices, faces), "strip")
+
+
+@pytest.mark.parametrize("more", ["", "colours", "signed colours", "quads", "ascii"])
+def test_a_ply_file_gives_the_same_wall_as_trimesh_reads(tmp_path, more):
+    """Files that hold triangles alone are read without trimesh, the others by it."""
+    sheet_mesh = sheet()
+    if more == "quads":
+        path = tmp_path / "wall.ply"
+        path.write_text(
+            "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+            "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+            "0 0 0\n4 0 0\n4 0 4\n0 0 4\n2 0 6\n4 0 1 2 3\n3 3 2 4\n"
+        )
+    elif more == "ascii":
+        path = tmp_path / "wall.ply"
+        rows = [f"{x!r} {y!r} {z!r}" for x, y, z in sheet_mesh.vertices.tolist()]
+        rows += [f"3 {a} {b} {c}" for a, b, c in sheet_mesh.faces.tolist()]
+        path.write_text(
+            f"ply\nformat ascii 1.0\nelement vertex {len(sheet_mesh.vertices)}\nproperty double x\nproperty double y\n"
+            f"property double z\nelement face {len(sheet_mesh.faces)}\nproperty list uchar int vertex_index\nend_header\n"
+            + "\n".join(rows)
+        )
+    else:
+        colours = np.random.default_rng(1).integers(0, 255, (len(sheet_mesh.vertices), 3)) if "colours" in more else None
+        path = written(tmp_path / "wall.ply", sheet_mesh, colours)
+        if more == "signed colours":
+            path.write_bytes(path.read_bytes().replace(b"uchar red", b"char red"))
+    expected = trimesh.load(path, process=False)
+    found, _ = load(path)
+    np.testing.assert_array_equal(found.faces, expected.faces)
+    np.testing.assert_allclose(found.vertices, expected.vertices, atol=1e-12)
+    coloured = expected.visual.kind == "vertex"
+    assert (found.vertex_albedo is not None) == coloured
+    if coloured:
+        grey = np.asarray(expected.visual.vertex_colors)[:, :3] / 255.0
+        linear = np.where(grey <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
+        np.testing.assert_allclose(found.vertex_albedo, linear @ [0.2126, 0.7152, 0.0722], rtol=1e-5)
+
+
+def test_the_pieces_of_a_surface_are_those_that_scipy_finds():
+    """Random graphs of some dozen pieces, shuffled, and a long chain in the worst order; numbered by first appearance."""
+    random = np.random.default_rng(2)
+    chain = random.permutation(5000)
+    cases = [
+        (random.integers(0, 3000, (2500, 2)), 3000),
+        (np.stack([chain[:-1], chain[1:]], axis=1), 5000),
+        (np.empty((0, 2), int), 4),
+    ]
+    for pairs, count in cases:
+        graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+        expected = connected_components(graph, directed=False)[1]
+        np.testing.assert_array_equal(groups(pairs, count), expected)
