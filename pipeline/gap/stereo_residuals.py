@@ -147,7 +147,7 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
     whole = Residuals(
         sensor="stereo",
         value=measured - geometry.disparity - mean,
-        sigma=np.full(len(u), np.sqrt(_variance(model))),
+        sigma=np.full(len(u), np.sqrt(predicted_variance(model))),
         unit_m=1 / slope,
         smooth=hit & (curvature < _EDGE_PX),
         pose=_pose(nominal, geometry),
@@ -239,7 +239,7 @@ def _mean_error(nominal: NominalPair, model: StereoModel, geometry: StereoGeomet
     return seen_disparity(nominal, real, geometry) - plain + exposure_and_locking(model.effects, geometry)
 
 
-def _variance(model: StereoModel) -> float:
+def predicted_variance(model: StereoModel) -> float:
     """Variance of a disparity that the model predicts, px^2, on average over the grid of the regularization."""
     noise = model.noise
     total = noise.parallax_sigma_px**2 + _REGULARIZATION_SHARE * noise.regularization_sigma_px**2
