@@ -288,6 +288,7 @@ def _max_pooled(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
 
 
 def png_bytes(figure: Figure) -> bytes:
+    """The figure as a PNG file; equal figures give equal bytes."""
     """The figure as a PNG file that holds no date or version."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
