@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -15,6 +15,7 @@ from scene.frame import WallFrame
 from scene.illumination import IlluminationConfig
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, TriangleMesh
+from scene.procedural import ProceduralWall
 from scene.raycast import RayCaster
 from scene.texture import TextureConfig
 from sensors.camera import CameraPair
@@ -81,10 +82,15 @@ def robust_sigma(error: FloatArray) -> float:
 
 def locking(compared: Compared) -> float:
     """Amplitude of the sine of the disparity's fraction in the errors, by least squares, px."""
-    inlier = np.abs(compared.error) < 0.5
-    phase = 2 * np.pi * compared.disparity[inlier]
+    return amplitude(compared.error, compared.disparity)
+
+
+def amplitude(error: FloatArray, disparity: FloatArray) -> float:
+    """As `locking`, of errors (n,) at true disparities (n,), px."""
+    inlier = np.abs(error) < 0.5
+    phase = 2 * np.pi * disparity[inlier]
     design = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=1)
-    _, sine, cosine = np.linalg.lstsq(design, compared.error[inlier])[0]
+    _, sine, cosine = np.linalg.lstsq(design, error[inlier])[0]
     return float(np.hypot(sine, cosine))
 
 
@@ -97,6 +103,33 @@ def test_a_tilted_plane_comes_back_and_refinement_takes_out_the_locking() -> Non
     assert (np.abs(fine.error) > 1).mean() < 1e-3
     assert locking(coarse) > 0.08
     assert locking(fine) < 0.03
+
+
+def test_refinement_adds_no_outliers_on_rough_rock() -> None:
+    """On the cells that both give, fewer errors beyond 1 px and a smaller scatter than SGBM's own, without its locking.
+
+    Measured: 4.0 % beyond 1 px after SGBM's 4.4 %, robust sigma 0.25 after 0.31, locking 0.006 after 0.068 px.
+    """
+    world = ProceduralWall(style="glendale", width_m=10.0, height_m=6.5, resolution_m=0.03, seed=5).mesh(KeyedRandom(1))
+    pair = RigConfig(distance_m=50.0, base_m=13.0, width=2400, height=1600).place(Target(world))
+    frame = WallFrame.fit(world.vertices, pair.left.position)
+    caster = RayCaster(world.with_vertices(frame.to_wall(world.vertices)))
+    quiet = replace(sensor().pair, cameras=pair, frame=frame)
+    real = [replace(sensor(refinement=refinement), pair=quiet) for refinement in (None, {})]
+    nominal = pair.in_wall_frame(frame)
+    geometry = rectify(nominal)
+
+    def cells(observation: Observation) -> FloatArray:
+        depth = (observation.points - nominal.left.position) @ nominal.left.rotation @ geometry.left.T[:, 2]
+        return (geometry.f * geometry.base_m / depth + geometry.offset) / STEP
+
+    true, coarse, fine = (cells(one.observe(caster, KeyedRandom(1))) for one in (quiet, *real))
+    both = ~np.isnan(true + coarse + fine)
+    assert both.sum() > 0.9 * np.isfinite(true).sum()
+    before, after = coarse[both] - true[both], fine[both] - true[both]
+    assert (np.abs(after) > 1).mean() < (np.abs(before) > 1).mean()
+    assert robust_sigma(after) < 0.9 * robust_sigma(before)
+    assert amplitude(after, true[both]) < 0.02 < 0.03 < amplitude(before, true[both])
 
 
 def test_a_sphere_comes_back_where_it_does_not_turn_away() -> None:
