@@ -14,7 +14,7 @@ import traceback
 from importlib import metadata
 from typing import Protocol
 
-from pipeline.cli import doctor, gap, init, inspect
+from pipeline.cli import dataset, doctor, gap, init, inspect
 from pipeline.cli import simulate as simulate_command
 from pipeline.cli.parser import Parser
 from scene.errors import InputError, nearest
@@ -42,7 +42,14 @@ class Command(Protocol):
         ...
 
 
-COMMANDS: dict[str, Command] = {"simulate": simulate_command, "inspect": inspect, "gap": gap, "init": init, "doctor": doctor}
+COMMANDS: dict[str, Command] = {
+    "simulate": simulate_command,
+    "inspect": inspect,
+    "dataset": dataset,
+    "gap": gap,
+    "init": init,
+    "doctor": doctor,
+}
 
 
 def main(argv: list[str] | None = None) -> int:

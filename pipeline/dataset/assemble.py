@@ -1,0 +1,180 @@
+"""From the shards to what people open: annotations.json of each split, the card, the checksums. One shard in memory at a time.
+
+All that is written here depends on the shards and dataset.json alone, so that an interrupted set ends in the bytes of an
+undisturbed one.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+from pipeline.annotate import BLOCK_CATEGORY
+from pipeline.dataset.card import write_card
+from pipeline.dataset.folder import (
+    CHECKSUMS,
+    SHARDS,
+    Damage,
+    Record,
+    read_dataset_file,
+    read_shard,
+    sha256,
+    shard_name,
+    tile_files,
+)
+from pipeline.dataset.plan import SPLITS, Split
+from pipeline.dataset.statistics import SetStatistics
+from pipeline.formats.atomic import write_text, writing
+
+ANNOTATIONS = "annotations.json"
+
+
+@dataclass
+class Assembled:
+    """How much a set holds, by split."""
+
+    images: dict[str, int] = field(default_factory=dict)
+    annotations: dict[str, int] = field(default_factory=dict)
+
+
+def assemble(folder: Path, *, complete: bool) -> Assembled:
+    """Write annotations.json of each split, the card and the checksums of a set whose shards are there.
+
+    complete=False: put together those that are, of an interrupted set. Image and annotation ids count from 1 through train, val
+    and test, so that no two of a set are the same.
+    """
+    dataset = read_dataset_file(folder)
+    statistics = SetStatistics()
+    digests: dict[str, str] = {}
+    writer = _Ids()
+    result = Assembled()
+    for split in SPLITS:
+        records = (record for record in shards(folder, dataset) if record["epoch"]["split"] == split)
+        first = next(records, None)
+        if first is None:
+            continue
+        path = folder / split / ANNOTATIONS
+        before = (writer.image, writer.annotation)
+        with writing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+            _write_coco(file, _info(dataset, split, complete), _chained(first, records), writer, statistics, digests)
+        result.images[split], result.annotations[split] = writer.image - before[0], writer.annotation - before[1]
+        digests[f"{split}/{ANNOTATIONS}"] = sha256(path)
+    for name in write_card(folder, dataset, statistics, digests, complete=complete):
+        digests[name] = sha256(folder / name)
+    for record_name in _shard_names(dataset):
+        if (folder / SHARDS / record_name).exists():
+            digests[f"{SHARDS}/{record_name}"] = sha256(folder / SHARDS / record_name)
+    write_text(folder / CHECKSUMS, "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items())))
+    return result
+
+
+def shards(folder: Path, dataset: Record) -> Iterator[Record]:
+    """The epochs' records that are there, in the order of the plan."""
+    for name in _shard_names(dataset):
+        record = read_shard(folder, name)
+        if record is not None:
+            yield record
+
+
+def assembled_damages(folder: Path) -> list[Damage]:
+    """What is missing or damaged of the files that `assemble` writes."""
+    path = folder / CHECKSUMS
+    if not path.exists():
+        return [Damage(Path(CHECKSUMS), "missing")]
+    found = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        digest, _, name = line.partition("  ")
+        if name.endswith(".tif") or name.startswith(SHARDS):  # the shards know their tiles, and themselves
+            continue
+        if not name or not (folder / name).is_file():
+            found.append(Damage(Path(name or CHECKSUMS), "missing" if name else "damaged"))
+        elif sha256(folder / name) != digest:
+            found.append(Damage(Path(name), "damaged"))
+    return found
+
+
+@dataclass
+class _Ids:
+    """The last ids given."""
+
+    image: int = 0
+    annotation: int = 0
+
+
+def _shard_names(dataset: Record) -> Iterator[str]:
+    for source, indices in dataset["epochs"].items():
+        yield from (shard_name(source, index) for index in indices)
+
+
+def _chained(first: Record, rest: Iterator[Record]) -> Iterator[Record]:
+    yield first
+    yield from rest
+
+
+def _info(dataset: Record, split: Split, complete: bool) -> dict[str, Any]:
+    return {
+        "description": f"Rockfall blocks in difference maps: {dataset['name']}, {split}",
+        "version": dataset["fingerprint"],
+        "contributor": "scarpsim",
+        "unit": "m, reference minus epoch; missing rock is positive; NaN is no data",
+        "complete": complete,
+    }
+
+
+def _write_coco(
+    file: TextIO,
+    info: dict[str, Any],
+    records: Iterator[Record],
+    ids: _Ids,
+    statistics: SetStatistics,
+    digests: dict[str, str],
+) -> None:
+    """Stream a split: the annotations as they come, then the images."""
+    head = {"info": info, "licenses": [], "categories": [BLOCK_CATEGORY]}
+    file.write(_compact(head)[:-1] + ',"annotations":[')
+    images = []
+    separator = "\n"
+    for record in records:
+        statistics.add(record)
+        digests.update({str(name): digest for name, digest in tile_files(record)})
+        for tile in record["tiles"]:
+            ids.image += 1
+            images.append(_compact(_image(record, tile, ids.image)))
+            for annotation in tile["annotations"]:
+                ids.annotation += 1
+                entry = {"id": ids.annotation, "image_id": ids.image, **annotation, **_cell(record)}
+                file.write(separator + _compact(entry))
+                separator = ",\n"
+    file.write('],"images":[\n' + ",\n".join(images) + "]}\n")
+
+
+def _image(record: Record, tile: Record, number: int) -> dict[str, Any]:
+    return {
+        "id": number,
+        **tile["image"],
+        **_cell(record),
+        "reference": record["epoch"]["reference"],
+        "noise_sigma_m": record["outside_blocks"]["standard_deviation_m"],
+        "sha256": tile["sha256"],
+    }
+
+
+def _cell(record: Record) -> dict[str, Any]:
+    """What images and annotations say of where they come from."""
+    epoch = record["epoch"]
+    return {
+        "sensor": epoch["sensor"],
+        "wall": epoch["wall"],
+        "noise": epoch["noise"],
+        "size_class": epoch["size"],
+        "seed": record["seed"],
+        "source": record["source"],
+        "epoch": epoch["index"],
+    }
+
+
+def _compact(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, separators=(",", ":"))

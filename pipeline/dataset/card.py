@@ -1,0 +1,154 @@
+"""The data set card: README.md of the folder and its pictures. The same set gives the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.dataset.plan import SPLITS
+from pipeline.dataset.statistics import SIZE_EDGES_M, SetStatistics
+from pipeline.formats.atomic import write_bytes, write_text
+
+README, CARD = "README.md", "card"
+_LOADING = """## Loading
+
+The folder of a split is the folder of its images; `file_name` is relative to it.
+
+    from pycocotools.coco import COCO                       # pycocotools
+    coco = COCO("train/annotations.json")
+
+    from torchvision.datasets import CocoDetection          # torchvision; its own loader makes 8-bit RGB, which loses the metres:
+    class Tiles(CocoDetection):
+        def _load_image(self, id):
+            path = os.path.join(self.root, self.coco.loadImgs(id)[0]["file_name"])
+            return torch.from_numpy(tifffile.imread(path))[None]
+    tiles = Tiles("train", "train/annotations.json")
+
+    import fiftyone as fo                                   # FiftyOne
+    fo.Dataset.from_dir(dataset_type=fo.types.COCODetectionDataset, data_path="train", labels_path="train/annotations.json")
+
+    from pipeline.dataset.loaders import Tiles              # scarpsim: NumPy and tf.data
+    for sample in Tiles("train", noise="low"): ...          # sample.image (h, w), sample.valid, sample.boxes, sample.masks
+    Tiles("train").tf_dataset().shuffle(100).prefetch(2)
+"""
+_TILES = """## A tile
+
+Float32 TIFF, one band: reference minus epoch in metres, missing rock positive, NaN where there is no data. A second page is the
+validity mask (a TIFF transparency mask of one bit a pixel: `rasterio.open(f).dataset_mask()`, page 1 in tifffile). Tie point and
+pixel scale give its place on the wall in the wall frame (x along the wall, y up the wall, metres), as do `x_min_m`, `y_max_m` and
+`gsd_m` of the image's entry; `row` and `column` are its first pixel in the epoch's difference map.
+
+An annotation has beside COCO's keys: `size_m` (the block's three axes), `volume_m3` (rock removed), `measured_volume_m3` and
+`depth_m` (volume and mean depth that the epoch's map shows of the whole block), `share_in_tile` (of the block's pixels; less
+than 1 where the tile's edge cuts it), `shape`, `sensor`, `wall`, `noise`, `size_class`, `seed`, `epoch` (index in the plan),
+`source`.
+"""
+
+
+def write_card(
+    folder: Path, dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str], *, complete: bool
+) -> list[str]:
+    """Write README.md and the pictures; digests: of the files so far, by name. Returns the names of what was written."""
+    from pipeline.report.dataset_figures import noise_figure, sizes_figure
+
+    pictures = {
+        f"{CARD}/sizes.png": sizes_figure(_sizes(statistics), SIZE_EDGES_M),
+        f"{CARD}/noise.png": noise_figure(_noise(statistics)),
+    }
+    pictures |= {f"{CARD}/samples_{sensor}.png": data for sensor, data in _samples(folder, statistics)}
+    for name, data in pictures.items():
+        write_bytes(folder / name, data)
+    write_text(folder / README, "\n".join(_readme(dataset, statistics, digests, list(pictures), complete)))
+    return [README, *pictures]
+
+
+def _readme(
+    dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str], pictures: list[str], complete: bool
+) -> Iterator[str]:
+    tiles = sum(cell.tiles for cell in statistics.cells.values())
+    annotations = sum(cell.annotations for cell in statistics.cells.values())
+    yield f"# {dataset['name']}\n"
+    if not complete:
+        yield "**Incomplete: an interrupted job. The command below goes on with it.**\n"
+    yield f"Simulated difference maps of rock walls with annotated rockfalls: {tiles:,} tiles, {annotations:,} annotations.\n"
+    yield from _table(statistics)
+    yield "Noise: mean over the epochs of the StD of the difference map outside the blocks.\n"
+    yield from (f"![{Path(name).stem}]({name})\n" for name in pictures)
+    yield "In the samples the colours end at six times the noise; black outlines are the annotated masks, grey is no data.\n"
+    yield from (_split_rules(dataset), _TILES, _LOADING)
+    yield from _making(dataset, statistics, digests)
+
+
+def _table(statistics: SetStatistics) -> Iterator[str]:
+    yield "| split | sensor | wall | noise | size | epochs | tiles | blocks a tile | noise, mm |"
+    yield "|---|---|---|---|---|---|---|---|---|"
+    for key in sorted(statistics.cells, key=lambda cell: (SPLITS.index(cell[0]), cell[1:])):
+        cell = statistics.cells[key]
+        noise = f"{1e3 * np.mean(cell.noise_m):.1f}" if cell.noise_m else "-"
+        figures = f"{len(cell.noise_m)} | {cell.tiles} | {cell.annotations / max(cell.tiles, 1):.1f} | {noise}"
+        yield f"| {' | '.join(key)} | {figures} |"
+    yield ""
+
+
+def _split_rules(dataset: dict[str, Any]) -> str:
+    shares = {source["config"]["validation_region"] for source in dataset["sources"].values()}
+    told = ", ".join(f"{share:.0%}" for share in sorted(shares))
+    return (
+        "## Splits\n\nTraining and validation tiles come from different epochs, and from different parts of a wall: the right\n"
+        f"end of each wall ({told} of its columns of tiles) is for validation alone (0%: told by epoch only). No tile of one\n"
+        "overlaps a tile of the other. Test tiles come from epochs of their own, from the whole wall.\n"
+    )
+
+
+def _making(dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str]) -> Iterator[str]:
+    yield "## How it was made\n"
+    for name, source in dataset["sources"].items():
+        yield f"    {source['command'] or 'scarpsim dataset dataset.json --out DIR'}\n"
+        versions = ", ".join(f"{key} {value}" for key, value in source["versions"].items())
+        yield f"Source {name}, seed {source['config']['seed']}; {versions}.\n"
+    if len(dataset["sources"]) == 1:
+        yield "`scarpsim dataset dataset.json --out DIR` makes it again, to the byte; the resolved config is in dataset.json.\n"
+    yield "## Checksums\n"
+    yield "`sha256sum -c checksums.sha256` checks every file, `scarpsim dataset verify .` also makes damaged tiles again.\n"
+    listing = "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()) if name.endswith(".tif"))
+    yield "| what | SHA-256 |\n|---|---|"
+    yield f"| the list of all tiles | {hashlib.sha256(listing.encode()).hexdigest()} |"
+    yield from (f"| {name} | {digest} |" for name, digest in sorted(digests.items()) if name.endswith(".json"))
+    yield ""
+
+
+def _sizes(statistics: SetStatistics) -> dict[str, Any]:
+    names = dict.fromkeys(key[4] for key in statistics.cells)
+    return {name: sum(cell.sizes for key, cell in statistics.cells.items() if key[4] == name) for name in names}
+
+
+def _noise(statistics: SetStatistics) -> dict[str, list[float]]:
+    names = dict.fromkeys((key[1], key[3]) for key in statistics.cells)
+    return {
+        f"{sensor}, {noise}": [
+            value for key, cell in statistics.cells.items() if (key[1], key[3]) == (sensor, noise) for value in cell.noise_m
+        ]
+        for sensor, noise in names
+    }
+
+
+def _samples(folder: Path, statistics: SetStatistics) -> Iterator[tuple[str, bytes]]:
+    """A picture for each sensor: levels of noise down, classes of sizes across."""
+    from pipeline.dataset.loaders import masks_of
+    from pipeline.formats.geotiff import read_tiff
+    from pipeline.report.dataset_figures import SampleTile, samples_figure
+
+    def shown(key: tuple[str, str, str]) -> SampleTile:
+        sample = statistics.samples[key]
+        values = read_tiff(folder / sample.file)
+        masks = masks_of(sample.tile["annotations"], values.shape)
+        return SampleTile(f"{sample.cell[2]}, {key[1]}, {key[2]}", values, np.any(masks, axis=0, keepdims=False), sample.noise_m)
+
+    for sensor in dict.fromkeys(key[0] for key in statistics.samples):
+        levels = dict.fromkeys(key[1] for key in statistics.samples if key[0] == sensor)
+        rows = [[shown(key) for key in statistics.samples if key[:2] == (sensor, level)] for level in levels]
+        yield sensor, samples_figure(rows)

@@ -1,0 +1,76 @@
+"""The epochs of a set on Dask's distributed: local processes, or the scheduler at an address. Queue and retries are Dask's."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from pipeline.dataset.worker import Order, fill
+from scene.errors import InputError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_CONNECT_S = 20
+
+
+def fill_on_cluster(orders: list[Order], count: int, scheduler: str) -> Iterator[dict[str, Any]]:
+    """What each order took, in the order in which they are done; count: local workers, or scheduler: an address.
+
+    Local workers share the cores; those of a scheduler have as many threads as Dask gave them, and must see the folder under the
+    same path. Raises InputError for a scheduler that does not answer, and for an epoch whose workers die again and again.
+    """
+    try:
+        from distributed import KilledWorker, as_completed
+    except ImportError:
+        where, remedy = "--scheduler" if scheduler else "--workers", "install it: pip install 'scarpsim[dataset]'"
+        raise InputError("needs Dask's distributed, which is not installed", where=where, remedy=remedy) from None
+    with ExitStack() as stack:
+        client = _remote(stack, scheduler) if scheduler else _local(stack, count)
+        threads = 0 if scheduler else _threads_each(count)
+        keys = [f"epoch-{order.job}-{order.source}-{order.index:06d}" for order in orders]
+        futures = client.map(fill, [replace(order, threads=threads) for order in orders], key=keys)
+        try:
+            for _, taken in as_completed(futures, with_results=True):
+                yield taken
+        except KilledWorker as error:
+            raise InputError(
+                f"workers died while making {error.task}", where="dataset", remedy="see that each has 2.5 GB of memory or more"
+            ) from None
+
+
+def _threads_each(count: int) -> int:
+    return max(1, (os.cpu_count() or 1) // count)
+
+
+def _local(stack: ExitStack, count: int) -> Client:
+    """Workers on this machine, one thread of Dask's each. Dask's memory limit is off: it takes the ray tracer's for a leak."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    pools = dict.fromkeys(_POOLS, str(_threads_each(count)))
+    stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": pools, "distributed.worker.memory.spill": False}))
+    cluster = LocalCluster(
+        n_workers=count,
+        threads_per_worker=1,
+        memory_limit=0,
+        dashboard_address=None,
+        silence_logs=logging.CRITICAL,
+    )
+    return stack.enter_context(Client(stack.enter_context(cluster)))
+
+
+def _remote(stack: ExitStack, address: str) -> Client:
+    from distributed import Client
+
+    try:
+        return stack.enter_context(Client(address, timeout=_CONNECT_S))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no scheduler answers at '{address}' ({error})", where="--scheduler", remedy="give the address that it printed"
+        ) from None

@@ -1,0 +1,102 @@
+"""Merging finished sets into one, and splitting one: tiles and shards are copied, the rest is put together anew."""
+
+from __future__ import annotations
+
+import shutil
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.dataset.assemble import assemble, shards
+from pipeline.dataset.folder import Record, locked, read_dataset_file, sha256, shard_name, tile_files, write_shard
+from pipeline.dataset.run import DatasetSummary, write_dataset_file
+from scene.errors import InputError, nearest
+
+KEYS = ("sensor", "noise", "size", "wall", "split")
+
+
+def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
+    """Merge finished sets into a new one; ids are given anew, and a set's files get its fingerprint before their names.
+
+    Raises InputError for an unfinished set, two sets of one source, and a folder in use.
+    """
+    if len(folders) < 2:
+        raise InputError(f"needs two folders or more, got {len(folders)}", where="scarpsim dataset merge")
+    sets = {folder: _finished(folder) for folder in folders}
+    sources: dict[str, Any] = {}
+    epochs: dict[str, list[int]] = defaultdict(list)
+    for folder, dataset in sets.items():
+        for source, indices in dataset["epochs"].items():
+            if set(epochs[source]) & set(indices):
+                raise InputError("holds epochs that an earlier one holds too", where=str(folder), remedy="give each set once")
+            epochs[source] = sorted({*epochs[source], *indices})
+            sources[source] = {**dataset["sources"][source], "prefix": f"{source}_"}
+    with locked(_new(out)):
+        for folder, dataset in sets.items():
+            for record in shards(folder, dataset):
+                _copy(folder, out, record, dataset["sources"][record["source"]]["prefix"], f"{record['source']}_")
+        name = "-".join(dict.fromkeys(dataset["name"] for dataset in sets.values()))
+        return _finish(out, name, sources, dict(epochs))
+
+
+def split_dataset(folder: Path, out: Path, keys: Sequence[str]) -> list[DatasetSummary]:
+    """Make a set of its own of every combination of `keys` (sensor, noise, size, wall, split) that a finished set holds.
+
+    The sets are folders of `out`, named after their combination. Raises InputError for an unknown key and a folder in use.
+    """
+    for key in keys:
+        if key not in KEYS:
+            raise InputError(f"unknown key '{key}'", where="--by", allowed=", ".join(KEYS), remedy=nearest(key, KEYS))
+    dataset = _finished(folder)
+    found: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
+    for record in shards(folder, dataset):
+        name = "_".join(record["epoch"][key] for key in keys)
+        found[name][record["source"]].append(record["epoch"]["index"])
+    return [_part(folder, out / name, f"{dataset['name']}_{name}", dataset, epochs) for name, epochs in found.items()]
+
+
+def _part(folder: Path, out: Path, name: str, dataset: Record, epochs: dict[str, list[int]]) -> DatasetSummary:
+    sources = {source: dataset["sources"][source] for source in epochs}
+    with locked(_new(out)):
+        for record in shards(folder, {"epochs": epochs}):
+            prefix = sources[record["source"]]["prefix"]
+            _copy(folder, out, record, prefix, prefix)
+        return _finish(out, name, sources, {source: list(indices) for source, indices in epochs.items()})
+
+
+def _finished(folder: Path) -> Record:
+    dataset = read_dataset_file(folder)
+    if not dataset["complete"]:
+        remedy = "run the command that makes it again"
+        raise InputError("is not finished", where=str(folder), remedy=remedy)
+    return dataset
+
+
+def _new(out: Path) -> Path:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
+    return out
+
+
+def _copy(folder: Path, out: Path, record: Record, before: str, after: str) -> None:
+    """Copy an epoch's tiles and its shard; the tiles' names change their prefix."""
+    old = [name for name, _ in tile_files(record)]
+    for tile in record["tiles"]:
+        image = tile["image"]
+        image["file_name"] = after + image["file_name"].removeprefix(before)
+        if "truth_file_name" in image:
+            parent, _, name = image["truth_file_name"].rpartition("/")
+            image["truth_file_name"] = f"{parent}/{after}{name.removeprefix(before)}"
+    for source, (target, digest) in zip(old, tile_files(record), strict=True):
+        (out / target).parent.mkdir(parents=True, exist_ok=True)
+        if not (folder / source).exists() or sha256(shutil.copyfile(folder / source, out / target)) != digest:
+            raise InputError("is missing or damaged", where=str(folder / source), remedy="verify its set")
+    write_shard(out, shard_name(record["source"], record["epoch"]["index"]), record)
+
+
+def _finish(out: Path, name: str, sources: dict[str, Any], epochs: dict[str, list[int]]) -> DatasetSummary:
+    write_dataset_file(out, name, sources, epochs)
+    assembled = assemble(out, complete=True)
+    write_dataset_file(out, name, sources, epochs, complete=True)
+    return DatasetSummary(out, images=assembled.images, annotations=assembled.annotations)

@@ -1,0 +1,187 @@
+"""The config of a data set: a matrix of walls, sensors, levels of noise and sizes of blocks, and how many epochs of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import Field, StringConstraints, model_validator
+
+from pipeline.annotate import AnnotationConfig
+from pipeline.bundled import bundled_config
+from pipeline.config import SensorModel, SensorName, SimulationConfig, load_config
+from pipeline.overrides import apply_overrides
+from pipeline.presets import is_path, model_file
+from pipeline.tiles import TileConfig
+from scene.blocks import RockfallConfig
+from scene.config import Config, load_yaml, parse
+from scene.errors import InputError, nearest
+from sensors.model import StereoModel, TlsModel
+
+DATASET_FILE = "dataset.json"
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9.-]*$", max_length=40)]
+"""A word that can stand in a file name, between underscores."""
+
+
+class ScaledModel(Config):
+    """A sensor model, all of whose noise is multiplied by a factor. In a file `model` may be a bundled name or a file."""
+
+    model: SensorModel
+    scale: float | dict[str, float] = Field(1.0, description="factor of every sigma and mean of the noise, one or by wall")
+
+    def on(self, wall: str) -> StereoModel | TlsModel:
+        """The model with its noise scaled for a wall."""
+        factor = self.scale[wall] if isinstance(self.scale, dict) else self.scale
+        values = {key: _scaled(value, factor) for key, value in self.model.noise.model_dump().items() if key not in _NO_SIGMA}
+        noise = self.model.noise.model_validate(self.model.noise.model_dump() | values)
+        return self.model.model_copy(update={"noise": noise})
+
+
+_NO_SIGMA = {"regularization_step_px"}
+
+
+def _scaled(value: Any, factor: float) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _scaled(inner, factor) for key, inner in value.items()}
+    return value * factor
+
+
+class NoiseLevel(Config):
+    """The sensors' models at one level of noise."""
+
+    stereo: ScaledModel | None = Field(None, description="model of the stereo pair")
+    tls: ScaledModel | None = Field(None, description="model of the laser scanner")
+
+    def of(self, sensor: SensorName) -> ScaledModel | None:
+        return self.stereo if sensor == "stereo" else self.tls
+
+
+class SizeClass(Config):
+    """Blocks of one class of sizes."""
+
+    blocks_per_tile: float = Field(gt=0, description="blocks on the area of a tile; gives rockfall.count, whatever that says")
+    rockfall: RockfallConfig = RockfallConfig()
+
+
+class Part(Config):
+    """A part of the matrix: every combination of its walls, noise, sizes and of the sensors, each with as many epochs."""
+
+    walls: tuple[Name, ...] = Field(min_length=1, description="names of walls")
+    noise: tuple[Name, ...] = Field(min_length=1, description="names of levels of noise")
+    sizes: tuple[Name, ...] = Field(min_length=1, description="names of classes of sizes")
+    train: int = Field(0, ge=0, le=9999, description="epochs for training, of each combination")
+    val: int = Field(0, ge=0, le=9999, description="epochs for validation, of each combination")
+    test: int = Field(0, ge=0, le=9999, description="epochs for testing, of each combination")
+
+
+class DatasetConfig(Config):
+    """A data set of tiles of difference maps."""
+
+    name: Name = Field("rockfall", description="name of the data set")
+    seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
+    sensors: tuple[SensorName, ...] = Field(("stereo", "tls"), min_length=1, description="sensors that observe every epoch")
+    walls: dict[Name, SimulationConfig] = Field(
+        min_length=1,
+        description="walls and the sensors before them, by name; in a file `{site: name or file, set: [key=value, ...]}`",
+    )
+    noise: dict[Name, NoiseLevel] = Field(min_length=1, description="levels of noise, by name")
+    sizes: dict[Name, SizeClass] = Field(min_length=1, description="classes of sizes, by name")
+    parts: tuple[Part, ...] = Field(min_length=1, description="what the matrix holds")
+    tiles: TileConfig = TileConfig()
+    annotation: AnnotationConfig = AnnotationConfig()
+    validation_region: float = Field(
+        0.43,
+        ge=0,
+        lt=1,
+        description="share of a wall's columns of tiles, at its right end, for validation alone: training tiles come from the "
+        "rest, each from epochs of their own; 0: told by epoch only",
+    )
+    references: int = Field(
+        1, ge=1, le=999, description="reference epochs of each wall, sensor and noise, taken in turn by the epochs"
+    )
+    truth: bool = Field(False, description="the true difference of each tile too, in a folder `truth`")
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Self:
+        known: dict[str, Mapping[str, Any]] = {"walls": self.walls, "noise": self.noise, "sizes": self.sizes}
+        cells: set[tuple[str, str, str]] = set()
+        for number, part in enumerate(self.parts):
+            for kind, names in known.items():
+                unknown = [name for name in getattr(part, kind) if name not in names]
+                if unknown:
+                    hint = nearest(unknown[0], names) or f"known are {', '.join(names)}"
+                    raise ValueError(f"parts.{number}.{kind} names '{unknown[0]}', which is not under {kind}; {hint}")
+            if not part.train + part.val + part.test:
+                raise ValueError(f"parts.{number} has no epochs: give train, val or test a number")
+            found = {(wall, noise, size) for wall in part.walls for noise in part.noise for size in part.sizes}
+            if cells & found:
+                raise ValueError(f"parts.{number} holds {' '.join(min(cells & found))} a second time")
+            cells |= found
+            self._models_are_there(number, part)
+        return self
+
+    def _models_are_there(self, number: int, part: Part) -> None:
+        for sensor in self.sensors:
+            for noise in part.noise:
+                model = self.noise[noise].of(sensor)
+                if model is None or model.model.sensor != sensor:
+                    raise ValueError(f"parts.{number} needs noise.{noise}.{sensor}, a model with `sensor: {sensor}`")
+                missing = [wall for wall in part.walls if isinstance(model.scale, dict) and wall not in model.scale]
+                if missing:
+                    raise ValueError(f"noise.{noise}.{sensor}.scale has no factor for the wall {missing[0]}")
+
+
+def load_dataset_config(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> DatasetConfig:
+    """Read a data set's config and resolve what it names: sites, sensor models. Paths are relative to the file's folder.
+
+    The dataset.json of a finished set is a config too: that set again, to the byte. Raises InputError for whatever is wrong.
+    """
+    values = load_yaml(path)
+    if not isinstance(values, dict):
+        raise InputError("is not a mapping of keys", where=str(path), remedy="start from configs/datasets/small.yaml")
+    if "sources" in values and "fingerprint" in values:
+        values = _only_source(values, path)
+    values = apply_overrides(values, overrides)
+    if seed is not None:
+        values["seed"] = seed
+    walls, noise = values.get("walls"), values.get("noise")
+    if isinstance(walls, dict):
+        values["walls"] = {name: _wall(wall, f"{path}: walls.{name}", path.parent) for name, wall in walls.items()}
+    if isinstance(noise, dict):
+        values["noise"] = {name: _with_models(level, path.parent) for name, level in noise.items()}
+    return parse(DatasetConfig, values, str(path))
+
+
+def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
+    sources = values["sources"]
+    if len(sources) != 1:
+        raise InputError(f"is of a set merged of {len(sources)}", where=str(path), remedy="make each of its sources")
+    return dict(next(iter(sources.values()))["config"])
+
+
+def _wall(values: Any, where: str, folder: Path) -> Any:
+    """The simulation's values that a wall's entry stands for; entries that are no `{site, set}` are such values already."""
+    if not (isinstance(values, dict) and "site" in values):
+        return values
+    wrong = sorted(set(values) - {"site", "set"})
+    if wrong:
+        raise InputError(f"unknown key '{wrong[0]}'", where=where, allowed="site, set")
+    site, overrides = values["site"], values.get("set", [])
+    if not isinstance(site, str) or not isinstance(overrides, list):
+        raise InputError("expected `site: name` and `set: [key=value, ...]`", where=where)
+    path = folder / site if is_path(site) else bundled_config("sites", site)
+    return load_config(path, [str(item) for item in overrides], None, None).model_dump(mode="json")
+
+
+def _with_models(level: Any, folder: Path) -> Any:
+    """A level of noise with the sensor models that it names by name or file written out."""
+    if not isinstance(level, dict):
+        return level
+    result = dict(level)
+    for sensor, entry in level.items():
+        if isinstance(entry, dict) and isinstance(entry.get("model"), str):
+            name = entry["model"]
+            file = folder / name if is_path(name) else model_file(name)
+            result[sensor] = {**entry, "model": load_yaml(file)}
+    return result

@@ -1,0 +1,137 @@
+"""A finished data set as NumPy arrays and as tf.data. Imports no part of the simulation: training is a process without it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+
+from pipeline.formats.geotiff import read_tiff
+from scene.errors import InputError, nearest
+
+if TYPE_CHECKING:
+    import tensorflow as tf
+
+FILTERS = ("sensor", "wall", "noise", "size_class")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A tile of h x w pixels with k blocks.
+
+    image: (h, w) float32, reference minus epoch, m, 0 where there is no data; valid: (h, w) bool; boxes: (k, 4) float32, x, y,
+    width, height in pixels from the top-left corner; masks: (k, h, w) bool; truth: (h, w) float32, m, NaN where there is no wall,
+    None in a set without it; record: the image's entry in annotations.json; annotations: the blocks' entries.
+    """
+
+    image: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    boxes: NDArray[np.float32]
+    masks: NDArray[np.bool_]
+    truth: NDArray[np.float32] | None
+    record: dict[str, Any]
+    annotations: list[dict[str, Any]]
+
+
+class Tiles(Sequence[Sample]):
+    """One split of a data set, read tile by tile; several filters all have to match.
+
+    Tiles("sets/rockfall_9/train", sensor="stereo", noise="low")
+    """
+
+    def __init__(self, folder: Path | str, **filters: str) -> None:
+        """folder: train, val or test of a set; filters: sensor, wall, noise, size_class. InputError where nothing matches."""
+        self.folder = Path(folder)
+        for key in filters:
+            if key not in FILTERS:
+                raise InputError(
+                    f"unknown filter '{key}'", where="Tiles", allowed=", ".join(FILTERS), remedy=nearest(key, FILTERS)
+                )
+        content = _read(self.folder / "annotations.json")
+        self.records = [image for image in content["images"] if all(image[key] == value for key, value in filters.items())]
+        if not self.records:
+            present = {key: sorted({image[key] for image in content["images"]}) for key in filters}
+            raise InputError(f"no tile has {filters}", where=str(self.folder), allowed=str(present))
+        self._annotations: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in self.records}
+        for annotation in content["annotations"]:
+            if annotation["image_id"] in self._annotations:
+                self._annotations[annotation["image_id"]].append(annotation)
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def __getitem__(self, index: Any) -> Any:
+        """The sample of this index, read from disk; of a slice a list of samples."""
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        record = self.records[index]
+        values = read_tiff(self.folder / record["file_name"])
+        valid = ~np.isnan(values)
+        annotations = self._annotations[record["id"]]
+        truth = read_tiff(self.folder / record["truth_file_name"]) if "truth_file_name" in record else None
+        return Sample(
+            image=np.where(valid, values, np.float32(0)),
+            valid=valid,
+            boxes=np.array([each["bbox"] for each in annotations], dtype=np.float32).reshape(-1, 4),
+            masks=masks_of(annotations, values.shape),
+            truth=truth,
+            record=record,
+            annotations=annotations,
+        )
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[index] for index in range(len(self)))
+
+    def shuffled(self, seed: int) -> Iterator[Sample]:
+        """All samples once, in an order that depends on `seed` alone; another seed for each pass gives another order."""
+        return (self[int(index)] for index in np.random.default_rng(seed).permutation(len(self)))
+
+    def tf_dataset(self) -> tf.data.Dataset:
+        """A tf.data.Dataset of dictionaries: image (h, w, 1) float32, valid (h, w, 1) bool, boxes (k, 4) float32, masks
+        (k, h, w) bool, image_id int64."""
+        import tensorflow as tf
+
+        height, width = self.records[0]["height"], self.records[0]["width"]
+        signature = {
+            "image": tf.TensorSpec((height, width, 1), tf.float32),
+            "valid": tf.TensorSpec((height, width, 1), tf.bool),
+            "boxes": tf.TensorSpec((None, 4), tf.float32),
+            "masks": tf.TensorSpec((None, height, width), tf.bool),
+            "image_id": tf.TensorSpec((), tf.int64),
+        }
+        dataset = tf.data.Dataset.from_generator(lambda: map(_for_tensorflow, self), output_signature=signature)
+        return dataset.apply(tf.data.experimental.assert_cardinality(len(self)))
+
+
+def masks_of(annotations: Sequence[dict[str, Any]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """(k, h, w) the masks of COCO annotations."""
+    if not annotations:
+        return np.zeros((0, *shape), dtype=bool)
+    decoded = coco_mask.decode([each["segmentation"] for each in annotations])
+    return np.ascontiguousarray(decoded.transpose(2, 0, 1).astype(bool))
+
+
+def _for_tensorflow(sample: Sample) -> dict[str, Any]:
+    return {
+        "image": sample.image[..., None],
+        "valid": sample.valid[..., None],
+        "boxes": sample.boxes,
+        "masks": sample.masks,
+        "image_id": np.int64(sample.record["id"]),
+    }
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        where, remedy = str(path), "give the folder of a split, such as my_set/train"
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy=remedy) from None
+    except ValueError:
+        raise InputError("is damaged", where=str(path), remedy="run `scarpsim dataset verify` on the set") from None

@@ -1,0 +1,122 @@
+"""From a data set's config to the list of its epochs, and which tiles of an epoch belong to the set."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from pipeline.config import SensorName, SimulationConfig
+from pipeline.dataset.config import DatasetConfig
+from pipeline.tiles import Tile, TileConfig
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.keyed_random import KeyedRandom
+
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class PlannedEpoch:
+    """One epoch of a data set. index: in the plan; number: among the epochs of its combination and split, from 1;
+    reference: which of the reference epochs it is compared with."""
+
+    index: int
+    split: Split
+    sensor: SensorName
+    wall: str
+    noise: str
+    size: str
+    number: int
+    reference: int
+
+    @property
+    def name(self) -> str:
+        """A word for file names, unique in the set."""
+        return f"{self.wall}_{self.sensor}_{self.noise}_{self.size}_{self.split}{self.number:04d}"
+
+    @property
+    def stage(self) -> tuple[SensorName, str, str, int]:
+        """What epochs share that have the same reference epoch: sensor, wall, noise, number of the reference."""
+        return self.sensor, self.wall, self.noise, self.reference
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
+    """All epochs of the set, those that share a reference epoch one after the other."""
+    found = [
+        PlannedEpoch(0, split, sensor, wall, noise, size, number, (number - 1) % config.references + 1)
+        for part in config.parts
+        for sensor in config.sensors
+        for wall in part.walls
+        for noise in part.noise
+        for size in part.sizes
+        for split in SPLITS
+        for number in range(1, getattr(part, split) + 1)
+    ]
+    order = {stage: rank for rank, stage in enumerate(dict.fromkeys(epoch.stage[:3] for epoch in found))}
+    found.sort(key=lambda epoch: (order[epoch.stage[:3]], epoch.reference))
+    return [PlannedEpoch(**{**epoch.to_dict(), "index": index}) for index, epoch in enumerate(found)]
+
+
+def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfig:
+    """The simulation that an epoch is an epoch of; the number of its blocks follows when the wall's area is known."""
+    level = config.noise[epoch.noise].of(epoch.sensor)
+    if level is None:  # the config's own check has been here
+        raise InputError(f"has no model of {epoch.sensor}", where=f"noise.{epoch.noise}")
+    changes = {"seed": config.seed, "sensor": (level.on(epoch.wall),), "rockfall": config.sizes[epoch.size].rockfall}
+    return config.walls[epoch.wall].model_copy(update={**changes, "tiles": config.tiles, "annotation": config.annotation})
+
+
+def blocks_on(config: DatasetConfig, size: str, grid: Grid) -> int:
+    """How many blocks fall from a wall whose difference maps have the pixels of `grid`."""
+    tiles = grid.width * grid.height / config.tiles.size_px**2
+    return max(1, round(config.sizes[size].blocks_per_tile * tiles))
+
+
+def random_of_wall(config: DatasetConfig, wall: str) -> KeyedRandom:
+    """Of a wall without a seed of its own, and of its texture: the same for all sensors, noise and sizes."""
+    return KeyedRandom(config.seed).child("dataset", "wall", wall)
+
+
+def random_of_reference(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
+    return KeyedRandom(config.seed).child("dataset", "reference", *epoch.stage)
+
+
+def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
+    return KeyedRandom(config.seed).child("dataset", "epoch", epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split)
+
+
+@dataclass(frozen=True)
+class Region:
+    """The columns of pixels, [first, end), in which a tile must lie."""
+
+    first: int
+    end: float
+
+    def holds(self, tile: Tile) -> bool:
+        return self.first <= tile.column and tile.column + tile.grid.width <= self.end
+
+
+def region(split: Split, share: float, grid: Grid, config: TileConfig) -> Region:
+    """Where the tiles of a split may lie on a wall with the difference maps `grid`.
+
+    Training has the columns of tiles from the left, validation those at the right end that make up about `share`; strata run
+    along the wall, so both see all of them. Tests use the whole wall. Raises InputError where a wall has too few columns.
+    """
+    step = config.size_px - config.overlap_px
+    columns = len(range(0, max(grid.width - config.overlap_px, 1), step))
+    if split == "test" or share == 0:
+        return Region(0, float("inf"))
+    kept = round(share * columns)
+    if not 0 < kept < columns:
+        raise InputError(
+            f"{share:g} of {columns} columns of tiles is {'none' if kept == 0 else 'all'} of them",
+            where="validation_region",
+            allowed="0, or a share that leaves both training and validation a column",
+            remedy="use smaller tiles, a finer gsd or a longer wall",
+        )
+    boundary = (columns - kept) * step
+    return Region(0, boundary) if split == "train" else Region(boundary, float("inf"))

@@ -1,0 +1,162 @@
+"""A whole data set: which epochs are missing, who makes them, and what is put together when they are there.
+
+In this process by default; with Dask's distributed on a cluster of local processes or on a scheduler of the user's. Queues, lost
+workers and retries are Dask's business: an epoch that a dead worker left is made by another one, to the same bytes.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.dataset.assemble import assemble, assembled_damages
+from pipeline.dataset.config import DATASET_FILE, DatasetConfig
+from pipeline.dataset.folder import (
+    SCHEMA,
+    Damage,
+    damages,
+    fingerprint,
+    locked,
+    read_dataset_file,
+    remove_leftovers,
+    shard_name,
+)
+from pipeline.dataset.plan import planned_epochs
+from pipeline.dataset.worker import Order, fill, makers, require_same_makers
+from pipeline.formats.atomic import write_json
+from pipeline.progress import Progress
+from scene.errors import InputError
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who makes the epochs. count: local processes; scheduler: address of a Dask scheduler; neither: this process."""
+
+    count: int = 0
+    scheduler: str = ""
+
+
+@dataclass
+class DatasetSummary:
+    """What a job did. folder: of the set; made: what each epoch took that it made (`worker.fill`); images, annotations: of the
+    whole set, by split; damage: what was wrong with epochs that were there before."""
+
+    folder: Path
+    made: list[dict[str, Any]] = field(default_factory=list)
+    images: dict[str, int] = field(default_factory=dict)
+    annotations: dict[str, int] = field(default_factory=dict)
+    damage: list[Damage] = field(default_factory=list)
+
+    def summary(self) -> str:
+        splits = ", ".join(f"{name} {self.images[name]:,} tiles with {self.annotations[name]:,} blocks" for name in self.images)
+        return f"{len(self.made)} epochs made; {splits}\ncard: {self.folder / 'README.md'}"
+
+
+def make_dataset(
+    config: DatasetConfig, out: Path, workers: Workers = Workers(), *, command: str = "", progress: Progress | None = None
+) -> DatasetSummary:
+    """Make a data set, or what is missing of it: the same call goes on with one that was interrupted, however it was.
+
+    out: a folder that is new, empty, or holds a set of the same config. command: for the card. Raises InputError for a
+    folder in use or of another set. On an interrupt what is finished is put together before KeyboardInterrupt goes on.
+    """
+    progress = progress or Progress()
+    with locked(out):
+        _claim(out, config, command)
+        return _complete(out, workers, progress)
+
+
+def verify_dataset(
+    folder: Path, workers: Workers = Workers(), *, repair: bool = True, progress: Progress | None = None
+) -> DatasetSummary:
+    """Read every byte of a set, and make again what is missing or damaged; with repair=False only report it."""
+    progress = progress or Progress()
+    read_dataset_file(folder)
+    with locked(folder):
+        if repair:
+            return _complete(folder, workers, progress)
+        found = _find_damage(folder, progress)
+        damage = [each for problems in found.values() for each in problems]
+        return DatasetSummary(folder, damage=damage + assembled_damages(folder))
+
+
+def _claim(out: Path, config: DatasetConfig, command: str) -> None:
+    """Make sure that `out` is ours to write to: new, empty, or a set of the same config and versions."""
+    source = fingerprint(config)
+    if (out / DATASET_FILE).exists():
+        known = read_dataset_file(out)
+        if list(known["sources"]) != [source]:
+            raise InputError(
+                f"holds the set {known['name']} ({', '.join(known['sources'])}), the config is of another ({source})",
+                where=str(out),
+                remedy="go on with the config it was begun with, or choose another --out",
+            )
+        require_same_makers(known["sources"][source], str(out))
+        return
+    if any(not path.name.startswith(".") for path in out.iterdir()):
+        raise InputError("the folder exists and is not empty", where=f"--out {out}", remedy="choose another --out")
+    entry = {"config": config.model_dump(mode="json"), "versions": makers(), "command": command, "prefix": ""}
+    write_dataset_file(out, config.name, {source: entry}, {source: [epoch.index for epoch in planned_epochs(config)]})
+
+
+def write_dataset_file(
+    folder: Path, name: str, sources: dict[str, Any], epochs: dict[str, list[int]], *, complete: bool = False
+) -> None:
+    """Write dataset.json. sources: config, versions, command, prefix of file names, by fingerprint; epochs: the set's."""
+    head = {"schema": SCHEMA, "name": name, "fingerprint": "-".join(sources), "complete": complete}
+    write_json(folder / DATASET_FILE, {**head, "sources": sources, "epochs": epochs})
+
+
+def _find_damage(folder: Path, progress: Progress) -> dict[tuple[str, int], list[Damage]]:
+    """What is wrong with each epoch of the set that is not whole."""
+    epochs = [(source, index) for source, indices in read_dataset_file(folder)["epochs"].items() for index in indices]
+    found = {}
+    with progress.stage("check") as stage:
+        for done, (source, index) in enumerate(epochs):
+            damage = damages(folder, shard_name(source, index))
+            if damage:
+                found[source, index] = damage
+            stage.advance(done / len(epochs))
+    return found
+
+
+def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSummary:
+    """Make what is missing or damaged, and put the set together."""
+    remove_leftovers(folder)
+    progress.plan({"check": 1.0, "epochs": 1000.0, "card": 10.0})
+    known = read_dataset_file(folder)
+    found = _find_damage(folder, progress)
+    damage = [each for problems in found.values() for each in problems if known["complete"] or not each.is_missing_shard]
+    summary = DatasetSummary(folder, damage=damage + (assembled_damages(folder) if known["complete"] else []))
+    write_dataset_file(folder, known["name"], known["sources"], known["epochs"])
+    job = uuid.uuid4().hex
+    orders = [Order(str(folder.absolute()), job, source, index) for source, index in found]
+    try:
+        with progress.stage("epochs") as stage:
+            for taken in _fill_all(orders, workers):
+                summary.made.append(taken)
+                stage.advance(len(summary.made) / len(orders))
+    except KeyboardInterrupt:
+        assemble(folder, complete=False)
+        raise
+    with progress.stage("card"):
+        assembled = assemble(folder, complete=True)
+        write_dataset_file(folder, known["name"], known["sources"], known["epochs"], complete=True)
+    remove_leftovers(folder)
+    summary.images, summary.annotations = assembled.images, assembled.annotations
+    return summary
+
+
+def _fill_all(orders: list[Order], workers: Workers) -> Iterator[dict[str, Any]]:
+    """What each order took, in the order in which they are done."""
+    if not orders:
+        return
+    if not (workers.count or workers.scheduler):
+        yield from map(fill, orders)
+        return
+    from pipeline.dataset.cluster import fill_on_cluster  # Dask is slow to import, and an extra
+
+    yield from fill_on_cluster(orders, workers.count, workers.scheduler)

@@ -1,0 +1,146 @@
+"""What a worker does: make an epoch of the set and put its tiles and its shard into the folder, which every worker sees."""
+
+from __future__ import annotations
+
+import os
+import resource
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from pipeline.dataset.config import DatasetConfig
+from pipeline.dataset.epoch import EpochTile, MadeEpoch, Stages, make_epoch
+from pipeline.dataset.folder import SCHEMA, STAGING, TRUTH, read_dataset_file, sha256, shard_name, write_shard
+from pipeline.dataset.plan import PlannedEpoch, planned_epochs
+from pipeline.formats.geotiff import write_geotiff
+from pipeline.progress import Progress
+from pipeline.provenance import versions
+from scene.backend import VARIANT, dr
+from scene.config import parse
+from scene.errors import InputError
+
+_one_at_a_time = threading.Lock()
+"""Dask may give a worker several threads; a stage is set up once and used by one epoch at a time."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """An epoch to make. folder: of the data set; job: names its staging folder; source: whose epoch; threads: to use; 0: all."""
+
+    folder: str
+    job: str
+    source: str
+    index: int
+    threads: int = 0
+
+
+@dataclass(frozen=True)
+class _Workshop:
+    """What a worker keeps of a source between epochs."""
+
+    config: DatasetConfig
+    plan: list[PlannedEpoch]
+    stages: Stages
+    prefix: str
+
+
+@lru_cache(maxsize=1)
+def _workshop(folder: str, job: str, source: str) -> _Workshop:
+    """The config of a source as the folder has it; `job` makes a new job read it anew."""
+    entry = read_dataset_file(Path(folder))["sources"][source]
+    require_same_makers(entry, folder)
+    config = parse(DatasetConfig, entry["config"], folder)
+    return _Workshop(config, planned_epochs(config), Stages(config), entry["prefix"])
+
+
+def makers() -> dict[str, str]:
+    """What the bytes of a set depend on beside its config: versions of the packages, and the ray tracer's backend."""
+    return {**versions(), "backend": VARIANT}
+
+
+def require_same_makers(entry: dict[str, Any], where: str) -> None:
+    """Raise InputError where the packages here differ from those that began the set: its bytes would, too."""
+    before, here = entry["versions"], makers()
+    differ = sorted(key for key in before if key != "platform" and here.get(key) != before[key])
+    if differ:
+        told = ", ".join(f"{key} {before[key]} (here {here.get(key, 'none')})" for key in differ)
+        raise InputError(
+            f"was begun with {told}",
+            where=where,
+            remedy="use the same versions, or make the set in another folder",
+        )
+
+
+def use_threads(count: int) -> None:
+    """Let the ray tracer and the image library use `count` threads in this process; 0: as many as there are."""
+    if count:
+        import cv2
+
+        dr.set_thread_count(count)
+        cv2.setNumThreads(count)
+
+
+def fill(order: Order) -> dict[str, Any]:
+    """Make an epoch and store it. Returns what it took: wall time by stage, s, tiles, peak memory of the worker so far, GB."""
+    with _one_at_a_time:
+        use_threads(order.threads)
+        workshop = _workshop(order.folder, order.job, order.source)
+        epoch, progress = workshop.plan[order.index], Progress()
+        made = make_epoch(workshop.config, epoch, workshop.stages, progress)
+        with progress.stage("write"):
+            _store(Path(order.folder), order, workshop.prefix, epoch, made)
+    return {
+        "index": order.index,
+        "tiles": len(made.tiles),
+        "seconds": {name.partition(": ")[2] or name: value for name, value in progress.timings.items()},
+        "peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "process": os.getpid(),
+    }
+
+
+def _store(folder: Path, order: Order, prefix: str, epoch: PlannedEpoch, made: MadeEpoch) -> None:
+    staging = folder / STAGING / order.job / f"{order.source}_{order.index:06d}"
+    entries = [_write_tile(staging, prefix, epoch, tile) for tile in made.tiles]
+    for entry in entries:
+        for name in _names(entry):
+            (folder / epoch.split / name).parent.mkdir(parents=True, exist_ok=True)
+            (staging / name).replace(folder / epoch.split / name)
+    record = {"schema": SCHEMA, "source": order.source, **made.record, "tiles": entries}
+    write_shard(staging, shard_name(order.source, order.index), record)
+    final = folder / "shards" / shard_name(order.source, order.index)
+    final.parent.mkdir(exist_ok=True)
+    (staging / "shards" / final.name).replace(final)
+
+
+def _names(entry: dict[str, Any]) -> Iterator[str]:
+    yield entry["image"]["file_name"]
+    if entry["truth_sha256"] is not None:
+        yield entry["image"]["truth_file_name"]
+
+
+def _write_tile(staging: Path, prefix: str, epoch: PlannedEpoch, made: EpochTile) -> dict[str, Any]:
+    """Write a tile, and its truth, into the staging folder; returns its entry in the shard."""
+    tile = made.tile
+    name = f"{prefix}{epoch.name}_{tile.name}.tif"
+    write_geotiff(staging / name, tile.values, tile.grid, description="reference minus epoch, m", with_mask=True)
+    image = {
+        "file_name": name,
+        "width": tile.grid.width,
+        "height": tile.grid.height,
+        "row": tile.row,
+        "column": tile.column,
+        "x_min_m": tile.grid.x_min,
+        "y_max_m": tile.grid.y_max,
+        "gsd_m": tile.grid.gsd,
+        "valid_share": round(tile.valid_share, 6),
+    }
+    truth_digest = None
+    if made.truth is not None:
+        image["truth_file_name"] = f"{TRUTH}/{name}"
+        write_geotiff(staging / TRUTH / name, made.truth, tile.grid, description="true difference, m", with_mask=True)
+        truth_digest = sha256(staging / TRUTH / name)
+    digest = sha256(staging / name)
+    return {"image": image, "sha256": digest, "truth_sha256": truth_digest, "annotations": made.annotations}
