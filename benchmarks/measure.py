@@ -35,14 +35,18 @@ def peak_memory_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
-def bare_cast(caster: RayCaster, origin: Any, direction: Any) -> Callable[[], None]:
-    """`ray_intersect_preliminary` alone on rays that are ready in memory (3 x (n,) float64), coherent, as fast as it goes."""
-    ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
-    dr.eval(ray)
+def bare_cast(caster: RayCaster, origin: Any, *directions: Any) -> Callable[[], None]:
+    """`ray_intersect_preliminary` alone on rays that are ready in memory (3 x (n,) float64), coherent, as fast as it goes.
+
+    One set of rays per entry of `directions`, cast one after the other.
+    """
+    rays = [mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction)) for direction in directions]
+    dr.eval(rays)
 
     def work() -> None:
-        found = caster._scene.ray_intersect_preliminary(ray, coherent=True)
-        dr.eval(found.t, found.prim_index)
+        for ray in rays:
+            found = caster.bare.ray_intersect_preliminary(ray, coherent=True)
+            dr.eval(found.t, found.prim_index)
 
     return work
 
@@ -52,4 +56,4 @@ def bare_test(caster: RayCaster, origin: Any, direction: Any, reach: float) -> C
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
     ray.maxt = mi.Float(reach)
     dr.eval(ray)
-    return lambda: dr.eval(caster._scene.ray_test(ray, coherent=True))
+    return lambda: dr.eval(caster.bare.ray_test(ray, coherent=True))

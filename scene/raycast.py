@@ -51,7 +51,10 @@ class Hits:
 
 
 class RayCaster:
-    """A mesh prepared for ray casting, in a frame whose origin is near (the wall frame)."""
+    """A mesh prepared for ray casting, in a frame whose origin is near (the wall frame).
+
+    mesh: as given; bare: Mitsuba's own scene of it, which casts in single precision and refines nothing.
+    """
 
     def __init__(self, mesh: TriangleMesh) -> None:
         if len(mesh.faces) == 0:
@@ -68,7 +71,7 @@ class RayCaster:
         parameters["vertex_positions"] = on_device(mi.Float32, mesh.vertices)
         parameters["faces"] = self._face_vertices
         parameters.update()
-        self._scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surface": shape})
+        self.bare = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surface": shape})
 
     @cached_property
     def _records(self) -> mi.Float32:
@@ -109,7 +112,7 @@ class RayCaster:
         exact: decide in float64 which face a ray near an edge meets, instead of leaving that to the single precision.
         """
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
-        found = self._scene.ray_intersect_preliminary(ray, coherent=coherent)
+        found = self.bare.ray_intersect_preliminary(ray, coherent=coherent)
         valid, face = found.is_valid(), found.prim_index
         if exact:
             u, v = found.prim_uv
@@ -135,7 +138,7 @@ class RayCaster:
         for right, up in _AROUND:
             aside = mi.Array3f64(right * side + up * other)
             ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction + reach * aside))
-            beside = self._scene.ray_intersect_preliminary(ray, active=at_edge)
+            beside = self.bare.ray_intersect_preliminary(ray, active=at_edge)
             candidates.append(dr.select(beside.is_valid(), beside.prim_index, face))
         nearest, settled = mi.Float64(np.inf), face
         for candidate in candidates:
@@ -160,7 +163,7 @@ class RayCaster:
         """Whether something lies on each ray before `length` (n,), m for unit directions."""
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         ray.maxt = mi.Float(length)
-        return self._scene.ray_test(ray, coherent=coherent)
+        return self.bare.ray_test(ray, coherent=coherent)
 
     def nearest_vertex_label(self, hits: Hits, point: mi.Array3f64, labels: mi.Int32) -> mi.Int32:
         """(n,) the label, out of one per vertex, of the hit face's vertex that is nearest to `point` (3 x (n,), m)."""
