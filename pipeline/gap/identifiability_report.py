@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from pipeline.formats.atomic import write_json, write_text, writing
+from pipeline.gap.figures import matrix_figure
 from pipeline.gap.identifiability import ALIKE, NAMED_AT, Identifiability
-from pipeline.gap.pictures import png
 from pipeline.gap.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE
 from pipeline.provenance import versions
 from pipeline.report.page import template
@@ -40,7 +39,7 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
     """Write the files of one analysis per sensor into `out`; returns report.html."""
     record = {"schema": 1, "surveys": [each.to_dict() for each in found], "versions": versions()}
     write_json(out / "identifiability.json", record)
-    pictures = {each.sensor: matrix_figure(each) for each in found}
+    pictures = {each.sensor: matrix_figure(list(each.names), each.cosines, each.survival) for each in found}
     for sensor, picture in pictures.items():
         with writing(out / f"identifiability_{sensor}.png") as temporary:
             temporary.write_bytes(picture)
@@ -75,29 +74,6 @@ def in_words(found: Identifiability) -> str:
     else:
         parts.append("No two effects on the mean look alike.")
     return " ".join(parts)
-
-
-def matrix_figure(found: Identifiability) -> bytes:
-    """Cosines of the signatures after the pose fit, and beside them the share of each that survives it; PNG."""
-    names, count = [name.partition(".")[2] for name in found.names], len(found.names)
-    figure = Figure(figsize=(2.8 + 0.62 * count, 1.9 + 0.44 * count), layout="constrained")
-    matrix, bars = figure.subplots(1, 2, width_ratios=[count, 3.0], sharey=True)
-    image = matrix.imshow(found.cosines, cmap="Blues", vmin=0, vmax=1, aspect="auto")
-    for row in range(count):
-        for column in range(count):
-            value = found.cosines[row, column]
-            if row != column and value >= 0.3:
-                colour = "white" if value > 0.6 else "black"
-                matrix.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
-    matrix.set_xticks(range(count), names, rotation=60, ha="right", fontsize=8)
-    matrix.set_yticks(range(count), names, fontsize=8)
-    matrix.set_title("cosine of the signatures after the pose fit", fontsize=9)
-    figure.colorbar(image, ax=matrix, shrink=0.7)
-    bars.barh(range(count), 100 * found.survival, color="#0072B2")
-    bars.set_title("survives the pose, %", fontsize=9)
-    bars.set_xlim(0, 100)
-    bars.tick_params(labelsize=8)
-    return png(figure)
 
 
 def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:

@@ -1,0 +1,87 @@
+"""A diagnosis in plain words: the paragraph at the top of the report, and what became of each explanation that was tried."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.gap.entries import Named
+from pipeline.gap.selection import Tried
+from pipeline.gap.verify import Gap
+from pipeline.gap.workflow import Diagnosis
+
+VERDICTS = {
+    "no_gap": "The measurement agrees with the model: nothing was found that the model does not hold.",
+    "named": "One effect explains where measurement and model disagree.",
+    "several": "More than one effect is needed to explain where measurement and model disagree.",
+    "ambiguous": "An effect is there, but this measurement cannot tell it from others that would look the same.",
+    "unknown": "The model is rejected, and no effect of the catalogue passes its own test; an empirical term describes it.",
+    "insufficient_data": "There are too few points on smooth parts of the reference to say anything.",
+}
+_INSTRUMENTS = {"tls": "ranges of a laser scan", "stereo": "disparities of a stereo pair"}
+_STATISTICS = {"mean": "mean", "spread": "spread", "shape": "outliers", "missing": "lost returns"}
+_CLEAR = 0.01
+
+
+def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
+    """What was compared, what was found, how far the gap closes. rows: as `where` gives them."""
+    parts = [f"{len(found.residuals):,} {_INSTRUMENTS[found.residuals.sensor]} were compared with what the model predicts."]
+    parts.append(VERDICTS[found.verdict])
+    parts += [_effect(effect) for effect in found.effects]
+    clear = [row for row in rows if row["p_value"] <= _CLEAR]
+    if clear and found.effects:
+        seen = dict.fromkeys(f"{_STATISTICS[row['statistic']]} against {row['covariate']}" for row in clear[:3])
+        parts.append(f"Before anything was named it showed most in the {', the '.join(seen)}.")
+    if found.gap is not None:
+        parts.append(_gap(found.gap, bool(found.effects)))
+    if found.changes:
+        volume = sum(abs(change.volume_m3) for change in found.changes)
+        regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
+        parts.append(f"{regions} where the rock itself moved ({volume:.2g} m\N{SUPERSCRIPT THREE} in all) were set aside.")
+    if found.remaining.get("note"):
+        parts.append(f"Note: {found.remaining['note']}.")
+    return " ".join(parts)
+
+
+def outcome(found: Diagnosis, tried: Sequence[Tried], item: Tried) -> str:
+    """What became of one of the explanations `tried`, best first: named, in the class of a named one, or rejected."""
+    name = f"{found.residuals.sensor}.{item.name}"
+    if item.empirical:
+        added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
+        best = next(each for each in tried if each.empirical and each.name == item.name)
+        return "added as empirical" if item is best and item.name in added else "rejected"
+    if any(effect.name == name for effect in found.effects):
+        return "named"
+    alike = {other for effect in found.effects for other in effect.alike}
+    return "cannot be told from the named one" if name in alike else "rejected"
+
+
+def values(effect: Named) -> str:
+    """Parameters with their standard deviations."""
+    return ", ".join(_value(key, value, effect.std.get(key)) for key, value in effect.entry.items() if key != "name")
+
+
+def _value(key: str, value: Any, std: float | None) -> str:
+    if isinstance(value, list):
+        return f"{key} {', '.join(f'{each:.3g}' for each in value)}"
+    if not isinstance(value, float):
+        return f"{key} {value}"
+    return f"{key} {value:.4g}" + ("" if not std else f" \N{PLUS-MINUS SIGN} {std:.1g}")
+
+
+def _effect(effect: Named) -> str:
+    if effect.kind == "empirical":
+        covariate = effect.entry.get("covariate")
+        what = f"depends on {covariate}" if covariate else "is larger than the model says"
+        return f"The disagreement {what}; it is described, not explained, by {effect.name}."
+    said = f"It is {effect.name} ({values(effect)})."
+    return f"{said} It looks like {', '.join(effect.alike)}; {effect.split_by} would split them." if effect.alike else said
+
+
+def _gap(gap: Gap, named: bool) -> str:
+    scores = f"{1e3 * gap.before:.3f} mm before"
+    after = f", {1e3 * gap.after:.3f} mm after" if named else ""
+    text = f"On blocks that no step has used, the gap is {scores}{after}; the model's own noise leaves {1e3 * gap.floor:.3f} mm"
+    if gap.closed is None:
+        return f"{text}, so before and floor differ by no more than their uncertainty."
+    return f"{text}: {gap.closed:.0%} of the gap is closed."
