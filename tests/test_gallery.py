@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
+from sensors.effects import FURTHER_STEREO_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS
 
+EFFECTS = (*TLS_EFFECTS, *STEREO_EFFECTS, *FURTHER_STEREO_EFFECTS)
 FOLDER = Path(__file__).parents[1] / "docs" / "effects"
 
 
 def test_every_effect_has_a_page_and_a_small_picture_and_nothing_else_does() -> None:
-    names = {f"{effect.sensor}.{effect.model_fields['name'].default}" for effect in (*TLS_EFFECTS, *STEREO_EFFECTS)}
+    names = {f"{effect.sensor}.{effect.model_fields['name'].default}" for effect in EFFECTS}
     assert {path.stem for path in FOLDER.glob("*.png")} == names
     assert {path.stem for path in FOLDER.glob("*.md")} == names | {"README"}
     assert max(path.stat().st_size for path in FOLDER.glob("*.png")) <= 60_000
 
 
 def test_every_page_states_the_effects_present_parameters() -> None:
-    for effect in (*TLS_EFFECTS, *STEREO_EFFECTS):
+    for effect in EFFECTS:
         page = (FOLDER / f"{effect.sensor}.{effect.model_fields['name'].default}.md").read_text()
         assert all(f"| `{key}` |" in page for key in effect.model_fields if key != "name")

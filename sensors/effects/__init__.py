@@ -20,6 +20,7 @@ from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.focal_length import FocalLength
+from sensors.effects.heavy_tailed_noise import HeavyTailedNoise
 from sensors.effects.horizontal_eccentricity import HorizontalEccentricity
 from sensors.effects.occlusion_fill import OcclusionFill
 from sensors.effects.parallax_noise import ParallaxNoise
@@ -95,6 +96,9 @@ STEREO_EFFECTS: tuple[type[Effect], ...] = (
     RowJitter,
 )
 
+FURTHER_STEREO_EFFECTS: tuple[type[Effect], ...] = (HeavyTailedNoise,)
+"""Beyond the shared catalogue: for simulation, no candidates of `scarpsim gap`."""
+
 
 def _named(effects: tuple[type[Effect], ...]) -> Any:
     """The type of one entry of an `effects:` list: a mapping whose `name` picks the class out of `effects`."""
@@ -114,10 +118,11 @@ def _named(effects: tuple[type[Effect], ...]) -> Any:
 
 
 TlsEffect = _named((*TLS_EFFECTS, RangeEmpirical))
-StereoEffect = _named((*STEREO_EFFECTS, DisparityEmpirical))
+StereoEffect = _named((*STEREO_EFFECTS, *FURTHER_STEREO_EFFECTS, DisparityEmpirical))
 """What a config may name: the catalogue and, for what it does not explain, the empirical terms that `scarpsim gap` adds."""
 
 __all__ = [
+    "FURTHER_STEREO_EFFECTS",
     "STEREO_EFFECTS",
     "TLS_EFFECTS",
     "AffinitySkew",
@@ -133,6 +138,7 @@ __all__ = [
     "EdgeFattening",
     "Effect",
     "FocalLength",
+    "HeavyTailedNoise",
     "HorizontalEccentricity",
     "OcclusionFill",
     "ParallaxNoise",

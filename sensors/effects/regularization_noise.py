@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from scene.upload import on_device
 from sensors.effects.base import Effect, Stage, parameter
 from sensors.matches import Matches
+from sensors.node_grid import smooth_field
 
 
 class RegularizationNoise(Effect):
@@ -29,18 +27,5 @@ class RegularizationNoise(Effect):
     step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=32.0, gt=0)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        columns, rows = (int(np.ceil(size / self.step_px)) + 1 for size in (state.width, state.height))
-        nodes = on_device(mi.Float32, random.generator().normal(0.0, self.sigma_px, (rows, columns)))
-        step = dr.opaque(mi.Float64, self.step_px)
-        x, y = state.u / step, state.v / step
-        left, top = mi.UInt32(x), mi.UInt32(y)
-        right_share, bottom_share = mi.Float32(x - left), mi.Float32(y - top)
-        stride = dr.opaque(mi.UInt32, columns)
-        corner = top * stride + left
-
-        def node(offset: mi.UInt32) -> mi.Float32:
-            return dr.gather(mi.Float32, nodes, corner + offset, state.matched)
-
-        upper = dr.lerp(node(mi.UInt32(0)), node(mi.UInt32(1)), right_share)
-        lower = dr.lerp(node(stride), node(stride + 1), right_share)
-        return replace(state, disparity=state.disparity + mi.Float64(dr.lerp(upper, lower, bottom_share)))
+        field = smooth_field(state, self.step_px, random)
+        return replace(state, disparity=state.disparity + mi.Float64(dr.opaque(mi.Float32, self.sigma_px) * field))

@@ -1,0 +1,43 @@
+"""Smooth matching noise with heavy tails, as textured and bare, flat and broken rock together give it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from scene.backend import dr, mi
+from scene.keyed_random import KeyedRandom
+from sensors.effects.base import Effect, Stage, parameter
+from sensors.matches import Matches
+from sensors.node_grid import smooth_field
+
+
+class HeavyTailedNoise(Effect):
+    """dd = sigma a exp(t b - t^2), a and b independent smooth fields over the image of mean 0 and variance 1.
+
+    A normal error whose size varies log-normally from place to place: standard deviation sigma, kurtosis 3 exp(4 t^2). Both
+    fields: Gaussian values on a grid of nodes `step` apart, bilinear. Not in the shared catalogue; drawn from OpenCV's
+    semi-global matching of rendered and of real pictures (docs/matching.md).
+    """
+
+    name: Literal["heavy_tailed_noise"] = "heavy_tailed_noise"
+    sensor = "stereo"
+    stage = Stage.MATCH
+    order = 35
+    sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.5, ge=0, le=1000)
+    step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=12.0, gt=0)
+    tail: float = parameter(
+        "standard deviation of the size's logarithm; 0: normal errors",
+        unit="1",
+        source="empirical",
+        null=None,
+        default=0.6,
+        ge=0,
+        le=2,
+    )
+
+    def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
+        error, size = (smooth_field(state, self.step_px, random.child(part), even=True) for part in ("error", "size"))
+        sigma, tail = (dr.opaque(mi.Float32, value) for value in (self.sigma_px, self.tail))
+        noise = sigma * error * dr.exp(tail * size - dr.square(tail))
+        return replace(state, disparity=state.disparity + mi.Float64(noise))
