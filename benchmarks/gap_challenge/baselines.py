@@ -1,0 +1,92 @@
+"""What the diagnosis is compared with: the largest |z| and plain BIC, both taking residuals for independent; and the control,
+the share of the gap that wrong effects close on blocks that their fit has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.gap_challenge.casting import Array
+from benchmarks.gap_challenge.strength import Families, basis
+
+Z_LIMIT, BIC_LIMIT = 3.0, 10.0
+_CLIP, _MOST_POINTS, _BLOCKS = 4.0, 20_000, 12
+
+
+@dataclass(frozen=True)
+class Data:
+    """Residuals against reference and survey (n,), predicted sigma (n,), effect of the pose (n, 6), place (n, 2)."""
+
+    value: Array
+    sigma: Array
+    pose: Array
+    at: Array
+
+
+def rivals(data: Data, families: Families, forms: Mapping[str, Sequence[Array]], truth: list[Array]) -> dict[str, Any]:
+    """The baselines' answers, and for each effect on the mean the share of the gap that it closes where `truth` closes all."""
+    sound = _sound(data)
+    rows = sound[:: max(len(sound) // _MOST_POINTS, 1)]
+    weight = 1 / data.sigma[rows, None]
+    pose, value = data.pose[rows] * weight, data.value[rows] * weight[:, 0]
+    designs = {name: [variant[rows] * weight for variant in variants] for name, variants in families.items()}
+    side = np.sqrt(np.prod(np.ptp(data.at, axis=0)) / _BLOCKS**2)
+    corner = np.floor((data.at[rows] - data.at.min(axis=0)) / side).astype(int)
+    held_out = (corner[:, 0] + 2 * corner[:, 1]) % 5 == 0
+    shares = {}
+    if len(truth) == 1:
+        full = _gain(pose, truth[0][rows, None] * weight, value, held_out)
+        shares = {name: max(_gain(pose, d, value, held_out) for d in variants) / full for name, variants in designs.items()}
+    relative = {name: [form[rows] / data.sigma[rows] ** 2 for form in several] for name, several in forms.items()}
+    return {"baselines": _answers(pose, designs, value, relative), "closed_by": shares}
+
+
+def _sound(data: Data) -> Array:
+    """Rows within some sigmas of a robust registration."""
+    kept = np.arange(len(data.value))
+    for _ in range(5):
+        pose = np.linalg.lstsq(data.pose[kept] / data.sigma[kept, None], data.value[kept] / data.sigma[kept], rcond=None)[0]
+        z = np.abs(data.value - data.pose @ pose) / data.sigma
+        kept = np.flatnonzero(z < _CLIP * max(1.0, 1.4826 * float(np.median(z))))
+    return kept
+
+
+def _gain(pose: Array, design: Array, value: Array, held_out: Array) -> float:
+    """Drop of the weighted squares on held-out blocks when `design` joins the pose, both fitted on the other blocks."""
+    left = []
+    for columns in (pose, np.concatenate([pose, design], axis=1)):
+        size = np.linalg.norm(columns, axis=0)
+        fit = np.linalg.lstsq(columns[~held_out] / size, value[~held_out], rcond=1e-10)[0]
+        left.append(float(np.sum((value[held_out] - columns[held_out] / size @ fit) ** 2)))
+    return left[0] - left[1]
+
+
+def _spread(value: Array, relative: Mapping[str, list[Array]]) -> dict[str, float]:
+    """Score statistic of each effect on the spread, in standard deviations."""
+    return {
+        name: max(float((value**2 - 1) @ form / np.sqrt(2 * np.sum(form**2))) for form in several)
+        for name, several in relative.items()
+    }
+
+
+def _answers(
+    pose: Array, designs: Mapping[str, list[Array]], value: Array, relative: Mapping[str, list[Array]]
+) -> dict[str, str]:
+    """The names that the two baselines give; "" for nothing. Effects on the spread are tried on what the best mean leaves."""
+    fixed = basis(pose)
+    value = value - fixed @ (fixed.T @ value)
+    z, bic, best = {}, {}, (-np.inf, value)
+    for name, variants in designs.items():
+        bases = [basis(design - fixed @ (fixed.T @ design)) for design in variants]
+        gains = [float(np.sum((base.T @ value) ** 2)) for base in bases]
+        base = bases[int(np.argmax(gains))]
+        z[name] = max(float(np.max(np.abs(each.T @ value), initial=0.0)) for each in bases)
+        bic[name] = max(gains) - (base.shape[1] + (len(variants) > 1)) * np.log(len(value))
+        best = max(best, (bic[name], value - base @ (base.T @ value)), key=lambda item: item[0])
+    for name, score in _spread(best[1], relative).items():
+        z[name], bic[name] = max(score, 0.0), max(score, 0.0) ** 2 - np.log(len(value))
+    top_z, top_bic = max(z, key=lambda name: z[name]), max(bic, key=lambda name: bic[name])
+    return {"largest_z": top_z if z[top_z] > Z_LIMIT else "", "plain_bic": top_bic if bic[top_bic] > BIC_LIMIT else ""}

@@ -1,0 +1,40 @@
+"""Rays against a triangle mesh with Open3D (Embree), hits computed again in float64 on the plane of the triangle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
+
+
+class Surface:
+    """A mesh that answers rays. vertices: (v, 3) m, within some hundred metres of the origin; faces: (f, 3)."""
+
+    def __init__(self, vertices: Array, faces: Any) -> None:
+        import open3d as o3d
+
+        self.vertices, self.faces = vertices, faces
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32))
+        )
+
+    def cast(self, origin: Array, ray: Array) -> tuple[Array, Array]:
+        """Distance (n,) in lengths of `ray` (n, 3), NaN where nothing is hit, and unit normal (n, 3) of what is hit.
+
+        origin: (3,) or (n, 3).
+        """
+        import open3d as o3d
+
+        start = np.broadcast_to(origin, ray.shape)
+        found = self._scene.cast_rays(o3d.core.Tensor(np.concatenate([start, ray], axis=1).astype(np.float32)), nthreads=1)
+        face = found["primitive_ids"].numpy().astype(np.int64)
+        hit = np.isfinite(found["t_hit"].numpy())
+        corner = self.vertices[self.faces[np.where(hit, face, 0)]]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        along = np.einsum("ni,ni->n", ray, normal)
+        distance = np.einsum("ni,ni->n", corner[:, 0] - start, normal) / np.where(along == 0, np.nan, along)
+        return np.where(hit, distance, np.nan), normal

@@ -1,0 +1,144 @@
+"""How strongly an effect stands out, and from which other effects: distances between what they predict, the pose fitted away.
+
+For an effect on the mean the distance is that of Mahalanobis: white noise within cells, and between cells also the reference's
+error, correlated over metres. For an effect on the spread or on losses it is the square root of twice the Kullback-Leibler
+divergence per measurement, summed, which is the same thing for small effects. The distance to "nothing" is the signal-to-noise
+ratio; to the nearest other effect at its best parameters it is signal-to-noise x sin(angle between the signatures).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.gap_challenge.casting import Array
+
+Families = Mapping[str, Sequence[Array]]
+"""Candidates by name; each variant a design (n, k)."""
+_CELLS = 450
+_MOST_POINTS = 9000
+_LARGEST = 1e4
+
+
+@dataclass(frozen=True)
+class Strength:
+    """snr; nearest: the other effect that comes nearest; distance: to it, snr x sin(angle)."""
+
+    snr: float
+    nearest: str
+    distance: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """For the truth's file."""
+        return {"snr": min(self.snr, _LARGEST), "nearest": self.nearest, "snr_sin_angle": min(self.distance, _LARGEST)}
+
+
+class Whitener:
+    """Columns over points to columns of independent unit errors.
+
+    sigma: (n,) white; at: (n, 2) m; features: (n, f) shapes whose sum with independent normal weights is the correlated error.
+    """
+
+    def __init__(self, sigma: Array, at: Array, features: Array) -> None:
+        stride = max(len(sigma) // _MOST_POINTS, 1)
+        self.rows = slice(None, None, stride)
+        self._scale = np.sqrt(len(sigma) / len(sigma[self.rows]))
+        self._sigma = sigma[self.rows]
+        side = np.sqrt(np.prod(np.ptp(at, axis=0)) / _CELLS)
+        corner = np.floor((at[self.rows] - at.min(axis=0)) / side).astype(int)
+        self._cell = np.unique(corner[:, 0] * 100_000 + corner[:, 1], return_inverse=True)[1].ravel()
+        self._weight = np.bincount(self._cell, 1 / self._sigma**2)
+        mean = self._means(features[self.rows])
+        white = np.diag(1 / self._weight) / self._scale**2
+        self._root = np.linalg.cholesky(white + mean @ mean.T)
+
+    def _means(self, columns: Array) -> Array:
+        weighted = columns / self._sigma[:, None] ** 2
+        total = np.empty((len(self._weight), columns.shape[1]))
+        for index, column in enumerate(weighted.T):
+            total[:, index] = np.bincount(self._cell, column, len(self._weight))
+        return total / self._weight[:, None]
+
+    def __call__(self, columns: Array) -> Array:
+        """(n, k) or (n,) to (n' + cells, k)."""
+        chosen = columns.reshape(len(columns), -1)[self.rows]
+        mean = self._means(chosen)
+        within = (chosen - mean[self._cell]) / self._sigma[:, None] * self._scale
+        return np.concatenate([within, np.linalg.solve(self._root, mean)])
+
+
+def basis(columns: Array) -> Array:
+    """Orthonormal columns that span the same; columns that add nothing are left out."""
+    size = np.linalg.norm(columns, axis=0)
+    q, r = np.linalg.qr(columns / np.where(size > 0, size, 1.0))
+    return q[:, np.abs(np.diag(r)) > 1e-7]
+
+
+def mean_strength(name: str, signature: Array, base: Array, families: Families, whiten: Whitener) -> Strength:
+    """Of a mean effect with range or disparity errors `signature` (n,), after columns `base` (n, b) have been fitted."""
+    fixed = basis(whiten(base))
+    clean = _without(fixed, whiten(signature))[:, 0]
+    snr = float(np.linalg.norm(clean))
+    others = {other: _nearest(clean, fixed, variants, whiten) for other, variants in families.items() if other != name}
+    nearest = min(others, key=lambda other: others[other])
+    return Strength(snr, nearest, others[nearest])
+
+
+def _without(fixed: Array, columns: Array) -> Array:
+    return columns - fixed @ (fixed.T @ columns)
+
+
+def _nearest(clean: Array, fixed: Array, variants: Sequence[Array], whiten: Whitener) -> float:
+    widths = [variant.shape[1] for variant in variants]
+    columns = _without(fixed, whiten(np.concatenate(list(variants), axis=1)))
+    gram, cross, start, best = columns.T @ columns, columns.T @ clean, 0, 0.0
+    for width in widths:
+        part = slice(start, start + width)
+        matrix = gram[part, part]
+        best = max(best, float(cross[part] @ np.linalg.pinv(matrix, rcond=1e-9, hermitian=True) @ cross[part]))
+        start += width
+    return float(np.sqrt(max(clean @ clean - best, 0.0)))
+
+
+def spread_distance(true: Array, assumed: Array) -> float:
+    """Between normal errors of variances (n,)."""
+    ratio = true / assumed
+    return float(np.sqrt(max(np.sum(ratio - 1 - np.log(ratio)), 0.0)))
+
+
+def spread_strength(name: str, added: Array, variance: Array, forms: Mapping[str, Sequence[Array]]) -> Strength:
+    """Of an effect that adds a variance (n,) to what the model predicts; forms: of the other effects, to be scaled."""
+    true = variance + added
+    scales = np.concatenate([[0.0], np.geomspace(1e-3, 30, 60)])
+    others = {
+        other: min(
+            spread_distance(true, variance + scale * added.mean() / form.mean() * form) for form in several for scale in scales
+        )
+        for other, several in forms.items()
+        if other != name
+    }
+    snr = spread_distance(true, variance)
+    nearest = min(others, key=lambda other: others[other], default="")
+    return Strength(snr, nearest, others.get(nearest, snr))
+
+
+def loss_distance(true: Array, assumed: Array) -> float:
+    """Between chances of a loss (n,)."""
+    p, q = np.clip(true, 1e-6, 1 - 1e-6), np.clip(assumed, 1e-6, 1 - 1e-6)
+    return float(np.sqrt(max(2 * np.sum(p * np.log(p / q) + (1 - p) * np.log((1 - p) / (1 - q))), 0.0)))
+
+
+def scaled(snr_of: Callable[[float], float], target: float, most: float) -> float:
+    """The factor, at most `most`, at which a growing strength reaches its target; to a percent."""
+    low, high = most * 1e-6, most
+    if snr_of(high) <= target:
+        return most
+    for _ in range(40):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if snr_of(middle) < target else (low, middle)
+        if high < 1.01 * low:
+            break
+    return float(np.sqrt(low * high))

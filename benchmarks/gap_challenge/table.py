@@ -1,0 +1,123 @@
+"""The results as a page of the documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+Json = dict[str, Any]
+_ANSWERS = (
+    "right, alone",
+    "right, in a class",
+    "other effect only",
+    "wrong name",
+    "unknown",
+    "no_gap",
+    "insufficient_data",
+    "error",
+)
+
+
+def markdown(found: Json) -> str:
+    """docs/gap_challenge.md, from results.json."""
+    parts = [
+        "# The challenge of the missing effect",
+        f"{len(found['rows'])} measurements with hidden truth, made by `benchmarks/gap_challenge`, which shares no code with the "
+        "sensors or the diagnosis, each diagnosed by `scarpsim gap`. S/N: of the effect's signature after the pose fit, against "
+        "noise and the reference's correlated error; x sin(angle): what is left of it when the nearest "
+        "other effect is fitted too.",
+        _figures(found["figures"]),
+        f"A case took {found['seconds'].get('median', 0):.0f} s (median), {found['seconds'].get('longest', 0):.0f} s at most.",
+        "## Beside two baselines\n\nBoth take residuals for independent and give one name: the effect with the largest |z| above "
+        "3, and the best by BIC if by more than 10.\n\n" + _baselines(found),
+        "## What was answered\n\nclear: S/N x sin(angle) of 8 or more; weak: less.\n\n" + _by_effect(found["by_effect"]),
+        "## Detection\n\nSingle effects: found at all by S/N; right class by S/N x sin(angle).\n\n" + _curves(found["detection"]),
+        "## Coverage of the 90 % intervals\n\n" + _coverage(found["coverage"]),
+        "## All failures\n\n" + _failures(found["failures"]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    names = list(head)
+    lines = [names, ["---"] * len(names), *([str(cell) for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _figures(figures: list[Json]) -> str:
+    def value(row: Json) -> str:
+        if row["value"] is None:
+            return "no cases"
+        if "interval" in row:
+            low, high = row["interval"]
+            return f"{100 * row['value']:.1f} % ({row['successes']} of {row['count']}; 95 %: {100 * low:.0f}-{100 * high:.0f})"
+        return f"{100 * row['value']:.1f} % (of {row['count']})" if row["percent"] else f"{row['value']:g} (of {row['count']})"
+
+    reached = {True: "yes", False: "**no**", None: ""}
+    return _table(
+        ("what", "to reach", "found", "reached"), ((r["what"], r["goal"], value(r), reached[r["reached"]]) for r in figures)
+    )
+
+
+def _baselines(found: Json) -> str:
+    figures = {row["what"]: row for row in found["figures"]}
+    ours = [
+        figures[what] for what in list(figures) if what.startswith(("false alarms", "real change", "right class", "wrong names"))
+    ]
+    order = sorted(ours, key=lambda row: ("false", "real ", "right", "wrong").index(row["what"][:5]))
+    rows = [("scarpsim gap", *(f"{row['successes']} of {row['count']}" for row in order))]
+    for name, label in (("largest_z", "largest abs(z)"), ("plain_bic", "plain BIC")):
+        values = found["baselines"][name]
+        cells = (values[key] for key in ("false_alarms", "change_blamed", "right", "wrong_names"))
+        rows.append((label, *(f"{hits} of {count}" for hits, count in cells)))
+    return _table(("", "false alarms", "change blamed", "right class, clear", "wrong names among committed"), rows)
+
+
+def _by_effect(counts: Json) -> str:
+    rows = []
+    for key, answers in counts.items():
+        cells = []
+        for name in _ANSWERS:
+            clear, weak, plain = (answers.get(f"{prefix}{name}", 0) for prefix in ("clear: ", "weak: ", ""))
+            cells.append(f"{clear or ''}{f' (+{weak} weak)' if weak else ''}{plain or ''}".strip())
+        rows.append((key, *cells))
+    return _table(("truth", *_ANSWERS), rows)
+
+
+def _curves(detection: Json) -> str:
+    rows = []
+    for sensor, bins in detection.items():
+        for row in bins:
+            upper = "" if row["to"] is None else f"{row['to']:g}"
+            rows.append(
+                (
+                    sensor,
+                    f"{row['from']:g}-{upper}",
+                    f"{row['detected']} of {row['cases']}",
+                    f"{row['right']} of {row['cases_by_angle']}",
+                )
+            )
+    return _table(("sensor", "bin", "found at all", "right class"), rows)
+
+
+def _coverage(coverage: Json) -> str:
+    return _table(("parameter", "inside", "of"), ((key, row["inside"], row["count"]) for key, row in coverage.items()))
+
+
+def _failures(failures: list[Json]) -> str:
+    rows = (
+        (
+            f["case"],
+            f["sensor"],
+            f["stratum"],
+            f["wrong"],
+            "; ".join(f["true"]),
+            f"{f['verdict']}: {'; '.join(f['said'])}" + _last(f["error"]),
+        )
+        for f in sorted(failures, key=lambda f: (f["wrong"], f["sensor"]))
+    )
+    return _table(("case", "sensor", "stratum", "wrong", "truth", "answer"), rows)
+
+
+def _last(error: str) -> str:
+    return " ".join(error.strip().splitlines()[-1:]).replace("|", "/")
