@@ -14,7 +14,7 @@ import traceback
 from importlib import metadata
 from typing import Protocol
 
-from pipeline.cli import dataset, doctor, gap, init, inspect
+from pipeline.cli import calibrate, compare, dataset, doctor, gap, init, inspect
 from pipeline.cli import simulate as simulate_command
 from pipeline.cli.parser import Parser
 from scene.errors import InputError, nearest
@@ -45,6 +45,8 @@ class Command(Protocol):
 COMMANDS: dict[str, Command] = {
     "simulate": simulate_command,
     "inspect": inspect,
+    "compare": compare,
+    "calibrate": calibrate,
     "dataset": dataset,
     "gap": gap,
     "init": init,

@@ -43,6 +43,13 @@ def writing(path: Path) -> Iterator[Path]:
         _remove(temporary)
 
 
+def empty_folder(out: Path) -> Path:
+    """`out` itself, if it is new or empty; InputError, naming --out, where it is in use."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
+    return out
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `data`, whole or not at all."""
     with writing(path) as temporary:

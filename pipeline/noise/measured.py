@@ -101,8 +101,8 @@ def area_mask(areas: Sequence[Any], grid: Grid, where: str) -> BoolArray:
 
     Raises InputError, naming `where`, for an area that is neither.
     """
-    x: FloatArray = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
-    y: FloatArray = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
+    x = (grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd).astype(np.float64)
+    y = (grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd).astype(np.float64)
     mask = np.zeros(grid.shape, dtype=bool)
     for number, area in enumerate(areas):
         try:

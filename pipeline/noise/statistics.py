@@ -103,8 +103,9 @@ class Bin:
     of: DifferenceStatistics
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        return {"low": self.low, "high": self.high, **self.of.to_dict()}
+        """As JSON holds it: an infinite end is null."""
+        low, high = (end if np.isfinite(end) else None for end in (self.low, self.high))
+        return {"low": low, "high": high, **self.of.to_dict()}
 
 
 def binned(values: NDArray[np.floating], covariate: NDArray[np.floating], edges: Sequence[float] | FloatArray) -> list[Bin]:

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import SensorName, SimulationConfig
-from pipeline.formats.atomic import write_json
+from pipeline.formats.atomic import empty_folder, write_json
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.planning.maps import Plan, plan
 from pipeline.provenance import versions
 from pipeline.report.plan import write_plan_report
 from pipeline.site import prepare_site
-from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 
 PLAN_FILE = "plan.json"
@@ -29,8 +28,7 @@ def write_plans(out: Path, config: SimulationConfig, plans: Sequence[Plan]) -> P
 
     Raises InputError where the folder is in use.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
+    empty_folder(out)
     for each in plans:
         for found in each.maps:
             path = out / f"{each.sensor}_{found.name}.tif"

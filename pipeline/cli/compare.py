@@ -1,0 +1,67 @@
+"""`scarpsim compare`: several sensors on the same wall and the same blocks."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.parser import at_least, one_of
+
+SUMMARY = "compare sensors on one wall and the same blocks: noise, level of detection, smallest block, completeness"
+EXAMPLE = """  scarpsim compare my_site.yaml
+  scarpsim compare my_site.yaml riegl_vz400i glendale_high --epochs 8 --sizes-m 0.05 0.5 --measured my_epochs --out comparison"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "configs",
+        nargs="+",
+        metavar="CONFIG",
+        help="config file, run folder, sensor model file, or name of a bundled site, scanner or noise model; the first config's "
+        "wall and blocks are everybody's",
+    )
+    parser.add_argument("--measured", type=Path, nargs="+", default=[], metavar="FOLDER", help="measured epochs to put beside")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
+    parser.add_argument("--epochs", type=at_least(1), default=6, metavar="N", help="epochs in which rocks fall (default: 6)")
+    parser.add_argument(
+        "--blocks",
+        type=one_of("sweep", "config"),
+        default="sweep",
+        help="sizes that grow from epoch to epoch, or the config's blocks",
+    )
+    parser.add_argument(
+        "--sizes-m",
+        type=float,
+        nargs=2,
+        default=(0.05, 0.8),
+        metavar=("FIRST", "LAST"),
+        help="sizes of the sweep's blocks in the first and the last epoch (default: 0.05 0.8)",
+    )
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random numbers (default: the first config's)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="overrides",
+        metavar="KEY=VALUE",
+        help="override a key of every config, as a.b=c",
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from pipeline.cli.simulate import new_folder
+    from pipeline.formats.atomic import empty_folder
+    from pipeline.noise.comparison import compare_sensors
+    from pipeline.noise.contestants import contestants
+    from pipeline.progress import shown_progress
+    from pipeline.report.comparison import summary, write_comparison
+
+    sensors = contestants(arguments.configs, arguments.overrides, arguments.seed)
+    out = empty_folder(arguments.out or new_folder(Path("runs"), "compare"))
+    sizes = tuple(arguments.sizes_m) if arguments.blocks == "sweep" else None
+    with shown_progress(quiet=arguments.quiet) as progress:
+        comparison = compare_sensors(sensors, arguments.measured, arguments.epochs, sizes, progress)
+    report = write_comparison(out, comparison)
+    print(f"{summary(comparison)}\nreport: {report}")
+    return 0

@@ -1,0 +1,54 @@
+"""`scarpsim compare` as one call: the trial, its figures, and measured epochs beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.noise.assess import Assessment, Noise, assess, assess_measured
+from pipeline.noise.compare import Trial, compare
+from pipeline.noise.contestants import Contestant
+from pipeline.noise.measured import MeasuredMaps, read_measured
+from pipeline.progress import Progress
+from scene.keyed_random import KeyedRandom
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A trial with its figures, and measured epochs with theirs. config: the first sensor's, as JSON types."""
+
+    trial: Trial
+    found: list[Assessment]
+    measured: list[tuple[MeasuredMaps, Noise]]
+    config: dict[str, Any]
+
+    def noises(self) -> dict[str, Noise]:
+        """Noise by name, the measured epochs' last."""
+        return {each.name: each.noise for each in self.found} | {
+            f"{maps.name} (measured)": noise for maps, noise in self.measured
+        }
+
+
+def compare_sensors(
+    sensors: Sequence[Contestant],
+    measured: Sequence[Path] = (),
+    epochs: int = 6,
+    sizes_m: tuple[float, float] | None = (0.05, 0.8),
+    progress: Progress | None = None,
+) -> Comparison:
+    """Compare sensors as `pipeline.noise.compare.compare` does, and put measured epochs beside them.
+
+    measured: folders as `read_measured` takes them, at the first config's GSD and registered by its ICP. They are read first, as
+    a mistake there should not cost a simulation.
+    """
+    progress = progress or Progress()
+    config = sensors[0].config
+    random = KeyedRandom(config.seed)
+    maps = [read_measured(folder, config.difference, config.icp, random.child("measured", folder.name)) for folder in measured]
+    trial = compare(sensors, epochs, sizes_m, progress)
+    with progress.stage("figures"):
+        found = [assess(trial, seen, random) for seen in trial.seen]
+        beside = [(each, assess_measured(each, random)) for each in maps]
+    return Comparison(trial, found, beside, config.model_dump(mode="json"))

@@ -1,0 +1,274 @@
+"""Which blocks a difference map shows: the level of detection of a pixel and of a block, and the curve over block sizes.
+
+A pixel's level of detection is what noise alone exceeds in 5 % of cases: the 95 % quantile of |difference| over stable pixels of
+all epochs, in square cells of the wall. It assumes no distribution.
+
+A block of n pixels counts as seen where the mean D of its differences exceeds the level of detection of a mean,
+
+    D > LoD = z s sqrt(V / C(0)),      z = 1.96,   s = level of detection of its pixels / z,
+
+with V the variance of a mean over just these pixels and C(0) that of a pixel, both from the variogram, which carries how far
+noise is alike (Rolstad et al. 2009), and s the noise around the block (root mean square over it), which carries that noise
+differs over the wall (Hugonnet et al. 2022). A block of which less than half has data, or fewer than four pixels, is not seen.
+The test is held against the truth: the same footprints, laid on stable ground, should be taken for blocks in 2.5 % of cases, and
+how often they are is reported.
+
+Over block sizes x the share seen follows P(x) = (1 - l) Phi((ln x - m) / w), by maximum likelihood; l is the share of blocks that
+no size makes visible, as they lie where the sensor does not look.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, optimize, special
+
+from pipeline.noise.variogram import VariogramModel, variance_of_mean
+from scene.keyed_random import KeyedRandom
+from scene.mesh import WALL, FloatArray, IntArray
+
+BoolArray = NDArray[np.bool_]
+Z_95 = 1.96
+LEAST_PIXELS = 4
+LEAST_SHARE = 0.5
+"""Of a block's footprint that has to have data."""
+LEAST_CELL_PIXELS = 40
+"""Stable differences that a cell of the level of detection needs."""
+_RESAMPLES = 100
+_PLACES = 10
+"""Where on the stable ground each footprint is laid."""
+_WIDTHS, _LAPSES = (0.02, 1.5), (0.0, 0.9)
+
+
+def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np.float32]:
+    """(h, w) m: the 95 % quantile of |difference| over the stable pixels of a square cell, of all epochs.
+
+    stable: (e, h, w) differences, m, NaN where not stable or without data. Cells with fewer than 40 take the median cell's value;
+    all NaN where no cell has so many.
+    """
+    _, height, width = stable.shape
+    rows, columns = -(-height // cell_px), -(-width // cell_px)
+    padded = np.full((len(stable), rows * cell_px, columns * cell_px), np.nan, dtype=np.float32)
+    padded[:, :height, :width] = np.abs(stable)
+    cells = padded.reshape(-1, rows, cell_px, columns, cell_px).transpose(1, 3, 0, 2, 4).reshape(rows * columns, -1)
+    ordered = np.sort(cells, axis=1)  # NaN last
+    count = np.count_nonzero(~np.isnan(ordered), axis=1)
+    place = np.minimum(np.ceil(0.95 * count).astype(int), np.maximum(count, 1)) - 1
+    level = np.where(count >= LEAST_CELL_PIXELS, ordered[np.arange(len(ordered)), np.maximum(place, 0)], np.nan)
+    middle = np.nanmedian(level) if np.isfinite(level).any() else np.nan
+    level = np.where(np.isnan(level), middle, level).reshape(rows, columns)
+    return np.repeat(np.repeat(level, cell_px, axis=0), cell_px, axis=1)[:height, :width].astype(np.float32)
+
+
+@dataclass(frozen=True)
+class BlockSeen:
+    """What a difference map shows of a block.
+
+    size_m: geometric mean of its three axes; depth_m: true mean depth over its footprint; footprint_px: pixels of the map on
+    which it changed the wall; data_share: of these, with data; mean_m: of the differences there, None with too little data;
+    limit_m: level of detection of that mean; volume_m3, measured_volume_m3: true, and sum of the differences over the footprint.
+    """
+
+    epoch: int
+    label: int
+    size_m: float
+    depth_m: float
+    footprint_px: int
+    data_share: float
+    mean_m: float | None
+    limit_m: float | None
+    volume_m3: float
+    measured_volume_m3: float
+    seen: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON and CSV hold it."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class MeanTest:
+    """The test of a block's mean: the noise's model and the level of detection of every pixel, (h, w), m."""
+
+    model: VariogramModel
+    level: NDArray[np.float32]
+    gsd_m: float
+
+    def limit_m(self, footprint: BoolArray, window: tuple[slice, slice]) -> float:
+        """The level of detection of the mean over a footprint (n, m), which lies in `window` of the map."""
+        level = self.level[window][footprint].astype(np.float64)
+        share = variance_of_mean(self.model, footprint, self.gsd_m) / self.model.sill_m2 if self.model.sill_m2 > 0 else 0.0
+        return float(np.sqrt(np.mean(level**2) * share))
+
+    def mean_and_limit(
+        self, change: NDArray[np.floating], footprint: BoolArray, window: tuple[slice, slice]
+    ) -> tuple[float | None, float | None]:
+        """Mean of the differences over the part of a footprint with data, m, and its limit; None where too little has data."""
+        values = change[window]
+        known = footprint & ~np.isnan(values)
+        count = np.count_nonzero(known)
+        if count < max(LEAST_PIXELS, LEAST_SHARE * np.count_nonzero(footprint)):
+            return None, None
+        return float(np.mean(values[known], dtype=np.float64)), self.limit_m(known, window)
+
+
+def footprints(block: IntArray, true_change: NDArray[np.floating]) -> Iterator[tuple[int, tuple[slice, slice], BoolArray]]:
+    """Label, window of the map and footprint in it of each block: the pixels of its label where the wall receded."""
+    receded = np.where(true_change > 0, block, WALL)
+    for label, window in enumerate(ndimage.find_objects(receded), start=1):
+        if window is not None:
+            yield label, window, receded[window] == label
+
+
+def blocks_seen(
+    epoch: int,
+    change: NDArray[np.floating],
+    block: IntArray,
+    true_change: NDArray[np.floating],
+    records: Sequence[dict[str, Any]],
+    test: MeanTest,
+) -> list[BlockSeen]:
+    """What the map `change` (h, w), m, of an epoch shows of each of its blocks.
+
+    block, true_change: (h, w) labels and change of the wall as it really is, reference minus epoch, m; records: of blocks.json.
+    """
+    found = {label: (window, footprint) for label, window, footprint in footprints(block, true_change)}
+    nowhere = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), dtype=bool)
+    area = test.gsd_m**2
+    result = []
+    for record in records:
+        window, footprint = found.get(record["label"], nowhere)
+        count = int(np.count_nonzero(footprint))
+        differences = change[window][footprint]
+        mean, limit = test.mean_and_limit(change, footprint, window)
+        result.append(
+            BlockSeen(
+                epoch=epoch,
+                label=record["label"],
+                size_m=float(np.prod(record["size_m"]) ** (1 / 3)),
+                depth_m=float(np.mean(true_change[window][footprint], dtype=np.float64)) if count else 0.0,
+                footprint_px=count,
+                data_share=float(np.mean(~np.isnan(differences))) if count else 0.0,
+                mean_m=mean,
+                limit_m=limit,
+                volume_m3=record["volume_m3"],
+                measured_volume_m3=float(np.nansum(differences, dtype=np.float64) * area),
+                seen=mean is not None and limit is not None and mean > limit,
+            )
+        )
+    return result
+
+
+def false_alarms(
+    stable: NDArray[np.floating], shapes: Sequence[BoolArray], test: MeanTest, random: KeyedRandom
+) -> tuple[int, int]:
+    """How many footprints, laid at random on the stable ground of one map (h, w), would be taken for blocks; and of how many."""
+    generator = random.generator()
+    alarms = trials = 0
+    for shape in [shape for shape in shapes for _ in range(_PLACES)]:
+        rows, columns = (full - part for full, part in zip(stable.shape, shape.shape, strict=True))
+        if rows <= 0 or columns <= 0:
+            continue
+        row, column = int(generator.integers(rows)), int(generator.integers(columns))
+        window = (slice(row, row + shape.shape[0]), slice(column, column + shape.shape[1]))
+        mean, limit = test.mean_and_limit(stable, shape, window)
+        if mean is not None and limit is not None:
+            trials, alarms = trials + 1, alarms + (mean > limit)
+    return alarms, trials
+
+
+@dataclass(frozen=True)
+class DetectionCurve:
+    """P(x) = (1 - lapse) Phi((ln x - ln middle) / width), fitted to `count` blocks of sizes from smallest_m to largest_m.
+
+    smallest_95_m: the size from which 95 % are seen, with the 2.5 and 97.5 % quantiles of its bootstrap distribution over blocks;
+    None where the curve stays below 95 %; an interval's end is None where that holds for the resamples.
+    """
+
+    count: int
+    smallest_m: float
+    largest_m: float
+    middle_m: float
+    width: float
+    lapse: float
+    smallest_95_m: float | None
+    interval_m: tuple[float | None, float | None]
+
+    def probability(self, size_m: FloatArray) -> FloatArray:
+        """The share seen at sizes, m."""
+        return (1 - self.lapse) * special.ndtr((np.log(size_m) - np.log(self.middle_m)) / self.width)
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether the smallest block lies outside of the sizes that were simulated."""
+        return self.smallest_95_m is not None and not self.smallest_m <= self.smallest_95_m <= self.largest_m
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {**dataclasses.asdict(self), "extrapolated": self.extrapolated}
+
+
+def detection_curve(size_m: FloatArray, seen: BoolArray, random: KeyedRandom, share: float = 0.95) -> DetectionCurve | None:
+    """Fit the curve to blocks of sizes (k,), m, seen or not (k,); None for fewer than ten blocks."""
+    if len(size_m) < 10:
+        return None
+    log_size = np.log(size_m)
+    fitted = _likeliest(log_size, seen)
+    generator = random.generator()
+    draws = generator.integers(len(seen), size=(_RESAMPLES, len(seen)))
+    resampled = [_size_at(share, *_likeliest(log_size[draw], seen[draw], start=fitted)) for draw in draws]
+    low, high = np.quantile(resampled, [0.025, 0.975], method="nearest")  # infinite where a resample's curve stays below
+    middle, width, lapse = fitted
+    return DetectionCurve(
+        len(seen),
+        float(size_m.min()),
+        float(size_m.max()),
+        float(np.exp(middle)),
+        width,
+        lapse,
+        _finite(_size_at(share, *fitted)),
+        (_finite(low), _finite(high)),
+    )
+
+
+def _likeliest(
+    log_size: FloatArray, seen: BoolArray, start: tuple[float, float, float] | None = None
+) -> tuple[float, float, float]:
+    """Middle (of the logarithms), width and lapse of the greatest likelihood, within wide bounds."""
+    low, high = float(log_size.min()), float(log_size.max())
+    bounds = [(low - 1.0, high + 1.0), _WIDTHS, _LAPSES]
+
+    def cost(parameters: FloatArray) -> float:
+        middle, width, lapse = parameters
+        share = np.clip((1 - lapse) * special.ndtr((log_size - middle) / width), 1e-9, 1 - 1e-9)
+        return -float(np.sum(np.where(seen, np.log(share), np.log1p(-share))))
+
+    crossing = low if seen.all() else float(np.mean([log_size[~seen].mean(), log_size[seen].mean() if seen.any() else high]))
+    starts = [start] if start else [(middle, width, 0.02) for middle in (low, crossing, high) for width in (0.1, 0.4)]
+    found = [optimize.minimize(cost, at, method="L-BFGS-B", bounds=bounds) for at in starts]
+    middle, width, lapse = min(found, key=lambda each: each.fun).x.tolist()
+    return middle, width, lapse
+
+
+def _size_at(share: float, middle: float, width: float, lapse: float) -> float:
+    """The size, m, at which the curve reaches a share; infinite where it does not."""
+    return float(np.exp(middle + width * special.ndtri(share / (1 - lapse)))) if share < 1 - lapse else np.inf
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's (1927) 95 % interval of a share."""
+    if trials == 0:
+        return 0.0, 1.0
+    share, factor = successes / trials, Z_95**2 / trials
+    middle = (share + factor / 2) / (1 + factor)
+    half = Z_95 * np.sqrt(share * (1 - share) / trials + factor / (4 * trials)) / (1 + factor)
+    return float(max(middle - half, 0.0)), float(min(middle + half, 1.0))

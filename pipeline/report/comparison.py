@@ -1,0 +1,231 @@
+"""The folder that `scarpsim compare` fills: comparison.json, CSV tables, GeoTIFFs, pictures and report.html."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pipeline.formats.atomic import write_bytes, write_json, write_text
+from pipeline.formats.geotiff import write_geotiff
+from pipeline.noise.assess import Assessment, grid_record, shared_scale_m
+from pipeline.noise.compare import Trial
+from pipeline.noise.comparison import Comparison
+from pipeline.products import write_cloud
+from pipeline.provenance import versions
+from pipeline.recorded_points import recorded_points
+from pipeline.report.comparison_figures import (
+    MapPanel,
+    covariate_figure,
+    detection_figure,
+    level_limit_m,
+    noise_figure,
+    scale_limit_m,
+    side_by_side,
+    table_figure,
+)
+from pipeline.report.page import template
+
+COMPARISON_FILE = "comparison.json"
+_NOTHING = "\N{EN DASH}"
+
+
+def write_comparison(out: Path, comparison: Comparison) -> Path:
+    """Write everything; returns the report's path. Each file is whole or absent."""
+    trial, found = comparison.trial, comparison.found
+    sizes = _write_products(out, comparison)
+    write_csv(out / "noise.csv", _noise_rows(comparison))
+    write_csv(out / "by_covariate.csv", _covariate_rows(found))
+    write_csv(out / "detection.csv", _class_rows(found))
+    write_csv(out / "blocks.csv", ({"sensor": each.name, **b.to_dict()} for each in found for b in each.detection.blocks))
+    pictures = _pictures(comparison)
+    for name, png in pictures.items():
+        write_bytes(out / name, png)
+    record = {
+        "schema": 1,
+        "seed": comparison.config["seed"],
+        "epochs": len(trial.epochs),
+        "grid": grid_record(trial.grid),
+        "sensors": [{**each.to_dict(), "bytes": sizes[each.name]} for each in found],
+        "measured": [{"name": maps.name, "points": maps.points, "noise": noise.to_dict()} for maps, noise in comparison.measured],
+        "config": comparison.config,
+        "versions": versions(),
+    }
+    write_json(out / COMPARISON_FILE, record)
+    page = template("comparison.html.jinja").render(
+        title="Sensors compared",
+        answers=[answer(each) for each in found],
+        names=list(comparison.noises()),
+        rows=_rows(comparison, sizes),
+        pictures=pictures,
+        epoch=_shown(trial),
+        measured=[maps for maps, _ in comparison.measured],
+        config=yaml.safe_dump(comparison.config, sort_keys=False, allow_unicode=True),
+    )
+    write_text(out / "report.html", page)
+    return out / "report.html"
+
+
+def answer(found: Assessment) -> str:
+    """The sentence that people ask for: the smallest block that a sensor sees in 95 % of cases."""
+    curve = found.detection.by_size
+    if curve is None:
+        return f"{found.name}: too few blocks fell to say which are seen."
+    if curve.smallest_95_m is None:
+        return f"{found.name}: no size is seen in 95 % of cases; {curve.lapse:.0%} of the blocks stay unseen whatever their size."
+    if curve.smallest_95_m < curve.smallest_m:
+        return f"{found.name}: sees 95 % of the smallest blocks that fell, {100 * curve.smallest_m:.1f} cm."
+    if curve.smallest_95_m > curve.largest_m:
+        return f"{found.name}: sees less than 95 % of the largest blocks that fell, {100 * curve.largest_m:.0f} cm."
+    low, high = (_NOTHING if end is None else f"{100 * end:.1f}" for end in curve.interval_m)
+    return (
+        f"{found.name}: the smallest block seen in 95 % of cases has a size of {100 * curve.smallest_95_m:.1f} cm "
+        f"(95 % interval {low} to {high} cm)."
+    )
+
+
+def summary(comparison: Comparison) -> str:
+    """The main figures as lines of text."""
+    lines = [f"{name}: stable ground {noise.stable.summary()}" for name, noise in comparison.noises().items()]
+    return "\n".join(lines + [answer(each) for each in comparison.found])
+
+
+def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write rows with the first one's keys as the header; None is empty. Nothing is written where there are no rows."""
+    rows = list(rows)
+    if not rows:
+        return
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    table.writeheader()
+    table.writerows({key: "" if value is None else value for key, value in row.items()} for row in rows)
+    write_text(path, text.getvalue())
+
+
+def _write_products(out: Path, comparison: Comparison) -> dict[str, dict[str, int]]:
+    """Write maps, level of detection and the reference's points of each sensor; returns files' sizes by sensor, bytes."""
+    trial, sizes = comparison.trial, {}
+    for seen, each in zip(trial.seen, comparison.found, strict=True):
+        folder = out / each.name
+        for epoch, change in zip(trial.epochs, seen.changes, strict=True):
+            path = folder / f"difference_{epoch.number:03d}.tif"
+            write_geotiff(path, change, trial.grid, description="reference minus epoch, m; missing rock is positive")
+        write_geotiff(folder / "level_of_detection.tif", each.noise.level, trial.grid, description="95 % level of detection, m")
+        write_cloud(folder / "points.laz", recorded_points(seen.reference.observations))
+        sizes[each.name] = {name: (folder / name).stat().st_size for name in ("points.laz", "difference_001.tif")}
+    return sizes
+
+
+def _shown(trial: Trial) -> int:
+    """The epoch in the pictures: the middle one, whose blocks are neither all seen nor all missed."""
+    return trial.epochs[len(trial.epochs) // 2].number
+
+
+def _pictures(comparison: Comparison) -> dict[str, bytes]:
+    trial, found, noises = comparison.trial, comparison.found, comparison.noises()
+    number = _shown(trial)
+    epoch = trial.epochs[number - 1]
+    limit = scale_limit_m(shared_scale_m(list(noises.values())))
+    maps = [
+        MapPanel(f"{each.name}, epoch {number}", seen.changes[number - 1], trial.grid, epoch.block)
+        for each, seen in zip(found, trial.seen, strict=True)
+    ] + [MapPanel(f"{maps.name} (measured)", maps.maps[0], maps.grid) for maps, _ in comparison.measured]
+    grids = [trial.grid] * len(found) + [maps.grid for maps, _ in comparison.measured]
+    levels = [MapPanel(name, noise.level, grid) for (name, noise), grid in zip(noises.items(), grids, strict=True)]
+    level_limit = level_limit_m(list(noises.values()))
+    return {
+        "maps.png": side_by_side(maps, limit, "reference minus epoch, mm; missing rock is positive", signed=True),
+        "level_of_detection.png": side_by_side(levels, level_limit, "95 % level of detection of a pixel, mm", signed=False),
+        "noise.png": noise_figure(noises),
+        "by_covariate.png": covariate_figure(found),
+        "detection.png": detection_figure(found),
+        "size_and_depth.png": table_figure(found),
+    }
+
+
+def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> list[tuple[str, list[str]]]:
+    """The table of the report: a title and one text a sensor, the measured epochs last."""
+    noises, found = list(comparison.noises().values()), comparison.found
+    blank = [_NOTHING] * len(comparison.measured)
+
+    def simulated(values: Sequence[str]) -> list[str]:
+        return [*values, *blank]
+
+    measured_points = [f"{maps.points[0]:,}" if maps.points else _NOTHING for maps, _ in comparison.measured]
+    return [
+        ("Stable ground: median", [_mm(each.stable.median) for each in noises]),
+        ("Stable ground: StD", [_mm(each.stable.standard_deviation) for each in noises]),
+        ("Stable ground: RMSE", [_mm(each.stable.rmse) for each in noises]),
+        ("Stable ground: NMAD", [_mm(each.stable.nmad) for each in noises]),
+        ("Beyond 3 NMAD (normal: 0.27 %)", [f"{each.tails.beyond_3_nmad:.2%}" for each in noises]),
+        ("Excess kurtosis", [f"{each.tails.excess_kurtosis:.1f}" for each in noises]),
+        ("Normality, p", [_NOTHING if each.normality.p_value is None else f"{each.normality.p_value:.2g}" for each in noises]),
+        ("Variogram (StD and range)", [each.model.summary() for each in noises]),
+        ("Independent pixels of an epoch", [f"{each.effective:,.0f} of {each.pixels:,}" for each in noises]),
+        ("Level of detection of a pixel, 95 %: median", [_mm(each.median_level_m) for each in noises]),
+        ("Whole wall, against the truth: RMSE", simulated([_mm(each.wall.rmse) for each in found])),
+        ("Whole wall, against the truth: NMAD", simulated([_mm(each.wall.nmad) for each in found])),
+        (
+            "Blocks seen",
+            simulated([f"{sum(b.seen for b in each.detection.blocks)} of {len(each.detection.blocks)}" for each in found]),
+        ),
+        (
+            "Stable ground taken for a block (2.5 % expected)",
+            simulated([f"{each.detection.alarms} of {each.detection.trials:,}" for each in found]),
+        ),
+        ("Wall that the sensor can see", simulated([f"{each.visible:.1%}" for each in found])),
+        ("Hidden (occlusion)", simulated([f"{1 - each.visible:.1%}" for each in found])),
+        ("Wall with data (completeness)", simulated([f"{each.complete:.1%}" for each in found])),
+        ("Visible wall with data", simulated([f"{each.complete_of_visible:.1%}" for each in found])),
+        ("Points of the reference", [f"{each.points:,}" for each in found] + measured_points),
+        ("Time to measure", simulated([_seconds(each.scan_seconds) for each in found])),
+        ("Time to simulate an epoch", simulated([_seconds(each.seconds) for each in found])),
+        ("Size of points.laz", simulated([_megabytes(sizes[each.name]["points.laz"]) for each in found])),
+        ("Size of a difference map", simulated([_megabytes(sizes[each.name]["difference_001.tif"]) for each in found])),
+        (
+            "Registration: RMS of the inliers",
+            simulated([_NOTHING if each.registration_rms_m is None else _mm(each.registration_rms_m) for each in found]),
+        ),
+    ]
+
+
+def _noise_rows(comparison: Comparison) -> Iterable[dict[str, Any]]:
+    for name, noise in comparison.noises().items():
+        for number, each in enumerate([noise.stable, *noise.per_epoch]):
+            yield {
+                "sensor": name,
+                "epoch": number or "all",
+                **each.to_dict(),
+                **(noise.tails.to_dict() if number == 0 else dict.fromkeys(noise.tails.to_dict())),
+                "sill_m2": noise.model.sill_m2,
+                "effective_sample_size": noise.effective,
+            }
+
+
+def _covariate_rows(found: Sequence[Assessment]) -> Iterable[dict[str, Any]]:
+    for each in found:
+        for name, bins in each.by.items():
+            yield from ({"sensor": each.name, "covariate": name, **item.to_dict()} for item in bins)
+
+
+def _class_rows(found: Sequence[Assessment]) -> Iterable[dict[str, Any]]:
+    for each in found:
+        for name, classes in (("size", each.detection.size_classes), ("depth", each.detection.depth_classes)):
+            yield from ({"sensor": each.name, "by": name, **item.to_dict()} for item in classes)
+
+
+def _mm(metres: float | None) -> str:
+    return _NOTHING if metres is None or np.isnan(metres) else f"{metres * 1e3:.1f} mm"
+
+
+def _seconds(seconds: float | None) -> str:
+    return _NOTHING if seconds is None else f"{seconds:.1f} s"
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
