@@ -48,8 +48,9 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
     """The difference maps of a folder with measurement.yaml, or of one with GeoTIFFs difference_*.tif (all *.tif where none is
     so called) that share a grid.
 
-    icp: registration of each epoch's points to the reference, none: they are where they should be. Raises InputError where the
-    folder holds neither.
+    config: side of the pixels, at least; that of maps out of points is no smaller than the points' spacing, as most pixels would
+    be empty. icp: registration of each epoch's points to the reference, none: they are where they should be. Raises InputError
+    where the folder holds neither.
     """
     if (folder / FILE).is_file():
         return _from_points(folder, config, icp, random)
@@ -66,8 +67,7 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
 
 def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
     measurement = read_measurement(folder)
-    grid = raster_grid(measurement.reference.bounds, config)
-    cloud = measurement.cloud
+    cloud, bounds = measurement.cloud, measurement.reference.bounds
     epoch = cloud.extra.get("epoch", np.zeros(len(cloud.points), dtype=np.int64))
     clouds = [cloud.points[epoch == number] for number in np.unique(epoch)]
     target = ReferenceSurface.build(measurement.reference.vertices, measurement.reference.vertex_normals()) if icp else None
@@ -76,10 +76,17 @@ def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, 
         if target is not None and icp is not None:
             registrations.append(register_to(target, points, icp, random.child("register", number)))
             clouds[number] = registrations[-1].apply(points)
+    grid = raster_grid(bounds, DifferenceConfig(gsd_m=max(config.gsd_m, max(map(_spacing, clouds)))))
     maps = np.stack([point_differences(measurement.scene, points, grid) for points in clouds])
     areas = parse(MeasurementConfig, load_yaml(folder / FILE), str(folder / FILE)).stable_areas
     stable = area_mask(areas, grid, str(folder / FILE)) if areas else None
     return MeasuredMaps(folder.name, grid, maps, stable, tuple(map(len, clouds)), tuple(registrations))
+
+
+def _spacing(points: FloatArray) -> float:
+    """The side of the square that a point has to itself in the wall's plane, m."""
+    low, high = np.quantile(points[:, :2], [0.01, 0.99], axis=0)
+    return float(np.sqrt(np.prod(high - low) / len(points)))
 
 
 def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> NDArray[np.float32]:

@@ -41,6 +41,7 @@ _SECTOR = np.tan(np.radians(22.5))
 """Directions within 22.5 degrees of an axis count as along it."""
 _WORTH = 0.8
 """A further structure has to bring the cost below this share of what it is without."""
+_MODEL_ERROR = 0.03
 _GOOD_ENOUGH = 0.01
 """Relative misfit from which a further structure is not looked for."""
 
@@ -171,7 +172,7 @@ class VariogramModel:
 def fit_variogram(found: Variogram) -> VariogramModel:
     """The model that makes the relative misfit of all bins least; a second structure, or a first, only where it is worth it.
 
-    All bins count alike: they have so many pairs that the model, not the sampling, limits the fit.
+    Bins count alike but for those of few pairs: the model is taken to be good to 3 %, n pairs tell a semivariance to sqrt(2 / n).
     """
     if not found.semivariance_m2.max() > 0:
         return VariogramModel(0.0, ())
@@ -187,15 +188,16 @@ def fit_variogram(found: Variogram) -> VariogramModel:
 
 def _fitted(found: Variogram, families: tuple[Family, ...]) -> VariogramModel:
     """The least relative misfit with structures of these families: ranges by search, sills by non-negative least squares."""
+    weight = 1 / np.sqrt(1 + 2 / (np.maximum(found.pairs, 1) * _MODEL_ERROR**2))
     lag, gamma = found.lag_m, np.maximum(found.semivariance_m2, 1e-6 * found.semivariance_m2.max())
 
     def solved(log_ranges: FloatArray) -> VariogramModel:
         ranges = np.sort(np.exp(log_ranges))
         units = [Structure(family, 1.0, float(a)) for family, a in zip(families, ranges, strict=True)]
         columns = np.stack([np.ones(len(lag)), *(unit.share(lag) for unit in units)], axis=1)
-        sills, residual = optimize.nnls(columns / gamma[:, None], np.ones(len(lag)))
+        sills, residual = optimize.nnls(columns / gamma[:, None] * weight[:, None], weight)
         parts = tuple(dataclasses.replace(unit, sill_m2=float(sill)) for unit, sill in zip(units, sills[1:], strict=True))
-        return VariogramModel(float(sills[0]), parts, float(residual / np.sqrt(len(lag))))
+        return VariogramModel(float(sills[0]), parts, float(residual / np.linalg.norm(weight)))
 
     if not families:
         return solved(np.zeros(0))

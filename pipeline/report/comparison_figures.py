@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from pipeline.noise.assess import Assessment, Noise, SizeClass
@@ -114,7 +114,7 @@ def covariate_figure(found: Sequence[Assessment]) -> bytes:
         if key == "edge_m":
             _metric(axes)
         dress(axes, label, "NMAD, mm")
-        axes.set_ylim(bottom=0)
+    panels[0].set_ylim(bottom=0)
     _grid_and_legend(figure, list(panels))
     return png_bytes(figure)
 
@@ -155,9 +155,8 @@ def table_figure(found: Sequence[Assessment]) -> bytes:
         size = [item.low_m for item in detection.size_classes] + [detection.size_classes[-1].high_m]
         depth = [item.low_m for item in detection.depth_classes] + [detection.depth_classes[-1].high_m]
         image = axes.pcolormesh(size, depth, 100 * detection.table.T, cmap=SEQUENTIAL, vmin=0, vmax=100)
-        _metric(axes)
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        _metric(axes, both=True)
         axes.set_title(each.name, fontsize=10, loc="left")
         dress(axes, "size of the block, m", "mean depth of the niche, m")
     bar = figure.colorbar(image, ax=row.tolist(), pad=0.01)
@@ -193,11 +192,13 @@ def _colours(count: int) -> list[str]:
     return [FAMILY[number % len(FAMILY)] for number in range(count)]
 
 
-def _metric(axes: Axes) -> None:
-    """A logarithmic axis of metres with plain numbers."""
+def _metric(axes: Axes, *, both: bool = False) -> None:
+    """A logarithmic axis of metres, or two, with plain numbers."""
     axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    for axis in (axes.xaxis, axes.yaxis) if both else (axes.xaxis,):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def _grid_and_legend(figure: Figure, panels: Sequence[Axes]) -> None:
