@@ -204,10 +204,11 @@ def pair(stratum: str, true: str = "", said: str = "", others: tuple[str, ...] =
     effects = (
         [{"name": true, "parameters": {"offset_m": 0.01}, "snr": 30.0, "nearest": "x", "snr_sin_angle": 20.0}] if true else []
     )
+    closed = {name: {"fitted": share, "held_out": share} for name, share in ((true, 1.0), ("b", 0.03))}
     truth = {
         "number": 1, "sensor": "tls", "stratum": stratum, "points": 1, "fields": [], "known": [],
         "effects": effects, "changes": [],
-        "baselines": {"largest_z": "", "plain_bic": ""}, "closed_by": {true: 1.0, "b": 0.03, "c": 0.5} if true else {},
+        "baselines": {"largest_z": "", "plain_bic": ""}, "closed_by": closed if true else {},
     }  # fmt: skip
     entry = {"name": f"tls.{said}", "kind": "physical", "cannot_be_told_from": [f"tls.{o}" for o in others]}
     entry["parameters"] = {"offset_m": {"value": 0.0101, "std": 0.0001}}

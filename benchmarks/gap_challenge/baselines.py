@@ -27,7 +27,8 @@ class Data:
 
 
 def rivals(data: Data, families: Families, forms: Mapping[str, Sequence[Array]], truth: list[Array]) -> dict[str, Any]:
-    """The baselines' answers, and for each effect on the mean the share of the gap that it closes where `truth` closes all."""
+    """The baselines' answers, and for each effect on the mean the share of the gap that it closes where `truth` closes all:
+    on the blocks of its fit, by which the best is chosen, and on held-out blocks, by which it is judged."""
     sound = _sound(data)
     rows = sound[:: max(len(sound) // _MOST_POINTS, 1)]
     weight = 1 / data.sigma[rows, None]
@@ -38,8 +39,10 @@ def rivals(data: Data, families: Families, forms: Mapping[str, Sequence[Array]],
     held_out = (corner[:, 0] + 2 * corner[:, 1]) % 5 == 0
     shares = {}
     if len(truth) == 1:
-        full = _gain(pose, truth[0][rows, None] * weight, value, held_out)
-        shares = {name: max(_gain(pose, d, value, held_out) for d in variants) / full for name, variants in designs.items()}
+        full = _gains(pose, truth[0][rows, None] * weight, value, held_out)
+        for name, variants in designs.items():
+            best = max((_gains(pose, design, value, held_out) for design in variants), key=lambda gains: gains[0])
+            shares[name] = {"fitted": best[0] / full[0], "held_out": best[1] / full[1]}
     relative = {name: [form[rows] / data.sigma[rows] ** 2 for form in several] for name, several in forms.items()}
     return {"baselines": _answers(pose, designs, value, relative), "closed_by": shares}
 
@@ -54,14 +57,15 @@ def _sound(data: Data) -> Array:
     return kept
 
 
-def _gain(pose: Array, design: Array, value: Array, held_out: Array) -> float:
-    """Drop of the weighted squares on held-out blocks when `design` joins the pose, both fitted on the other blocks."""
+def _gains(pose: Array, design: Array, value: Array, held_out: Array) -> tuple[float, float]:
+    """Drop of the weighted squares when `design` joins the pose, fitted off the held-out blocks: there, and on these."""
     left = []
     for columns in (pose, np.concatenate([pose, design], axis=1)):
         size = np.linalg.norm(columns, axis=0)
         fit = np.linalg.lstsq(columns[~held_out] / size, value[~held_out], rcond=1e-10)[0]
-        left.append(float(np.sum((value[held_out] - columns[held_out] / size @ fit) ** 2)))
-    return left[0] - left[1]
+        squared = (value - columns / size @ fit) ** 2
+        left.append((float(squared[~held_out].sum()), float(squared[held_out].sum())))
+    return left[0][0] - left[1][0], left[0][1] - left[1][1]
 
 
 def _spread(value: Array, relative: Mapping[str, list[Array]]) -> dict[str, float]:

@@ -126,12 +126,13 @@ def _off(key: str, truth: float, given: Json | None) -> Json:
 
 
 def _control(truth: Json, named: list[Json]) -> float | None:
-    """Share of the gap that the best effect outside the answered class closes, where one clear effect on the mean was named."""
+    """Share of the held-out gap that the best effect outside the answered class closes, best by its fit, where one clear effect
+    on the mean was named."""
     if truth["stratum"] != "one" or not truth["closed_by"] or not named or not _clear(truth["effects"][0]):
         return None
     inside = {truth["effects"][0]["name"], *(name for each in named for name in each["class"])}
-    outside = [share for name, share in truth["closed_by"].items() if name not in inside]
-    return max(max(outside, default=0.0), 0.0)
+    outside = [shares for name, shares in truth["closed_by"].items() if name not in inside]
+    return max(max(outside, key=lambda shares: shares["fitted"])["held_out"], 0.0) if outside else None
 
 
 def _figures(rows: list[Json]) -> list[Json]:

@@ -37,6 +37,8 @@ from benchmarks.gap_challenge.walls import (
 
 CATALOGUE = (*effects.CAMERA, *effects.IMAGE, *effects.SPREAD, *effects.RASTER)
 OFF_CATALOGUE = (*effects.OFF_MEAN, *effects.OFF_SPREAD)
+_LINEAR = {**effects.CAMERA, **effects.IMAGE, **effects.OFF_MEAN}
+_SPREADING = {**effects.SPREAD, **effects.OFF_SPREAD}
 Drawn = list[tuple[str, Parameters, Strength]]
 _LOST = 0.02
 _STEP_PX = 32.0
@@ -243,49 +245,55 @@ def _drawn(
     chosen: Array,
     random: Random,
 ) -> Drawn:
-    """Effects with magnitudes such that their signal-to-noise ratio is what is drawn for it."""
-    whiten, white = _whitener(scene, part, where), np.full(len(part.u), scene.noise[0] ** 2 + 4 / 9 * scene.noise[1] ** 2)
-    found: Drawn = []
+    """Effects with magnitudes such that each alone has the signal-to-noise ratio that is drawn for it; strengths are beside
+    the others."""
+    white = np.full(len(part.u), scene.noise[0] ** 2 + 4 / 9 * scene.noise[1] ** 2)
+    found: list[tuple[str, Parameters, Strength | None]] = []
     for kind in kinds:
         target = float(np.exp(random.uniform(np.log(2.0), np.log(120.0))))
-        linear, spread = {**effects.CAMERA, **effects.IMAGE, **effects.OFF_MEAN}, {**effects.SPREAD, **effects.OFF_SPREAD}
-        if kind in linear:
-            start, most = linear[kind]
+        if kind in _LINEAR:
+            start, most = _LINEAR[kind]
             unit = effects.shape(kind, part, random)
-            shown = _signature(scene, kind, unit, part) * _damping(kind, scene)
-            once = mean_strength(kind, shown, base, families, whiten)
-            factor = min(target / once.snr, most / start)
-            p, strength = effects.times(unit, factor), Strength(once.snr * factor, once.nearest, once.distance * factor)
-            base = np.concatenate([base, shown[:, None]], axis=1)
+            alone = mean_strength(kind, _shown(scene, kind, unit, part), base, {}, _whitener(scene, white, part, where))
+            found.append((kind, effects.times(unit, min(target / alone.snr, most / start)), None))
         elif kind == "regularization_noise":
-            p, strength = _regularization(scene, part, effects.shape(kind, part, random), target)
-        elif kind in spread:
-            start, most = spread[kind]
+            found.append((kind, *_regularization(scene, part, effects.shape(kind, part, random), target)))
+        elif kind in _SPREADING:
+            start, most = _SPREADING[kind]
             unit = effects.shape(kind, part, random)
             added = effects.variance(kind, unit, part)
             factor = scaled(lambda f: spread_distance(white + f**2 * added, white), target, most / start)  # noqa: B023
-            forms = {"parallax_noise": [np.ones_like(white)]}
-            p, strength = effects.times(unit, factor), spread_strength(kind, factor**2 * added, white, forms)
+            found.append((kind, effects.times(unit, factor), None))
         else:
-            p, strength = _raster(kind, scene, plain, chosen, white[0], random)
-        found.append((kind, p, strength))
-    return found
+            found.append((kind, *_raster(kind, scene, plain, chosen, white[0], random)))
+    added = {kind: effects.variance(kind, p, part) for kind, p, _ in found}
+    shown = {kind: _shown(scene, kind, p, part)[:, None] for kind, p, _ in found if kind in _LINEAR}
+    whole = sum(added.values(), white)
+    whiten, strong = _whitener(scene, whole, part, where), []
+    for kind, p, strength in found:
+        if kind in _LINEAR:
+            beside = np.concatenate([base, *(column for other, column in shown.items() if other != kind)], axis=1)
+            strength = mean_strength(kind, shown[kind][:, 0], beside, families, whiten)
+        elif strength is None:
+            strength = spread_strength(kind, added[kind], whole - added[kind], {"parallax_noise": [np.ones_like(white)]})
+        strong.append((kind, p, strength))
+    return strong
 
 
-def _damping(kind: str, scene: Set) -> float:
-    """Locking acts on the noisy disparity, which leaves less of its mean over the true one."""
-    return float(np.exp(-2 * np.pi**2 * scene.noise[0] ** 2)) if kind == "pixel_locking" else 1.0
+def _shown(scene: Set, kind: str, p: Parameters, part: Image) -> Array:
+    """(n,) mean change of the disparity. Locking acts on the noisy disparity, which leaves less of its mean over the true one."""
+    damping = float(np.exp(-2 * np.pi**2 * scene.noise[0] ** 2)) if kind == "pixel_locking" else 1.0
+    return damping * _signature(scene, kind, p, part)
 
 
-def _whitener(scene: Set, part: Image, where: Array) -> Whitener:
-    """Correlated: the reference's error, by its change of the disparity, and the regularization's grid."""
+def _whitener(scene: Set, variance: Array, part: Image, where: Array) -> Whitener:
+    """Correlated: the reference's error, by its change of the disparity, and the regularization, one per node of its grid."""
     at = where[:, [0, 2]]
     waved = wave_numbers(scene.reference[1], 200, np.random.default_rng(0))
     angle = at @ waved.T
     per_metre = part.disparity**2 / (scene.nominal.f * scene.nominal.base)
     error = np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * (scene.reference[0] / np.sqrt(200) * per_metre)[:, None]
-    sigma = np.full(len(part.u), np.sqrt(scene.noise[0] ** 2 + 4 / 9 * scene.noise[1] ** 2))
-    return Whitener(sigma, at, error)
+    return Whitener(np.sqrt(variance), at, error, (scene.noise[1] ** 2, (_STEP_PX / scene.step) ** 2))
 
 
 def _regularization(scene: Set, part: Image, unit: Parameters, target: float) -> tuple[Parameters, Strength]:

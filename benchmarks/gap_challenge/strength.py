@@ -39,10 +39,11 @@ class Strength:
 class Whitener:
     """Columns over points to columns of independent unit errors.
 
-    sigma: (n,) white; at: (n, 2) m; features: (n, f) shapes whose sum with independent normal weights is the correlated error.
+    sigma: (n,) white; at: (n, 2) m; features: (n, f) shapes whose sum with independent normal weights is the correlated error;
+    patch: variance and number of points of an error that is one per patch of points, smaller than a cell.
     """
 
-    def __init__(self, sigma: Array, at: Array, features: Array) -> None:
+    def __init__(self, sigma: Array, at: Array, features: Array, patch: tuple[float, float] = (0.0, 1.0)) -> None:
         stride = max(len(sigma) // _MOST_POINTS, 1)
         self.rows = slice(None, None, stride)
         self._scale = np.sqrt(len(sigma) / len(sigma[self.rows]))
@@ -52,7 +53,8 @@ class Whitener:
         self._cell = np.unique(corner[:, 0] * 100_000 + corner[:, 1], return_inverse=True)[1].ravel()
         self._weight = np.bincount(self._cell, 1 / self._sigma**2)
         mean = self._means(features[self.rows])
-        white = np.diag(1 / self._weight) / self._scale**2
+        count = np.bincount(self._cell) * self._scale**2
+        white = np.diag(1 / self._weight / self._scale**2 + patch[0] * np.minimum(patch[1] / count, 1.0))
         self._root = np.linalg.cholesky(white + mean @ mean.T)
 
     def _means(self, columns: Array) -> Array:
@@ -83,8 +85,8 @@ def mean_strength(name: str, signature: Array, base: Array, families: Families, 
     clean = _without(fixed, whiten(signature))[:, 0]
     snr = float(np.linalg.norm(clean))
     others = {other: _nearest(clean, fixed, variants, whiten) for other, variants in families.items() if other != name}
-    nearest = min(others, key=lambda other: others[other])
-    return Strength(snr, nearest, others[nearest])
+    nearest = min(others, key=lambda other: others[other], default="")
+    return Strength(snr, nearest, others.get(nearest, snr))
 
 
 def _without(fixed: Array, columns: Array) -> Array:

@@ -39,6 +39,7 @@ from benchmarks.gap_challenge.walls import (
 
 CATALOGUE = (*effects.MEAN, *effects.SPREAD, *effects.OTHER)
 OFF_CATALOGUE = (*effects.OFF_MEAN, *effects.OFF_SPREAD, *effects.OFF_LOSS)
+_LINEAR, _SPREADING = {**effects.MEAN, **effects.OFF_MEAN}, {**effects.SPREAD, **effects.OFF_SPREAD}
 _LOST = 0.01
 _GRAZING, _STEEP = 0.02, 0.12
 """Cosines of the incidence: below the first nothing comes back; below the second a case's own figures leave a return out."""
@@ -221,32 +222,42 @@ def _sigma(scene: Set, rays: Rays) -> Array:
 def _drawn(
     scene: Set, kinds: list[str], rays: Rays, usable: Array, pose: Array, at: Array, random: Random
 ) -> list[tuple[str, Parameters, Strength]]:
-    """Effects with magnitudes such that their signal-to-noise ratio is what is drawn for it."""
+    """Effects with magnitudes such that each alone has the signal-to-noise ratio that is drawn for it; strengths are beside
+    the others."""
     part, sigma = rays.part(usable), _sigma(scene, rays.part(usable))
-    whiten = _whitener(scene, sigma, at[usable])
     families, forms = effects.families(part, scene.fields), effects.forms(part, scene.fields)
-    found: list[tuple[str, Parameters, Strength]] = []
-    base = pose[usable]
+    found: list[tuple[str, Parameters, Strength | None]] = []
     for kind in kinds:
         target = float(np.exp(random.uniform(np.log(2.0), np.log(120.0))))
-        if kind in effects.MEAN or kind in effects.OFF_MEAN:
-            start, most = {**effects.MEAN, **effects.OFF_MEAN}[kind]
+        if kind in _LINEAR:
+            start, most = _LINEAR[kind]
             unit = effects.shape(kind, part, random)
-            once = mean_strength(kind, effects.signature(kind, unit, part), base, families, whiten)
-            factor = min(target / once.snr, most / start)
-            p = effects.times(unit, factor)
-            strength = Strength(once.snr * factor, once.nearest, once.distance * factor)
-            base = np.concatenate([base, effects.signature(kind, unit, part)[:, None]], axis=1)
-        elif kind in effects.SPREAD or kind in effects.OFF_SPREAD:
-            start, most = {**effects.SPREAD, **effects.OFF_SPREAD}[kind]
+            alone = mean_strength(
+                kind, effects.signature(kind, unit, part), pose[usable], {}, _whitener(scene, sigma, at[usable])
+            )
+            found.append((kind, effects.times(unit, min(target / alone.snr, most / start)), None))
+        elif kind in _SPREADING:
+            start, most = _SPREADING[kind]
             unit = effects.shape(kind, part, random)
             added = effects.variance(kind, unit, part)
             factor = scaled(lambda f: spread_distance(sigma**2 + f**2 * added, sigma**2), target, most / start)  # noqa: B023
-            p, strength = effects.times(unit, factor), spread_strength(kind, factor**2 * added, sigma**2, forms)
+            found.append((kind, effects.times(unit, factor), None))
         else:
-            p, strength = _special(kind, scene, part, sigma, target, random)
-        found.append((kind, p, strength))
-    return found
+            found.append((kind, *_special(kind, scene, part, sigma, target, random)))
+    added = {kind: effects.variance(kind, p, part) for kind, p, _ in found}
+    shown = {kind: effects.signature(kind, p, part)[:, None] for kind, p, _ in found if kind in _LINEAR}
+    whole = sum(added.values(), sigma**2)
+    whiten = _whitener(scene, np.sqrt(whole), at[usable])
+    strong: list[tuple[str, Parameters, Strength]] = []
+    for kind, p, strength in found:
+        if kind in _LINEAR:
+            base = np.concatenate([pose[usable], *(column for other, column in shown.items() if other != kind)], axis=1)
+            strength = mean_strength(kind, shown[kind][:, 0], base, families, whiten)
+        elif kind in _SPREADING:
+            strength = spread_strength(kind, added[kind], whole - added[kind], forms)
+        assert strength is not None
+        strong.append((kind, p, strength))
+    return strong
 
 
 def _whitener(scene: Set, sigma: Array, at: Array) -> Whitener:
