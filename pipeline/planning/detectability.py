@@ -32,7 +32,8 @@ otherwise). Two epochs are compared over the floor of the niche, along its norma
 Limits: the wall is a plane over the block, as steep as its normal at that place; roughness that is not the same in both epochs is
 not counted, nor are points of the niche's side walls, which help; a niche whose floor is hidden altogether counts as not seen.
 Seen very obliquely, beams that miss the floor are taken to hit the face, where some hit a side wall: the
-probability is then somewhat low. The block lies along the lattice; a turned one has the same mean number of points.
+probability is then somewhat low. The block lies along the scan lines or the image's columns; a turned one has the same mean number
+of points. Where the lattice is askew, every line is taken to hold as many points as the others.
 """
 
 from __future__ import annotations
@@ -98,13 +99,15 @@ class Sampling:
 def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights: Sequence[FloatArray]) -> dict[str, FloatArray]:
     """The steps, shadows and slopes of a `Sampling`, by name.
 
-    step_a, step_b: (n, 3) steps of the lattice on the surface, m, taken as the rectangle of the same area along step_a;
+    step_a, step_b: (n, 3) steps of the lattice on the surface, m, taken as the rectangle of the same area along step_b, the
+    scan lines or the image's columns: on a steep wall they run upright, and so does the block. Seen from aside and from below,
+    the other step runs askew, and the rim of a niche along it would hide another part of the floor than that of an upright one;
     sights: (n, 3) each, from the viewpoints to the places, any length; the lattice is made by the first.
     """
-    length = np.linalg.norm(step_a, axis=1)
+    length = np.linalg.norm(step_b, axis=1)
     width = np.linalg.norm(np.cross(step_a, step_b), axis=1) / length
-    axis_a = step_a / length[:, None]
-    axis_b = np.cross(normals, axis_a)
+    axis_b = step_b / length[:, None]
+    axis_a = np.cross(axis_b, normals)
     into = [-np.einsum("ni,ni->n", sight, normals) for sight in sights]
     tangents = [
         np.array([np.einsum("ni,ni->n", sight, axis) / depth for sight, depth in zip(sights, into, strict=True)])
@@ -112,7 +115,7 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
     ]
     shadow_a, shadow_b = (np.maximum(0, tangent.max(axis=0)) - np.minimum(0, tangent.min(axis=0)) for tangent in tangents)
     slope_a, slope_b = (tangent[0] for tangent in tangents)
-    steps = {"step_a": length, "step_b": width}
+    steps = {"step_a": width, "step_b": length}
     return {**steps, "shadow_a": shadow_a, "shadow_b": shadow_b, "slope_a": slope_a, "slope_b": slope_b}
 
 

@@ -165,6 +165,17 @@ def test_the_points_on_a_block_are_its_area_times_the_cosine_over_the_squared_sp
     assert found.shadow_b[0] == pytest.approx(0.0, abs=1e-12)
 
 
+def test_from_aside_and_below_the_rim_of_an_upright_niche_hides_what_both_tangents_say() -> None:
+    """A block 20 m above the scanner and 30 m beside it, 40 m away: the lines of equal zenith climb the wall askew there."""
+    sensor = scanner(OBLIQUE, range_sigma_m=0.01)
+    places = Places(np.array([[6.0, 24.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))
+    found = tls_geometry(sensor, places).sampling
+    assert found.shadow_a[0] == pytest.approx(30.0 / 40.0)
+    assert found.shadow_b[0] == pytest.approx(20.0 / 40.0)
+    assert found.step_b[0] == pytest.approx(6e-4 * (30**2 + 40**2 + 20**2) / 50)  # d(h cot z) = h / sin^2 z dz
+    assert found.step_a[0] == pytest.approx(6e-4 * 50**2 / 40)  # d(40 tan az) = 40 / cos^2 az daz
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
