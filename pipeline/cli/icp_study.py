@@ -1,0 +1,57 @@
+"""`scarpsim icp-study`: which settings of the registration suit a run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.parser import at_least, one_of
+from scene.errors import InputError
+
+SUMMARY = "find the settings of ICP that suit a run, against the true transform"
+EXAMPLE = """  scarpsim icp-study runs/my_site
+  scarpsim icp-study my_site.yaml --sensor stereo --epochs 2 --offset-m 0.05 --out study"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", type=Path, metavar="RUN|CONFIG", help="folder of a run, or a config file to simulate")
+    parser.add_argument("--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="of a config (default: its first)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
+    parser.add_argument("--epochs", type=at_least(1), default=1, metavar="N", help="epochs to register (default: 1)")
+    parser.add_argument("--repeats", type=at_least(1), default=3, metavar="N", help="random subsets for each ratio (default: 3)")
+    parser.add_argument(
+        "--offset-m", type=float, default=0.03, metavar="M", help="put each epoch off by a known motion first (default: 0.03)"
+    )
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random numbers (default: the config's)")
+    parser.add_argument(
+        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of a config, as a.b=c"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from pipeline.cli.simulate import new_folder
+    from pipeline.config import load_config
+    from pipeline.formats.atomic import empty_folder
+    from pipeline.noise.icp_study import simulated_surfaces, study, surfaces_of_run
+    from pipeline.progress import shown_progress
+    from pipeline.register import IcpConfig
+    from pipeline.report.icp_study import summary, write_icp_study
+    from scene.keyed_random import KeyedRandom
+
+    if not arguments.offset_m >= 0:
+        raise InputError(f"got {arguments.offset_m:g}", where="--offset-m", allowed="0 m or more")
+    out = empty_folder(arguments.out or new_folder(Path("runs"), "icp_study"))
+    with shown_progress(quiet=arguments.quiet) as progress:
+        if arguments.source.is_dir():
+            config, sensor, surfaces = surfaces_of_run(arguments.source)
+            surfaces = surfaces[: arguments.epochs + 1]
+        else:
+            config = load_config(arguments.source, arguments.overrides, arguments.sensor, arguments.seed)
+            sensor = arguments.sensor or config.sensor_names()[0]
+            surfaces = simulated_surfaces(config, sensor, arguments.epochs, progress)
+        settings = {"offset_m": arguments.offset_m, "repeats": arguments.repeats}
+        found = study(sensor, surfaces, config.icp or IcpConfig(), KeyedRandom(config.seed), **settings, progress=progress)
+    report = write_icp_study(out, found)
+    print(f"{summary(found)}\nreport: {report}")
+    return 0
