@@ -30,10 +30,10 @@ _UNITS = {
 
 def maps_figure(found: Diagnosis) -> bytes:
     """Residuals before and after on one scale: means of small pixels, and their spread over what each model predicts."""
-    figure = Figure(figsize=(11.5, 7.6), layout="constrained")
+    unit, pixels = 1e3 * found.residuals.unit_m, _Pixels(found)
+    left, right, low, high = pixels.extent
+    figure = Figure(figsize=(11.5, float(np.clip(10.0 * (high - low) / (right - left), 4.0, 12.0)) + 1.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    unit = 1e3 * found.residuals.unit_m
-    pixels = _Pixels(found)
     means = [pixels.mean(values * unit) for values in (found.before, found.after)]
     limit = float(np.nanpercentile(np.abs(means[0]), 98)) or 1.0
     sigmas = found.residuals.sigma, sigma_after(found)
@@ -50,8 +50,8 @@ def maps_figure(found: Diagnosis) -> bytes:
     for panel in panels.ravel():
         panel.set_facecolor("0.85")
         for change in found.changes:
-            low, high = change.bounds[:, :2]
-            panel.add_patch(Rectangle(tuple(low), *(high - low), fill=False, edgecolor="black", linewidth=1.0))
+            corner, opposite = change.bounds[:, :2]
+            panel.add_patch(Rectangle(tuple(corner), *(opposite - corner), fill=False, edgecolor="black", linewidth=1.0))
     for panel in panels[:, 0]:
         panel.set_ylabel("up the wall, m")
     return png(figure)
@@ -112,7 +112,7 @@ def gap_figure(gap: Gap) -> bytes:
     figure = Figure(figsize=(9.0, 1.7), layout="constrained")
     panel = figure.add_subplot()
     panel.barh(0, before - after, left=after, color="#56B4E9", height=0.5, label="closed")
-    panel.barh(0, after - floor, left=floor, color=_BEFORE, height=0.5, label="left")
+    panel.barh(0, max(after - floor, 0.0), left=floor, color=_BEFORE, height=0.5, label="left")
     errors = {"before": 1e3 * gap.error, "after": 1e3 * gap.floor_error}
     for name, value, level in (("floor", floor, -0.42), ("after", after, 0.34), ("before", before, -0.42)):
         panel.plot([value, value], [-0.33, 0.33], color="black", linewidth=1.2)

@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.formats.atomic import write_json, write_text, writing
 from pipeline.gap.figures import matrix_figure
 from pipeline.gap.identifiability import ALIKE, NAMED_AT, Identifiability
+from pipeline.gap.in_words import listed
 from pipeline.gap.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE
 from pipeline.provenance import versions
 from pipeline.report.page import template
@@ -60,7 +61,7 @@ def in_words(found: Identifiability) -> str:
     pairs = found.pairs()
     parts = [f"{_INSTRUMENTS[found.sensor]}, {found.points:,} points on smooth parts of the wall."]
     if weak:
-        parts.append(f"A shift or turn of the sensor takes up more than 90 % of {_listed(weak)}.")
+        parts.append(f"A shift or turn of the sensor takes up more than 90 % of {listed(weak)}.")
     if pairs:
         a, b = pairs[0]
         parts.append(
@@ -109,7 +110,3 @@ def _row(found: Identifiability, row: int) -> _Row:
 def _value(parameter: str, value: float) -> str:
     number = f"{value:.2g}" if np.isfinite(value) else _NEVER
     return f"{parameter} {number}".strip()
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

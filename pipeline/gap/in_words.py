@@ -30,8 +30,9 @@ def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
     parts += [_effect(effect) for effect in found.effects]
     clear = [row for row in rows if row["p_value"] <= _CLEAR]
     if clear and found.effects:
-        seen = dict.fromkeys(f"{_STATISTICS[row['statistic']]} against {row['covariate']}" for row in clear[:3])
-        parts.append(f"Before anything was named it showed most in the {', the '.join(seen)}.")
+        first = clear[0]["statistic"]
+        seen = [row["covariate"].replace("_", " ") for row in clear[:3] if row["statistic"] == first]
+        parts.append(f"Before anything was named it showed most in the {_STATISTICS[first]} against {listed(seen)}.")
     if found.gap is not None:
         parts.append(_gap(found.gap, bool(found.effects)))
     if found.changes:
@@ -54,6 +55,11 @@ def outcome(found: Diagnosis, tried: Sequence[Tried], item: Tried) -> str:
         return "named"
     alike = {other for effect in found.effects for other in effect.alike}
     return "cannot be told from the named one" if name in alike else "rejected"
+
+
+def listed(words: Sequence[str]) -> str:
+    """a, b and c."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def values(effect: Named) -> str:
