@@ -28,7 +28,7 @@ from pipeline.epoch import observe_epoch, observe_reference
 from pipeline.formats.ply import read_ply
 from pipeline.products import epoch_folder
 from pipeline.progress import Progress
-from pipeline.register import IcpConfig, register_to
+from pipeline.register import IcpConfig, fit, register_to
 from pipeline.rigid import RigidTransform
 from pipeline.run import RUN_FILE
 from pipeline.site import prepare_site
@@ -41,7 +41,8 @@ RATIOS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 """Shares of the points that are left out."""
 _THRESHOLDS = np.geomspace(0.5, 12.0, 13)
 """Outlier thresholds, in NMADs of the residuals at the true pose."""
-_SAMPLE = 20_000
+_SAMPLE, _FIT_SAMPLE = 20_000, 200_000
+"""Points for the error and for the RMS."""
 _TOLERANCE, _LEAST_TOLERANCE_M = 1.1, 1e-4
 """A setting is as good as the best where its error is at most 10 % or 0.1 mm larger."""
 _TO_TRUTH = IcpConfig(outlier_distance_threshold=0.2, threshold=0.0, delta_threshold=1e-7, max_iteration=60)
@@ -76,8 +77,12 @@ class PoseError:
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One registration. gradual: whether the outlier threshold came down to its value over the iterations, as the config says, or
-    held from the first; rms_m: of the inliers; the error's fields as in PoseError; None where ICP found too few pairs."""
+    """One registration.
+
+    gradual: whether the outlier threshold came down to its value over the iterations, as the config says, or held from the first;
+    rms_m, inlier_share: residuals of all points, not only the subset, within the threshold; the error's fields as in PoseError;
+    None where ICP found too few pairs.
+    """
 
     parameter: Parameter
     value: float
@@ -240,15 +245,18 @@ def composed(second: RigidTransform, first: RigidTransform) -> RigidTransform:
 
 
 def recommended(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
-    """The setting to take, by the median error over epochs and repeats; None where every registration failed.
+    """The setting to take, by the largest error over epochs and repeats; None where registrations failed at every value.
 
-    Of the subsample ratios that are as good as the best, the largest: the fewest points. Of the outlier thresholds, with the
-    gradual start, the one in the middle (of the logarithms) of the good range about the best.
+    Of the subsample ratios the largest up to which all are as good as taking all points: the fewest points. Of the outlier
+    thresholds, with the gradual start, the one in the middle (of the logarithms) of the good range about the best.
     """
     chosen = [row for row in rows if row.parameter == parameter and row.gradual]
     values = sorted({row.value for row in chosen})
-    errors = {value: _median_error([row for row in chosen if row.value == value]) for value in values}
-    best = min(values, key=lambda value: errors[value], default=None)
+    errors = {value: _worst_error([row for row in chosen if row.value == value]) for value in values}
+    if parameter == "subsample_ratio":
+        best = values[0] if values else None
+    else:
+        best = min(values, key=lambda value: errors[value], default=None)
     if best is None or not np.isfinite(errors[best]):
         return None
     limit = max(_TOLERANCE * errors[best], errors[best] + _LEAST_TOLERANCE_M)
@@ -301,16 +309,18 @@ class _Judge:
                 parameter, value, gradual, epoch.number, repeat, None, None, None, None, None, time.perf_counter() - began
             )
         error = self.error(found.transform, epoch.true)
+        step = max(len(epoch.points) // _FIT_SAMPLE, 1)
+        fitted = fit(self.target, found.apply(epoch.points[::step]), config)
         return StudyRow(
             parameter,
             value,
             gradual,
             epoch.number,
             repeat,
-            found.rms_m,
+            fitted.rms_m,
             error.normal_m,
             error.displacement_m,
-            found.inliers / found.points,
+            fitted.inliers / fitted.points,
             found.iterations,
             time.perf_counter() - began,
         )
@@ -351,9 +361,9 @@ def _residual_nmad(target: ReferenceSurface, epoch: StudyEpoch) -> float:
     return float(stats.median_abs_deviation(along, scale="normal"))
 
 
-def _median_error(rows: Sequence[StudyRow]) -> float:
-    """Median error along the normals, m; a registration that failed counts as infinite."""
-    return float(np.median([np.inf if row.normal_error_m is None else row.normal_error_m for row in rows]))
+def _worst_error(rows: Sequence[StudyRow]) -> float:
+    """Largest error along the normals, m; a registration that failed counts as infinite."""
+    return max(np.inf if row.normal_error_m is None else row.normal_error_m for row in rows)
 
 
 def _counted(cases: Sequence[Any], progress: Progress) -> Iterable[Any]:

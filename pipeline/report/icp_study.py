@@ -60,11 +60,11 @@ def summary(study: IcpStudy) -> str:
 
 
 def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
-    """RMS of the inliers, error of the pose and share of inliers against a parameter: lines are medians, dots registrations."""
+    """RMS of the fit, error of the pose and share of inliers against a parameter: lines are medians, dots registrations."""
     rows = [row for row in study.rows if row.parameter == parameter]
     figure = Figure(figsize=(13.0, 4.2), dpi=DPI, layout="constrained")
     panels = figure.subplots(1, 3)
-    labels = ("RMS of the inliers, mm", "error along the normal, mm (RMS)", "inliers, % of the points")
+    labels = ("RMS of all points within the threshold, mm", "error along the normal, mm (RMS)", "points within the threshold, %")
     fields = ("rms_m", "normal_error_m", "inlier_share")
     for axes, label, field, factor in zip(panels, labels, fields, (1e3, 1e3, 100.0), strict=True):
         for colour, gradual in zip(FAMILY, (True, False), strict=False):
