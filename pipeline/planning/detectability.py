@@ -31,9 +31,9 @@ otherwise). Two epochs are compared over the floor of the niche, along its norma
 
 Limits: the wall is a plane over the block, as steep as its normal at that place; roughness that is not the same in both epochs is
 not counted, nor are points of the niche's side walls, which help; a niche whose floor is hidden altogether counts as not seen.
-Seen very obliquely, beams that miss the floor are taken to hit the face, where some hit a side wall: the
-probability is then somewhat low. The block lies along the scan lines or the image's columns; a turned one has the same mean number
-of points. Where the lattice is askew, every line is taken to hold as many points as the others.
+Seen very obliquely, beams that miss the floor are taken to hit the face, where some hit a side wall: the probability is then
+somewhat low. The block lies along the scan lines or the image's columns; a turned one has the same mean number of points.
+Where the lattice is askew, every line is taken to hold as many points as the others.
 """
 
 from __future__ import annotations
