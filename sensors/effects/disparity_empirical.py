@@ -18,14 +18,16 @@ from sensors.matches import Matches
 class DisparityEmpirical(Effect):
     """dd = sum_k c_k t^k, t = (x - centre) / scale, k from 1: empirical, found by `scarpsim gap`; not in the shared catalogue.
 
-    x: column, row or distance from the centre of the left image (px), disparity or what it has behind the point (px), or depth (m).
+    x: column, row or distance from the centre of the left image (px), disparity or its fraction (px), or depth (m).
     """
 
     name: Literal["disparity_empirical"] = "disparity_empirical"
     sensor = "stereo"
     stage = Stage.MATCH
     order = 25
-    covariate: Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"] = Field("image_x", description="x")
+    covariate: Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"] = Field(
+        "image_x", description="x"
+    )
     centre: float = Field(0.0, description="of x, in its unit")
     scale: float = Field(1.0, gt=0, description="of x, in its unit")
     coefficients_px: tuple[float, ...] = Field((), max_length=6, description="of t, t^2, ... [px]")
