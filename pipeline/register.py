@@ -215,6 +215,8 @@ def register_to(
     """`register` to a reference that was indexed before, for many runs against one reference."""
     normals = _normals(surface, config)
     moving = checked_cloud(moving, "moving points")
+    if threads == 1:  # a pool of one thread would only cost the hand-over
+        return _Search(surface, normals, moving, config, map).run(random)
     with _executor(threads) as executor:
         return _Search(surface, normals, moving, config, executor.map).run(random)
 

@@ -14,6 +14,7 @@ from pipeline.look import look, reconstruct
 from pipeline.register import register_to
 from pipeline.site import Site
 from scene.errors import InputError
+from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 from scene.raycast import RayCaster
@@ -28,11 +29,13 @@ def with_model(site: Site, model: StereoModel) -> Site:
     return replace(site, sensor=replace(site.sensor, model=model))
 
 
-def noise_map(config: SimulationConfig, before: Site, after: Site, caster: RayCaster, random: KeyedRandom) -> NDArray[np.float32]:
+def noise_map(
+    config: SimulationConfig, before: Site, after: Site, caster: RayCaster, random: KeyedRandom, grid: Grid | None = None
+) -> NDArray[np.float32]:
     """(h, w) differences, m, of two observations of the untouched wall (`caster`), NaN without data.
 
     before, after: one site, with the sensor as it is at each observation. Both draw noise of their own from `random`; the
-    second is registered to the first where the config has ICP.
+    second is registered to the first where the config has ICP. grid: of the map; none: over the first one's surface.
     """
     reference = _surface(config, before, caster, random.child("reference"))
     later = _surface(config, after, caster, random.child("later"))
@@ -40,7 +43,7 @@ def noise_map(config: SimulationConfig, before: Site, after: Site, caster: RayCa
         target = ReferenceSurface.build(reference.vertices, reference.vertex_normals())
         found = register_to(target, later.vertices, config.icp, random.child("register"))
         later = later.with_vertices(found.apply(later.vertices))
-    grid = raster_grid(reference.bounds, config.difference)
+    grid = grid or raster_grid(reference.bounds, config.difference)
     return difference(surface_raster(reference, grid), surface_raster(later, grid))
 
 

@@ -18,12 +18,12 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "parallax_sigma_px": (0.02, 4.0),
     "regularization_sigma_px": (0.01, 4.0),
     "regularization_step_px": (8.0, 128.0),
-    ORIENTATION: (0.02, 30.0),
+    ORIENTATION: (0.05, 12.0),
     "range_sigma_m": (2e-4, 0.1),
     "range_ppm": (1.0, 300.0),
     "angle_sigma_rad": (2e-6, 1e-3),
 }
-_OF_SIGMA = (0.02, 30.0)
+_OF_SIGMA = (0.05, 12.0)
 """Bounds of a single sigma of the orientation, times that of the config."""
 _DEFAULT = {
     "stereo": ("parallax_sigma_px", "regularization_sigma_px", "regularization_step_px", ORIENTATION),
@@ -48,7 +48,7 @@ class Parameters:
         """The base model with these values; all else, effects included, stays as it is."""
         found = dict(zip(self.names, (float(value) for value in values), strict=True))
         noise = self.base.noise
-        plain = {name: value for name, value in found.items() if not name.startswith(ORIENTATION)}
+        plain: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(ORIENTATION)}
         if isinstance(self.base, StereoModel):
             plain["orientation"] = _orientation(self.base.noise.orientation, found)
         return self.base.model_copy(update={"noise": noise.model_copy(update=plain)})

@@ -12,8 +12,9 @@ two.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from pipeline.closest_points import ReferenceSurface
 from pipeline.config import SimulationConfig
 from pipeline.mesh import mesh_observation
+from pipeline.noise.measured import point_differences
 from pipeline.noise.parameters import Model
 from pipeline.noise.windows import Windows
 from pipeline.register import register_to
@@ -38,8 +40,8 @@ from sensors.pulses import Pulses
 from sensors.stereo import StereoPair
 from sensors.tls import LaserScanner
 
-_LATTICE_POINTS = 3000
-"""Points by which an observation is registered: their noise moves a plane by a fiftieth of it."""
+_LATTICE_POINTS = 6000
+"""Points by which an observation is registered: more of them would not bring it nearer to a registration by all."""
 _MARGIN_CELLS = 3
 _MARGIN_M = 0.05
 """Around a window, so that it stays covered when noise moves the cells."""
@@ -51,11 +53,10 @@ _OF_THE_WHOLE = {"edge_fattening", "smoothing", "occlusion_fill", "texture_noise
 class ChosenCells(StereoPair):
     """A stereo pair that is asked for some cells of the left depth map only. chosen: (n,) their numbers, counted by row."""
 
-    chosen: NDArray[np.uint32] | None = None
+    chosen: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, dtype=np.uint32))
 
     @property
     def shape(self) -> tuple[int, int]:
-        assert self.chosen is not None
         return len(self.chosen), 1
 
     def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
@@ -67,11 +68,10 @@ class ChosenCells(StereoPair):
 class ChosenPulses(LaserScanner):
     """A laser scanner that sends some pulses of its pattern only. chosen: (n,) their numbers, counted along the lines."""
 
-    chosen: NDArray[np.uint32] | None = None
+    chosen: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, dtype=np.uint32))
 
     @property
     def shape(self) -> tuple[int, int]:
-        assert self.chosen is not None
         return len(self.chosen), 1
 
     def emit(self) -> Pulses:
@@ -93,12 +93,13 @@ class Reobserver:
     simulated cell by cell.
     """
 
-    def __init__(self, config: SimulationConfig, site: Site, windows: Windows) -> None:
-        _check(config, site)
-        self.config, self.site, self.windows = config, site, windows
+    def __init__(self, config: SimulationConfig, site: Site, windows: Windows, *, of_points: bool = False) -> None:
+        self.sensor = _checked(config, site)
+        self.config, self.site, self.windows, self.of_points = config, site, windows, of_points
         self.caster = RayCaster(site.mesh)
+        self.silent = _silent(self.sensor.model)
         self.observations = 0
-        whole = _with_model(site.sensor, _silent(site.sensor.model)).observe(self.caster, KeyedRandom(0))
+        whole = _asked(self.sensor, self.silent).observe(self.caster, KeyedRandom(0))
         self._viewpoint = whole.viewpoint
         self._patches, patch_cells = self._surround(whole)
         lattice = _lattice(whole)
@@ -110,42 +111,46 @@ class Reobserver:
         """The wall as it is, to register to."""
         return ReferenceSurface.build(self.site.mesh.vertices, self.site.mesh.vertex_normals())
 
-    def maps(self, model: Model, epochs: int, random: KeyedRandom, *, exact_reference: bool = False) -> FloatArray:
-        """(epochs, k, n, n) differences, m, of a noisy reference and later epochs, in the windows; NaN where not stable.
-
-        exact_reference: the maps are differences to the wall as it is.
-        """
-        reference = self.true_heights if exact_reference else self.heights(model, random.child("epoch", 0))
-        later = [self.heights(model, random.child("epoch", number)) for number in range(1, epochs + 1)]
+    def maps(self, model: Model, epochs: int, random: KeyedRandom) -> FloatArray:
+        """(epochs, k, n, n) differences, m, in the windows; NaN where not stable: of a noisy reference and later epochs, or of
+        points, to the wall as it is."""
+        sources = [random.child("epoch", number) for number in range(1, epochs + 1)]
+        if self.of_points:
+            return np.stack([self._of_points(model, source) for source in sources])
+        reference = self.heights(model, random.child("epoch", 0))
+        later = [self.heights(model, source) for source in sources]
         return np.where(self.windows.stable, reference - np.stack(later), np.nan)
+
+    def _of_points(self, model: Model, random: KeyedRandom) -> FloatArray:
+        """(k, n, n) mean differences of the points of each pixel to the wall as it is, m."""
+        points = self._registered(model, random)[: self._lattice_start]
+        values = point_differences(self.caster, points[~np.isnan(points[:, 0])], self.windows.grid)
+        return self.windows.cut(values)
 
     def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
         """(k, n, n) heights, m, of one noisy observation's surface after registration, NaN where it has none."""
-        self.observations += 1
-        points = self._observe(model, random.child("observe"))
-        if self.config.icp is not None:
-            points = self._registration(points, random.child("register")).apply(points)
-        return self._raster(self._surface(points))
+        return self._raster(self._surface(self._registered(model, random)))
 
-    @cached_property
-    def true_heights(self) -> FloatArray:
-        """(k, n, n) heights, m, of the wall as it is."""
-        return self._raster(self.site.mesh, self.caster)
+    def _registered(self, model: Model, random: KeyedRandom) -> FloatArray:
+        """(cells, 3) points of one observation, m, registered where the config has ICP."""
+        self.observations += 1
+        points = self._observe(model, random)
+        if self.config.icp is None:
+            return points
+        return self._registration(points, random.child("register")).apply(points)
 
     @cached_property
     def silent_heights(self) -> FloatArray:
         """(k, n, n) heights, m, of the surface that the sensor would give without noise."""
-        return self._raster(self._surface(self._observe(_silent(self.site.sensor.model), KeyedRandom(0))))
+        return self._raster(self._surface(self._observe(self.silent, KeyedRandom(0))))
 
     def _observe(self, model: Model, random: KeyedRandom) -> FloatArray:
         """(cells, 3) points, m."""
-        sensor = self.site.sensor
-        own = {name: getattr(sensor, name) for name in sensor.__dataclass_fields__} | {"model": model, "truth": False}
-        kind = ChosenCells if isinstance(sensor, StereoPair) else ChosenPulses
-        return kind(**own, chosen=self.cells).observe(self.caster, random).points.reshape(-1, 3)
+        return _asked(self.sensor, model, self.cells).observe(self.caster, random).points.reshape(-1, 3)
 
     def _registration(self, points: FloatArray, random: KeyedRandom) -> RigidTransform:
         lattice = points[self._lattice_start :]
+        assert self.config.icp is not None
         config = self.config.icp.model_copy(update={"subsample_points": False})
         return register_to(self.target, lattice[~np.isnan(lattice[:, 0])], config, random, threads=1).transform
 
@@ -156,18 +161,19 @@ class Reobserver:
             rows, columns = patch.shape
             block = points[patch.start : patch.start + rows * columns].reshape(rows, columns, 3)
             depth = block[..., 2]
-            seen = Observation(self.site.sensor.__class__.__name__, block, depth, np.zeros(depth.shape, dtype=np.int32), self._viewpoint)
+            seen = Observation("patch", block, depth, np.zeros(depth.shape, dtype=np.int32), self._viewpoint)
             mesh = mesh_observation(seen, self.config.surface)
             vertices.append(mesh.vertices)
             faces.append(mesh.faces + count)
             count += len(mesh.vertices)
         return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
 
-    def _raster(self, mesh: TriangleMesh, caster: RayCaster | None = None) -> FloatArray:
+    def _raster(self, mesh: TriangleMesh) -> FloatArray:
+        """(k, n, n) heights of a mesh at the pixels' centres, m."""
         x, y = self.windows.places()
         top = float(mesh.bounds[1, 2]) + 1.0
         origin = np.stack([x.ravel(), y.ravel(), np.full(x.size, top)], axis=1)
-        distance, _ = (caster or RayCaster(mesh)).cast(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
+        distance, _ = RayCaster(mesh).cast(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
         return (top - distance).reshape(x.shape)
 
     def _surround(self, whole: Observation) -> tuple[list[_Patch], NDArray[np.int64]]:
@@ -194,16 +200,11 @@ class Reobserver:
         return patches, np.concatenate(numbers)
 
 
-
 def _lattice(whole: Observation) -> NDArray[np.int64]:
     """Numbers of cells in equal steps over the view that have a point."""
     step = max(int(np.sqrt(np.count_nonzero(whole.valid) / _LATTICE_POINTS)), 1)
     number = np.arange(whole.depth.size).reshape(whole.depth.shape)[::step, ::step]
     return number[whole.valid[::step, ::step]]
-
-
-def _with_model(sensor: StereoPair | LaserScanner, model: Model) -> StereoPair | LaserScanner:
-    return replace(sensor, model=model, truth=False)
 
 
 def _silent(model: Model) -> Model:
@@ -214,11 +215,22 @@ def _silent(model: Model) -> Model:
     return TlsModel(noise=type(model.noise)(**zero), effects=model.effects)
 
 
-def _check(config: SimulationConfig, site: Site) -> None:
+def _asked(sensor: StereoPair | LaserScanner, model: Model, cells: NDArray[np.uint32] | None = None) -> Any:
+    """The sensor with another model, asked for all its cells or for some."""
+    if cells is None:
+        return replace(sensor, model=model, truth=False)  # type: ignore[arg-type]
+    own = {each.name: getattr(sensor, each.name) for each in fields(sensor)} | {"model": model, "truth": False, "chosen": cells}
+    return ChosenCells(**own) if isinstance(sensor, StereoPair) else ChosenPulses(**own)
+
+
+def _checked(config: SimulationConfig, site: Site) -> StereoPair | LaserScanner:
+    """The sensor, if it can be asked for single cells."""
     if not isinstance(site.sensor, StereoPair | LaserScanner):
         raise InputError("the noise of real matching is its own", where="matcher", allowed="simulated")
     if site.further_stations:
-        raise InputError("maps of several stations are not calibrated", where="station", remedy="give the station of the maps alone")
+        raise InputError(
+            "maps of several stations are not calibrated", where="station", remedy="give the station of the maps alone"
+        )
     if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
         raise InputError(
             "windows are reconstructed from the sensor's own grid",
@@ -232,3 +244,4 @@ def _check(config: SimulationConfig, site: Site) -> None:
             where="sensor.effects",
             remedy="leave it out of the model to be calibrated",
         )
+    return site.sensor

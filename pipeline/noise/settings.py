@@ -22,7 +22,7 @@ class CalibrationConfig(Config):
     )
     fit: tuple[str, ...] = Field(
         (),
-        description="what is fitted; none: parallax_sigma_px, regularization_sigma_px, regularization_step_px and orientation (one "
+        description="what is fitted; none: parallax_sigma_px, regularization_sigma_px, regularization_step_px and orientation (a "
         "factor for the config's sigmas of the orientation) for stereo, range_sigma_m and angle_sigma_rad for tls; also "
         "range_ppm and single sigmas such as orientation.k1",
     )

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.difference import statistics
-from pipeline.noise.settings import Area, CalibrationConfig
+from pipeline.noise.settings import CalibrationConfig
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import FloatArray, IntArray
@@ -51,24 +50,6 @@ class Windows:
         """(k, 2) x and y of the windows' middles, wall frame, m."""
         middle = self.corner + self.side / 2
         return np.stack([self.grid.x_min + middle[:, 1] * self.grid.gsd, self.grid.y_max - middle[:, 0] * self.grid.gsd], axis=1)
-
-
-def drawn_areas(areas: Sequence[Area], grid: Grid) -> BoolArray:
-    """(h, w) the pixels whose centres lie in one of the areas. Raises InputError where none does."""
-    x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
-    y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
-    inside = np.zeros(grid.shape, dtype=bool)
-    for area in areas:
-        if isinstance(area[0], tuple):
-            points = np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=-1).reshape(-1, 2)
-            inside |= Outline(np.array(area)).contains_points(points).reshape(grid.shape)
-        else:
-            x0, y0, x1, y1 = area
-            inside |= ((x >= x0) & (x <= x1))[None] & ((y >= y0) & (y <= y1))[:, None]
-    if not inside.any():
-        extent = f"x {x[0]:.1f} to {x[-1]:.1f} m, y {y[-1]:.1f} to {y[0]:.1f} m"
-        raise InputError("no stable area lies on the difference map", where="calibration.stable_areas", allowed=extent)
-    return inside
 
 
 def unchanged(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
@@ -119,7 +100,9 @@ def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -
             allowed=f"up to {min(grid.shape)}",
         )
     total = np.pad(stable.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-    row, column = (each.ravel() for each in np.mgrid[0 : grid.height - side + 1 : side // 2, 0 : grid.width - side + 1 : side // 2])
+    row, column = (
+        each.ravel() for each in np.mgrid[0 : grid.height - side + 1 : side // 2, 0 : grid.width - side + 1 : side // 2]
+    )
     share = total[row + side, column + side] - total[row, column + side] - total[row + side, column] + total[row, column]
     good = share >= _LEAST_STABLE * side**2
     row, column, share = row[good], column[good], share[good]

@@ -1,0 +1,123 @@
+"""Do calibrations find the noise that maps were simulated with, and do their intervals hold it as often as they say?
+
+    python benchmarks/calibrate_recovery.py [--sensor stereo|tls] [--trials 50] [--out DIR]
+
+Each trial has a wall and a seed of its own and draws its true noise at random; its maps are made by the whole simulation
+(`noise_map`: every cell, meshing, ICP of one noisy epoch to the other, rasters), not by the one that the calibration searches
+with. Finished trials are kept under --out, so an interrupted benchmark goes on where it was. The table goes into
+docs/calibrate.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.bundled import bundled_config
+from pipeline.config import load_config
+from pipeline.difference import raster_grid
+from pipeline.look import look, reconstruct
+from pipeline.noise.calibrate import calibrate_material
+from pipeline.noise.inputs import Material
+from pipeline.noise.maps import noise_map
+from pipeline.noise.parameters import parameters
+from pipeline.progress import Progress
+from pipeline.site import prepare_site
+from scene.keyed_random import KeyedRandom
+from scene.raycast import RayCaster
+
+DOCUMENT = Path(__file__).parents[1] / "docs" / "calibrate.md"
+EPOCHS = 2
+SETTINGS = [
+    "wall.width_m=12",
+    "wall.height_m=8",
+    "wall.resolution_m=0.05",
+    "depth_map=low",
+    "difference.gsd_m=0.04",
+    "scanner.azimuth_step_rad=0.0008",
+    "scanner.zenith_step_rad=0.0008",
+    "calibration.windows=12",
+    "calibration.window_px=24",
+    "calibration.simulations=100",
+]
+TRUTH = {
+    "parallax_sigma_px": (0.2, 0.8),
+    "regularization_sigma_px": (0.15, 0.6),
+    "regularization_step_px": (24.0, 64.0),
+    "orientation": (0.5, 3.0),
+    "range_sigma_m": (0.0015, 0.01),
+    "angle_sigma_rad": (3e-5, 3e-4),
+}
+"""Bounds between which the logarithm of the true value is uniform."""
+
+
+def trial(sensor: Any, number: int) -> dict[str, Any]:
+    """One calibration: true values, estimates, intervals."""
+    config = load_config(bundled_config("", "demo"), [*SETTINGS, f"wall.seed={100 + number}"], sensor, 1000 + number)
+    random = KeyedRandom(50_000 + number)
+    site = prepare_site(config, sensor, KeyedRandom(config.seed))
+    instrument: Any = site.sensor
+    fitted = parameters(instrument.model, ())
+    low, high = np.log([TRUTH[name] for name in fitted.names]).T
+    true = np.exp(random.child("truth").generator().uniform(low, high))
+    real = replace(site, sensor=replace(instrument, model=fitted.model(true)))
+    caster = RayCaster(site.mesh)
+    grid = raster_grid(reconstruct(config, look(config, real, caster, random.child("grid"))).bounds, config.difference)
+    maps = np.stack([noise_map(config, real, real, caster, random.child("map", epoch), grid) for epoch in range(EPOCHS)])
+    names = tuple(f"epoch {epoch}" for epoch in range(EPOCHS))
+    material = Material(names, grid, maps, ~np.isnan(maps).any(axis=0), False, site, False)
+    begun = time.process_time()
+    found = calibrate_material(config, sensor, material, Progress(), with_greedy=False).found
+    values = zip(fitted.names, true, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True)
+    return {
+        "parameters": {name: {"true": t, "value": v, "low": a, "high": b} for name, t, v, a, b in values},
+        "p": found.misfit_p,
+        "cpu_s": time.process_time() - begun,
+    }
+
+
+def table(found: list[dict[str, Any]]) -> list[str]:
+    """Per parameter: intervals that hold the truth, median width and RMS error of the logarithm."""
+    rows = [f"| {len(found)} trials | in the interval of 95 % | RMS error | median half width |", "|" + "---|" * 4]
+    for name in found[0]["parameters"]:
+        each = [one["parameters"][name] for one in found]
+        true, value, low, high = (np.array([one[key] for one in each]) for key in ("true", "value", "low", "high"))
+        held = int(np.count_nonzero((low <= true) & (true <= high)))
+        error, half = np.sqrt(np.mean(np.log(value / true) ** 2)), np.median(np.log(high / low)) / 2
+        rows.append(f"| {name} | {held} ({held / len(found):.0%}) | {error:.1%} | {half:.1%} |")
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sensor", choices=("stereo", "tls"), default="tls")
+    parser.add_argument("--trials", type=int, default=50)
+    parser.add_argument("--out", type=Path, default=Path("runs/calibrate_recovery"))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    found = []
+    for number in range(arguments.trials):
+        path = arguments.out / f"{arguments.sensor}_{number:03}.json"
+        if not path.exists():
+            path.write_text(json.dumps(trial(arguments.sensor, number)))
+        found.append(json.loads(path.read_text()))
+        print(
+            number, {name: tuple(f"{v:.3g}" for v in one.values()) for name, one in found[-1]["parameters"].items()}, flush=True
+        )
+    rows = table(found)
+    print("\n".join(rows), f"\nCPU of a calibration: {np.median([one['cpu_s'] for one in found]):.0f} s")
+    begin, end = f"<!-- recovery {arguments.sensor} -->\n", "\n<!-- end -->"
+    text = DOCUMENT.read_text()
+    replacement = begin + "\n".join(rows) + end
+    DOCUMENT.write_text(re.sub(re.escape(begin) + ".*?" + re.escape(end), lambda _: replacement, text, flags=re.DOTALL))
+
+
+if __name__ == "__main__":
+    main()

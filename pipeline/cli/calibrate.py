@@ -1,0 +1,54 @@
+"""`scarpsim calibrate`: the noise of measured epochs, and the noise parameters that make the simulation give the like."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.parser import at_least, one_of
+
+SUMMARY = "measure the noise of real epochs and fit the simulation's noise to it"
+EXAMPLE = """  scarpsim calibrate my_measurement --out calibration
+  scarpsim calibrate maps/*.tif --sensor stereo --config my_site.yaml --set calibration.stable_areas=[[10,5,15,10]]
+  simulate --sensor stereo --config my_site.yaml --set sensor=calibration/calibrated.yaml"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "measured",
+        type=Path,
+        nargs="+",
+        metavar="MEASUREMENT|MAPS",
+        help="a folder with measurement.yaml, a folder of difference maps (a run's too), or difference maps (GeoTIFF)",
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="the site (default: the run's own, else demo.yaml)")
+    parser.add_argument(
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="what measured (default: as the inputs say)"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of the simulations (default: the config's)")
+    parser.add_argument(
+        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
+    )
+    parser.add_argument("--no-greedy", action="store_true", help="leave out the thesis's search, which is run for comparison")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from pipeline.bundled import bundled_config
+    from pipeline.cli.simulate import new_folder
+    from pipeline.config import load_config
+    from pipeline.noise.calibrate import calibrate
+    from pipeline.noise.inputs import config_of, sensor_of
+    from pipeline.noise.write import write
+    from pipeline.progress import shown_progress
+    from pipeline.report.calibration import summary
+
+    path = arguments.config or config_of(arguments.measured) or bundled_config("", "demo")
+    config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)
+    sensor = arguments.sensor or sensor_of(arguments.measured, config)
+    with shown_progress(quiet=arguments.quiet) as progress:
+        result = calibrate(config, sensor, arguments.measured, progress, with_greedy=not arguments.no_greedy)
+        report = write(arguments.out or new_folder(Path("runs"), "calibrate"), config, result, arguments.measured)
+    print(f"{summary(result)}\nreport: {report}")
+    return 0
