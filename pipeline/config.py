@@ -14,6 +14,7 @@ from pipeline.difference import DifferenceConfig
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import PairConfig, read_cameras_yaml
 from pipeline.mesh import SurfaceConfig
+from pipeline.noise.settings import CalibrationConfig
 from pipeline.overrides import apply_overrides
 from pipeline.planning.detectability import PlanningConfig
 from pipeline.presets import is_path, model_file, with_preset
@@ -130,6 +131,7 @@ class SimulationConfig(Config):
     tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")
     products: ProductsConfig = ProductsConfig()
     planning: PlanningConfig = PlanningConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
 
     @model_validator(mode="before")
     @classmethod
