@@ -16,6 +16,8 @@ from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.camera import Camera, CameraPair
 from sensors.effects.base import Effect, Stage
+from sensors.effects.disparity_empirical import DisparityEmpirical
+from sensors.effects.range_empirical import LARGEST
 from sensors.model import StereoModel
 from sensors.rectify import Rectification, rectify
 
@@ -143,7 +145,8 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
     geometry, curvature, depth = _reference(nominal, measurement.scene, u, v, measured)
     hit = np.isfinite(geometry.disparity)
     slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
-    mean = _mean_error(nominal, model, geometry, measurement)
+    covariates = _covariates(nominal, geometry, depth, curvature)
+    mean = _mean_error(nominal, model, geometry, measurement) + _empirical(model, covariates)
     whole = Residuals(
         sensor="stereo",
         value=measured - geometry.disparity - mean,
@@ -152,7 +155,7 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
         smooth=hit & (curvature < _EDGE_PX),
         pose=_pose(nominal, geometry),
         at=geometry.point[:, :2],
-        covariates=_covariates(nominal, geometry, depth, curvature),
+        covariates=covariates,
         index=np.arange(len(u)),
         geometry=geometry,
         notes=() if given else ("no pixel_x, pixel_y: pixels were found by projecting the points",),
@@ -237,6 +240,16 @@ def _mean_error(nominal: NominalPair, model: StereoModel, geometry: StereoGeomet
     real = real_pair(nominal, model.effects, measurement)
     plain = seen_disparity(nominal, nominal.pair, geometry)
     return seen_disparity(nominal, real, geometry) - plain + exposure_and_locking(model.effects, geometry)
+
+
+def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatArray:
+    """(n,) what empirical terms of the model add to the disparity, px (see DisparityEmpirical)."""
+    total = np.zeros(len(covariates["depth"]))
+    for effect in model.effects:
+        if isinstance(effect, DisparityEmpirical):
+            t = np.clip((covariates[effect.covariate] - effect.centre) / effect.scale, -LARGEST, LARGEST)
+            total += sum((c * t**power for power, c in enumerate(effect.coefficients_px, start=1)), np.zeros(len(t)))
+    return total
 
 
 def predicted_variance(model: StereoModel) -> float:
