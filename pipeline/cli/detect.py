@@ -1,0 +1,54 @@
+"""`scarpsim detect`: find rockfalls in difference maps."""
+
+from __future__ import annotations
+
+import argparse
+from datetime import datetime
+from pathlib import Path
+
+SUMMARY = "find rockfalls in difference maps: masks, events, pictures"
+EXAMPLE = """  scarpsim detect default runs/my_run --out found
+  scarpsim detect my_detector/best difference_001.tif difference_002.tif --confidence 0.9 --out found
+  scarpsim detect baseline my_dataset/test --out found_by_threshold"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "model",
+        metavar="MODEL",
+        help="'default' (comes with scarpsim), 'baseline' (threshold, no network), or a trained detector's folder",
+    )
+    parser.add_argument(
+        "inputs",
+        type=Path,
+        nargs="+",
+        metavar="INPUT",
+        help="difference maps (TIFF), run folders, or folders with annotations.json",
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
+    parser.add_argument(
+        "--confidence",
+        type=float,
+        action="append",
+        metavar="P",
+        help="lowest score, may be given several times (default: 0.9 0.95 0.99)",
+    )
+    parser.add_argument("--no-pictures", action="store_true", help="neither overlays nor rasters of masks")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from pipeline.detect.run import BASELINE, CONFIDENCES, checked_confidences, detect
+    from pipeline.progress import shown_progress
+
+    confidences = checked_confidences(arguments.confidence or CONFIDENCES)
+    out = arguments.out or Path("runs") / f"detect_{datetime.now():%Y%m%d_%H%M%S}"
+    if arguments.model != BASELINE:
+        from pipeline.detect.keras_backend import keras_ready
+
+        keras_ready()
+    with shown_progress(quiet=arguments.quiet) as progress:
+        found = detect(arguments.model, arguments.inputs, out, confidences, not arguments.no_pictures, progress)
+    volume = sum(item.volume_m3 for item in found)
+    print(f"{len(found)} blocks with a score of {min(confidences):g} or more, {volume:.3g} m3\nresults: {out}")
+    return 0

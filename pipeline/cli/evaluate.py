@@ -1,0 +1,35 @@
+"""`scarpsim evaluate`: how good detections are."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.parser import one_of
+
+SUMMARY = "compare detections with the truth: precision, recall, F1, mask areas, COCO metrics"
+EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detections.json
+  scarpsim evaluate my_dataset/test found/detections.json --by noise --out scores"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("truth", type=Path, metavar="TRUTH", help="COCO annotations, or a folder that holds annotations.json")
+    parser.add_argument("predictions", type=Path, metavar="PREDICTIONS", help="COCO detections with scores")
+    parser.add_argument(
+        "--by", action="append", default=[], metavar="KEY", help="a table for each value of this key of the images"
+    )
+    parser.add_argument(
+        "--iou", type=one_of("segm", "bbox"), default="segm", metavar="segm|bbox", help="overlap of masks or of boxes"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for scores.json and scores.csv (default: only print)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from pipeline.detect.score_files import as_text, assess, write
+
+    assessment = assess(arguments.truth, arguments.predictions, arguments.by, arguments.iou)
+    print(as_text(assessment))
+    if arguments.out:
+        write(assessment, arguments.out)
+        print(f"scores: {arguments.out}")
+    return 0

@@ -1,0 +1,49 @@
+"""`scarpsim train`: teach a detector on a data set of difference maps."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.parser import at_least
+
+SUMMARY = "train a rockfall detector on a data set"
+EXAMPLE = """  scarpsim train my_dataset --out my_detector
+  scarpsim train my_dataset --config configs/detectors/resnet50.yaml --set training.epochs=40 --out my_detector --resume"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "data_set", type=Path, metavar="DATASET", help="folder with train/ and val/, as scarpsim dataset makes it"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the detector, its checkpoints and curves"
+    )
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="network and training (default: the bundled detectors/light.yaml)"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
+    )
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of weights, order and flips (default: the config's)")
+    parser.add_argument("--resume", action="store_true", help="go on with the interrupted training in the folder --out")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from pipeline.bundled import bundled_config
+    from pipeline.detect.config import load_train_config
+    from pipeline.detect.keras_backend import keras_ready
+    from pipeline.progress import shown_progress
+
+    overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
+    config = load_train_config(arguments.config or bundled_config("detectors", "light"), overrides)
+    keras_ready()
+    from pipeline.detect.training import train
+
+    arguments.kept = f"what was learned is in {arguments.out}; go on with --resume"
+    with shown_progress(quiet=arguments.quiet) as progress:
+        history = train(arguments.data_set, config, arguments.out, resume=arguments.resume, progress=progress)
+    best = min(history.total)
+    print(f"{len(history.total)} epochs, validation loss {history.total[-1]:.4f}, best {best:.4f}: {arguments.out / 'best'}")
+    return 0

@@ -1,0 +1,96 @@
+"""Boxes (y0, x0, y1, x1) in px, pixel (0, 0) covering 0...1: overlap, coding against anchors, suppression.
+
+Everything works on batches and on any Keras backend.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from keras import ops
+from numpy.typing import NDArray
+
+Tensor = Any
+"""A tensor of the Keras backend in use."""
+_DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)
+"""Typical sizes of the four numbers of a code, by which they are divided (He et al. 2017, as everybody's code has it)."""
+_LARGEST_LOG = float(np.log(1000 / 16))
+STRIDES = (4, 8, 16, 32, 64)
+"""Pixels of the image per cell of the levels P2 to P6."""
+
+
+def anchors(height: int, width: int, sizes: tuple[float, ...], ratios: tuple[float, ...]) -> NDArray[np.float32]:
+    """(a, 4) anchors of all levels, level by level, row by row, column by column, ratio by ratio.
+
+    An anchor is centred on its cell; sizes: square root of the area, px, one per level; ratios: height over width.
+    """
+    root = np.sqrt(np.asarray(ratios))
+    levels = []
+    for stride, size in zip(STRIDES, sizes, strict=True):
+        y = (np.arange(-(-height // stride)) + 0.5) * stride
+        x = (np.arange(-(-width // stride)) + 0.5) * stride
+        centre = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)[:, :, None]
+        half = 0.5 * size * np.stack([root, 1 / root], axis=-1)
+        levels.append(np.concatenate([centre - half, centre + half], axis=-1).reshape(-1, 4))
+    return np.concatenate(levels).astype(np.float32)
+
+
+def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
+    """(..., n, m) of boxes (..., n, 4) and (..., m, 4); 0 where both are empty."""
+    left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
+    side = ops.maximum(ops.minimum(left[..., 2:], right[..., 2:]) - ops.maximum(left[..., :2], right[..., :2]), 0.0)
+    common = side[..., 0] * side[..., 1]
+    return common / ops.maximum(_area(left) + _area(right) - common, 1e-6)
+
+
+def encode(boxes: Tensor, reference: Tensor) -> Tensor:
+    """(..., 4) where boxes lie as seen from reference boxes: shift of the centre by their size, logarithm of the ratio of sizes."""
+    centre, size = _centre_size(boxes)
+    at, scale = _centre_size(reference)
+    code = ops.concatenate([(centre - at) / scale, ops.log(size / scale)], axis=-1)
+    return code / _DEVIATIONS
+
+
+def decode(code: Tensor, reference: Tensor) -> Tensor:
+    """(..., 4) boxes of codes, the inverse of `encode`; sizes are held within 62 times the reference's."""
+    at, scale = _centre_size(reference)
+    code = code * _DEVIATIONS
+    centre = at + code[..., :2] * scale
+    half = 0.5 * scale * ops.exp(ops.minimum(code[..., 2:], _LARGEST_LOG))
+    return ops.concatenate([centre - half, centre + half], axis=-1)
+
+
+def clip(boxes: Tensor, height: int, width: int) -> Tensor:
+    """The part of boxes (..., 4) inside the image."""
+    return ops.clip(boxes, 0.0, np.array([height, width, height, width], np.float32))
+
+
+def suppressed(boxes: Tensor, scores: Tensor, threshold: float, count: int) -> tuple[Tensor, Tensor]:
+    """Greedy non-maximum suppression: the best `count` boxes (b, count, 4) and scores (b, count), -1 where there are fewer.
+
+    boxes: (b, n, 4); scores: (b, n), 0...1, falling along n. A box stays unless a better one that stays overlaps it by more than
+    `threshold`. That rule has one solution; it is reached by applying it to all boxes at once until nothing changes, which
+    settles at least one more box each time and in practice all of them in a few.
+    """
+    size = boxes.shape[1]
+    better = np.triu(np.ones((size, size), np.float32), 1)
+    rival = ops.cast(intersection_over_union(boxes, boxes) > threshold, "float32") * better
+
+    def step(kept: Tensor, _: Tensor) -> tuple[Tensor, Tensor]:
+        return ops.cast(ops.matmul(kept[:, None], rival)[:, 0] < 0.5, "float32"), kept
+
+    start = ops.ones_like(scores)
+    kept, _ = ops.while_loop(lambda new, old: ops.any(new != old), step, (start, 0 * start), maximum_iterations=size)
+    sound = (kept > 0.5) & (_area(boxes) > 0)
+    best, index = ops.top_k(ops.where(sound, scores, -1.0), min(count, size))
+    return ops.take_along_axis(boxes, index[..., None], axis=1), best
+
+
+def _area(boxes: Tensor) -> Tensor:
+    return (boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1])
+
+
+def _centre_size(boxes: Tensor) -> tuple[Tensor, Tensor]:
+    size = ops.maximum(boxes[..., 2:] - boxes[..., :2], 1e-3)
+    return 0.5 * (boxes[..., 2:] + boxes[..., :2]), size

@@ -1,0 +1,110 @@
+"""What a detector is made of and how it is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from pipeline.overrides import apply_overrides
+from scene.config import Config, load_yaml, parse
+
+
+class NormalisationConfig(Config):
+    """How a difference map, m, becomes the network's input.
+
+    `minmax` maps the valid pixels of each image to 0...1, as the thesis does, and so loses the amplitude. `fixed` gives
+    asinh(d / scale_m), `level_of_detection` asinh(d / (1.96 NMAD of the image)): both keep how large a difference is, in metres
+    or in multiples of what the noise lets see. Pixels without data become 0 (`minmax`: the image's median).
+    """
+
+    method: Literal["minmax", "fixed", "level_of_detection"] = Field("fixed", description="how values are scaled")
+    scale_m: float = Field(0.05, gt=0, description="the difference that becomes asinh(1) = 0.88; for `fixed`")
+    validity_channel: bool = Field(True, description="a second channel: 1 where there are data, 0 where not")
+
+    @property
+    def channels(self) -> int:
+        """Channels of the network's input."""
+        return 2 if self.validity_channel else 1
+
+
+class ProposalConfig(Config):
+    """The region proposal network (Ren et al. 2015)."""
+
+    anchor_sizes_px: tuple[float, ...] = Field(
+        (8, 16, 32, 64, 128), min_length=5, max_length=5, description="one per pyramid level"
+    )
+    anchor_ratios: tuple[float, ...] = Field((0.5, 1.0, 2.0), min_length=1, description="height over width")
+    positive_iou: float = Field(0.6, gt=0, le=1, description="an anchor this near a block is a block")
+    negative_iou: float = Field(0.3, ge=0, lt=1, description="an anchor this far from every block is background")
+    sampled_anchors: int = Field(256, ge=4, description="anchors per image that enter the loss, at most half of them positive")
+    candidates: int = Field(1000, ge=1, description="best anchors per image that go into the suppression")
+    suppression_iou: float = Field(0.7, gt=0, le=1, description="of two proposals that overlap more the better one stays")
+    proposals: int = Field(256, ge=1, description="proposals per image after the suppression")
+
+
+class HeadConfig(Config):
+    """The heads on the proposals (He et al. 2017)."""
+
+    mask_size_px: Literal[28, 56, 112] = Field(56, description="side of a mask within its box")
+    sampled_proposals: int = Field(96, ge=3, description="proposals per image that enter the loss, a third of them positive")
+    positive_iou: float = Field(0.5, gt=0, le=1, description="a proposal this near a block is a block")
+    hidden_units: int = Field(256, ge=1, description="units of the two dense layers of the box head")
+    detections: int = Field(150, ge=1, description="most blocks found in one image")
+    suppression_iou: float = Field(0.4, gt=0, le=1, description="of two detections that overlap more the better one stays")
+
+
+class DetectorConfig(Config):
+    """The network, Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017)."""
+
+    backbone: Literal["light", "resnet50", "resnet101"] = Field("light", description="light is for CPUs")
+    pyramid_channels: int = Field(
+        64, ge=8, multiple_of=8, description="channels of the feature pyramid and of the heads; 256 in the papers"
+    )
+    image_px: int = Field(512, ge=64, multiple_of=64, description="side of the images that it is made for")
+    most_blocks: int = Field(100, ge=1, description="most blocks of one training image")
+    normalisation: NormalisationConfig = NormalisationConfig()
+    proposal: ProposalConfig = ProposalConfig()
+    head: HeadConfig = HeadConfig()
+
+
+class TrainingConfig(Config):
+    """How the network learns."""
+
+    epochs: int = Field(350, ge=1, description="most passes over the training images")
+    batch: int = Field(2, ge=1, description="images per step")
+    optimizer: Literal["adamw", "sgd"] = Field("adamw", description="sgd has a momentum of 0.9")
+    learning_rate: float = Field(1e-3, gt=0, description="after the warm-up")
+    schedule: Literal["constant", "cosine"] = Field("cosine", description="cosine falls to a hundredth over the epochs")
+    warm_up_steps: int = Field(200, ge=0, description="steps over which the learning rate rises from zero")
+    weight_decay: float = Field(1e-4, ge=0, description="pull of the weights towards zero")
+    clip_norm: float = Field(5.0, gt=0, description="largest norm of a gradient")
+    flips: bool = Field(True, description="mirror images left-right at random")
+    crop_px: int | None = Field(
+        None, ge=64, multiple_of=64, description="train on random windows of this side (default: whole images)"
+    )
+    stop_window: int = Field(10, ge=2, description="epochs over which the slope of the validation loss is averaged")
+    stop_slope: float = Field(0.0, ge=0, description="stop once the loss falls by less than this per epoch; 0: never")
+    seed: int = Field(1, ge=0, description="of weights, order, flips and samples")
+
+
+class TrainConfig(Config):
+    """A detector and its training: what `scarpsim train --config` reads."""
+
+    detector: DetectorConfig = DetectorConfig()
+    training: TrainingConfig = TrainingConfig()
+
+    @model_validator(mode="after")
+    def _check_crop(self) -> TrainConfig:
+        crop = self.training.crop_px
+        if crop is not None and crop > self.detector.image_px:
+            raise ValueError(f"training.crop_px must not exceed detector.image_px ({self.detector.image_px})")
+        return self
+
+
+def load_train_config(path: Path, overrides: Sequence[str] = ()) -> TrainConfig:
+    """Read a YAML file and put `key.path=value` overrides into it; raises InputError for every mistake in it."""
+    values = load_yaml(path) or {}
+    return parse(TrainConfig, apply_overrides(values, overrides) if isinstance(values, dict) else values, where=str(path))

@@ -1,0 +1,58 @@
+"""The three heads: proposals from the pyramid, class and box, mask."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import keras
+from keras import initializers, layers
+
+POOLED_PX, MASK_POOLED_PX = 7, 14
+"""Sides of the features of a box, for its class and place, and for its mask."""
+CLASSES = 2
+"""Background and block."""
+_RARE = initializers.Constant(-4.0)
+"""First guess of an anchor's logit: few hold a block, so that the first steps are not spent on saying no (Lin et al. 2017b)."""
+
+
+def proposal_head(channels: int, ratios: int) -> keras.Model:
+    """From one level of the pyramid to (b, h, w, 5 ratios): per anchor a logit, then the four numbers of its code."""
+    level = keras.Input((None, None, channels))
+    x = layers.Conv2D(channels, 3, padding="same", activation="relu", kernel_initializer="he_normal", name="shared")(level)
+    logits = layers.Conv2D(ratios, 1, bias_initializer=_RARE, kernel_initializer=_small(), name="logit")(x)
+    codes = layers.Conv2D(4 * ratios, 1, kernel_initializer=_small(), name="code")(x)
+    return keras.Model(level, [layers.Reshape((-1, 1))(logits), layers.Reshape((-1, 4))(codes)], name="proposal_head")
+
+
+def box_head(channels: int, hidden: int) -> keras.Model:
+    """From a box's features (n, POOLED_PX, POOLED_PX, channels) to class logits (n, CLASSES) and the block's code (n, 4)."""
+    features = keras.Input((POOLED_PX, POOLED_PX, channels))
+    x: Any = layers.Flatten()(features)
+    for number in range(2):
+        x = layers.Dense(hidden, activation="relu", kernel_initializer="he_normal", name=f"hidden_{number}")(x)
+    logits = layers.Dense(CLASSES, kernel_initializer=_small(), name="class")(x)
+    code = layers.Dense(4, kernel_initializer=_small(), name="code")(x)
+    return keras.Model(features, [logits, code], name="box_head")
+
+
+def mask_head(channels: int, size_px: int) -> keras.Model:
+    """From the features of one box, (n, MASK_POOLED_PX, MASK_POOLED_PX, channels), to mask logits (n, size_px, size_px).
+
+    Each doubling of 14 px is one transposed convolution: one for 28 px, two for 56, three for 112.
+    """
+    features = keras.Input((MASK_POOLED_PX, MASK_POOLED_PX, channels))
+    x: Any = features
+    for number in range(4):
+        x = layers.Conv2D(channels, 3, padding="same", kernel_initializer="he_normal", name=f"convolution_{number}")(x)
+        x = layers.ReLU()(layers.GroupNormalization(8, name=f"norm_{number}")(x))
+    doublings = (size_px // MASK_POOLED_PX).bit_length() - 1
+    for number in range(doublings):
+        x = layers.Conv2DTranspose(
+            channels, 2, strides=2, activation="relu", kernel_initializer="he_normal", name=f"doubling_{number}"
+        )(x)
+    x = layers.Conv2D(1, 1, name="logit")(x)
+    return keras.Model(features, layers.Reshape((size_px, size_px))(x), name="mask_head")
+
+
+def _small() -> initializers.Initializer:
+    return initializers.RandomNormal(stddev=0.01)

@@ -1,0 +1,179 @@
+"""What comes in and what goes out without a network: normalisation, COCO folders, tiles, seams, masks, events, the baseline."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+from test_model import make_set
+
+from pipeline.detect import baseline, events
+from pipeline.detect.config import DetectorConfig, NormalisationConfig, TrainingConfig
+from pipeline.detect.data import CocoFolder, batches, mirrored
+from pipeline.detect.detections import Detection, cropped, without_doubles
+from pipeline.detect.inference import paste, tile_places
+from pipeline.detect.normalisation import denormalised, nmad, normalised
+from pipeline.detect.run import detect, find_inputs
+from pipeline.detect.schedule import has_settled, learning_rate
+from scene.errors import InputError
+from scene.grid import Grid
+
+
+def _map() -> np.ndarray:
+    difference = np.random.default_rng(1).normal(0.0, 0.02, (40, 50)).astype(np.float32)
+    difference[3:9, 4:20] = np.nan
+    return difference
+
+
+def test_minmax_spans_zero_to_one_and_goes_back():
+    difference = _map()
+    image = normalised(difference, NormalisationConfig(method="minmax"))
+    valid = np.isfinite(difference)
+    assert (image[..., 0][valid].min(), image[..., 0][valid].max()) == (0, 1)
+    assert_array_equal(image[..., 1], valid)
+    low, high = difference[valid].min(), difference[valid].max()
+    assert_allclose(denormalised(image[..., 0], low, high)[valid], difference[valid], atol=5e-8)
+
+
+def test_fixed_keeps_the_amplitude_and_level_of_detection_the_ratio_to_the_noise():
+    difference = _map()
+    valid = np.isfinite(difference)
+    fixed = NormalisationConfig(method="fixed", scale_m=0.05)
+    assert_allclose(np.sinh(normalised(difference, fixed)[..., 0][valid]) * 0.05, difference[valid], rtol=1e-5, atol=1e-7)
+    relative = NormalisationConfig(method="level_of_detection", validity_channel=False)
+    assert_allclose(normalised(difference, relative), normalised(3 * difference, relative), rtol=1e-5, atol=1e-6)
+    assert nmad(difference) == pytest.approx(0.02, rel=0.05)  # 1800 values: 3 % is two of its standard errors
+    assert np.isfinite(normalised(np.full((4, 4), np.nan, np.float32), relative)).all()
+
+
+def test_batches_depend_on_seed_and_epoch_alone(tmp_path):
+    folder = CocoFolder(make_set(tmp_path, 5, 3, side=64, blocks=1))
+    config, training = DetectorConfig(image_px=64, most_blocks=4), TrainingConfig(batch=2)
+    first, again, other = (list(batches(folder, config, training, epoch, learning=True)) for epoch in (0, 0, 1))
+    assert len(first) == 3
+    for one, two in zip(first, again, strict=True):
+        assert all(np.array_equal(one[name], two[name]) for name in one)
+    assert any(not np.array_equal(one["image"], two["image"]) for one, two in zip(first, other, strict=True))
+    plain = next(batches(folder, config, training, 0, learning=False))
+    assert_array_equal(plain["labels"][0], folder.labelled(0).labels)
+
+
+def test_a_mirrored_map_has_its_blocks_mirrored(tmp_path):
+    labelled = CocoFolder(make_set(tmp_path, 1, 4, side=64, blocks=2)).labelled(0)
+    turned = mirrored(labelled)
+    for number, (y0, x0, y1, x1) in enumerate(turned.boxes, start=1):
+        rows, columns = np.nonzero(turned.labels == number)
+        assert (rows.min(), columns.min(), rows.max() + 1, columns.max() + 1) == (y0, x0, y1, x1)
+    assert_array_equal(mirrored(turned).labels, labelled.labels)
+
+
+@pytest.mark.parametrize(("shape", "count"), [((512, 512), 1), ((300, 200), 1), ((513, 512), 2), ((1024, 700), 3 * 2)])
+def test_tiles_cover_the_map_with_half_their_side_shared(shape, count):
+    places = list(tile_places(shape, 512))
+    assert len(places) == count
+    seen = np.zeros(shape, bool)
+    for row, column in places:
+        seen[row : row + 512, column : column + 512] = True
+    assert seen.all()
+
+
+def test_a_mask_is_pasted_at_its_place():
+    """A half-plane mask whose edge lies at a known place, with sub-pixel box corners."""
+    probability = np.zeros((56, 56), np.float32)
+    probability[:, :28] = 1
+    row, column, mask = paste(probability, np.array([10.25, 20.5, 30.25, 40.5], np.float32), 64)
+    assert (row, column, mask.shape) == (10, 20, (21, 21))
+    assert mask[:, :10].all()  # pixel centres up to 29.5 lie left of the middle, 30.5
+    assert not mask[:, 11:].any()
+
+
+def test_run_lengths_go_round():
+    mask = np.random.default_rng(3).random((9, 7)) > 0.4
+    item = cropped(mask, 5, 6, 0.7)
+    assert item is not None
+    entry = item.annotation(1, 1, (32, 40))
+    whole = np.zeros((32, 40), bool)
+    whole[5:14, 6:13] = mask
+    assert_array_equal(coco_mask.decode(entry["segmentation"]).astype(bool), whole)
+    assert entry["area"] == mask.sum() == coco_mask.area(entry["segmentation"])
+    assert entry["bbox"] == list(coco_mask.toBbox(entry["segmentation"]))
+
+
+def test_the_better_of_two_detections_of_one_block_stays():
+    whole, part = np.ones((20, 20), bool), np.ones((20, 12), bool)
+    found = without_doubles([Detection(0, 0, part, 0.8), Detection(0, 0, whole, 0.9), Detection(0, 19, whole, 0.7)])
+    assert [item.score for item in found] == [0.9, 0.7]
+
+
+def test_the_volume_of_a_known_niche():
+    difference = np.zeros((50, 60), np.float32)
+    difference[10:20, 30:50] = 0.25
+    difference[10, 30] = np.nan
+    item = cropped(difference[10:20, 30:50] != 0, 10, 30, 0.99)
+    assert item is not None
+    found = events.event(item, 1, "map", difference, Grid(100.0, 7.0, 0.02, 60, 50))
+    assert (found.x_m, found.y_m) == pytest.approx((100.0 + 40 * 0.02, 7.0 - 15 * 0.02))
+    assert found.area_m2 == pytest.approx(200 * 0.02**2)
+    assert (found.depth_m, found.volume_m3) == pytest.approx((0.25, 0.25 * 200 * 0.02**2))
+
+
+def test_the_baseline_finds_niches_above_the_level_of_detection_and_no_noise(tmp_path):
+    folder = CocoFolder(make_set(tmp_path, 3, 8))
+    for index in range(3):
+        truth = folder.labelled(index)
+        found = [item for item in baseline.detect(truth.difference) if item.score > 0.9]
+        assert len(found) == len(truth.boxes)
+        assert sum(item.area_px for item in found) == pytest.approx((truth.labels > 0).sum(), rel=0.1)
+
+
+def test_detect_writes_what_it_says(tmp_path):
+    make_set(tmp_path / "set", 2, 9)
+    out = tmp_path / "out"
+    found = detect("baseline", [tmp_path / "set"], out)
+    assert len(found) == 6
+    assert len(COCO(str(out / "detections_0.9.json")).anns) == 6
+    assert len((out / "events_0.9.csv").read_text().splitlines()) == 7
+    for name in ("detections.json", "detections_0.99.json", "1_masks.tif", "1_detections.png"):
+        assert (out / name).is_file()
+
+
+def test_inputs_that_are_none_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no difference map"):
+        find_inputs([tmp_path])
+    (tmp_path / "annotations.json").write_text("[1, 2]")
+    with pytest.raises(InputError, match="no COCO annotation file"):
+        find_inputs([tmp_path])
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": [], "annotations": []}))
+    with pytest.raises(InputError, match="names no image"):
+        find_inputs([tmp_path])
+    (tmp_path / "a.tif").write_bytes(b"II*\0garbage")
+    with pytest.raises(InputError, match="TIFF"):
+        detect("baseline", [tmp_path / "a.tif"], tmp_path / "out")
+
+
+def test_a_tiff_of_another_size_than_annotated_is_refused(tmp_path):
+    make_set(tmp_path, 1, 9)
+    content = json.loads((tmp_path / "annotations.json").read_text())
+    content["images"][0]["width"] = 99
+    (tmp_path / "annotations.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="128 x 99 px as annotated"):
+        CocoFolder(tmp_path).labelled(0)
+
+
+def test_learning_rate_warms_up_and_falls():
+    config = TrainingConfig(learning_rate=0.1, warm_up_steps=9, schedule="cosine")
+    assert learning_rate(0, 1000, config) == pytest.approx(0.01, rel=1e-3)
+    assert learning_rate(9, 1000, config) == pytest.approx(0.1, rel=1e-3)
+    assert learning_rate(1000, 1000, config) == pytest.approx(0.001)
+
+
+def test_training_stops_where_the_mean_slope_is_flat():
+    config = TrainingConfig(stop_window=10, stop_slope=0.01)
+    falling = [2.0 - 0.05 * epoch for epoch in range(20)]
+    assert not has_settled(falling, config)
+    assert has_settled(falling + [falling[-1]] * 10, config)
+    assert not has_settled([1.0] * 10, config)  # fewer than the window

@@ -1,0 +1,205 @@
+"""The network as a whole: it learns two tiles by heart, steps are deterministic, it goes on after a kill as before."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import keras
+import numpy as np
+import pytest
+import tensorflow as tf
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.annotate import run_length_encoding
+from pipeline.detect import weights
+from pipeline.detect.config import DetectorConfig, HeadConfig, TrainConfig, TrainingConfig, load_train_config
+from pipeline.detect.data import CocoFolder, network_input, window
+from pipeline.detect.inference import detect
+from pipeline.detect.model import LOSSES, MaskRCNN
+from pipeline.detect.training import train
+from pipeline.formats.geotiff import write_geotiff
+from scene.errors import InputError
+from scene.grid import Grid
+
+SIDE = 128
+SMALL = DetectorConfig(image_px=SIDE, pyramid_channels=32, most_blocks=8, head=HeadConfig(mask_size_px=28, hidden_units=64))
+
+
+def make_set(folder: Path, count: int, seed: int, side: int = SIDE, blocks: int = 3) -> Path:
+    """Difference maps with elliptic niches a few times the noise, as COCO."""
+    random = np.random.default_rng(seed)
+    images, annotations = [], []
+    for number in range(1, count + 1):
+        difference = random.normal(0, 0.01, (side, side)).astype(np.float32)
+        taken = np.zeros((side, side), bool)
+        y, x = np.mgrid[:side, :side] + 0.5
+        while sum(item["image_id"] == number for item in annotations) < blocks:
+            height, width = random.uniform(10, 30, 2)
+            row, column = random.uniform(16, side - 16, 2)
+            mask = ((y - row) / height * 2) ** 2 + ((x - column) / width * 2) ** 2 < 1
+            around = np.hypot(y - row, x - column) < 20
+            if (taken & around).any():
+                continue
+            taken |= around
+            difference[mask] += 0.1
+            rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+            crop = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            annotations.append(
+                {
+                    "id": len(annotations) + 1, "image_id": number, "category_id": 1, "iscrowd": 0, "area": int(mask.sum()),
+                    "bbox": [int(columns[0]), int(rows[0]), crop.shape[1], crop.shape[0]],
+                    "segmentation": run_length_encoding(crop, int(rows[0]), int(columns[0]), mask.shape),
+                }
+            )  # fmt: skip
+        difference[:4] = np.nan
+        write_geotiff(folder / f"{number}.tif", difference, Grid(0.0, side * 0.02, 0.02, side, side))
+        images.append({"id": number, "file_name": f"{number}.tif", "width": side, "height": side})
+    text = json.dumps({"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "block"}]})
+    (folder / "annotations.json").write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data_set(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data_set")
+    make_set(folder / "train", 4, 1)
+    make_set(folder / "val", 2, 2)
+    return folder
+
+
+def _batch(folder: Path) -> dict[str, np.ndarray]:
+    examples = [network_input(CocoFolder(folder).labelled(index), SMALL) for index in range(2)]
+    return {name: np.stack([example[name] for example in examples]) for name in examples[0]}
+
+
+def _compiled(seed: int = 1) -> MaskRCNN:
+    model = MaskRCNN(SMALL, seed=seed)
+    model.compile(optimizer=keras.optimizers.AdamW(2e-3, global_clipnorm=5.0), jit_compile=False)
+    return model
+
+
+@pytest.fixture
+def eager():
+    """Step by step: a graph takes 20 s to build, which a few steps are not worth."""
+    tf.config.run_functions_eagerly(True)
+    yield
+    tf.config.run_functions_eagerly(False)
+
+
+@pytest.mark.slow
+def test_two_tiles_are_learned_by_heart(data_set):
+    """Every block of both tiles is found with a mask that overlaps it by more than 0.9, and nothing else."""
+    folder, model = CocoFolder(data_set / "train"), _compiled()
+    batch = _batch(data_set / "train")
+    for step in range(220):
+        model.optimizer.learning_rate = 2e-3 * min(1, (step + 1) / 20) * (0.1 if step > 170 else 1)
+        model.train_on_batch(batch)
+    for index in range(2):
+        truth = folder.labelled(index)
+        found = detect(model, truth.difference, 0.5)
+        assert len(found) == len(truth.boxes)
+        for number in range(1, len(truth.boxes) + 1):
+            wanted = truth.labels == number
+            best = 0.0
+            for item in found:
+                mask = np.zeros_like(wanted)
+                mask[item.row : item.row + item.mask.shape[0], item.column : item.column + item.mask.shape[1]] = item.mask
+                best = max(best, float((mask & wanted).sum() / (mask | wanted).sum()))
+            assert best > 0.9
+
+
+def test_a_training_step_is_deterministic(data_set, eager):
+    batch = _batch(data_set / "train")
+    results = []
+    for _ in range(2):
+        model = _compiled()
+        losses = [model.train_on_batch(batch, return_dict=True) for _ in range(2)]
+        results.append((losses, [np.asarray(variable) for variable in model.variables]))
+    assert results[0][0] == results[1][0]
+    for one, other in zip(results[0][1], results[1][1], strict=True):
+        assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_a_killed_training_goes_on_to_the_same_curve(data_set, tmp_path, eager):
+    short = {"batch": 2, "warm_up_steps": 2, "epochs": 3, "learning_rate": 1e-3}
+    config = TrainConfig(detector=SMALL, training=TrainingConfig(**short))
+    whole = train(data_set, config, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(data_set, config, tmp_path / "killed", progress=_KilledAfter(2))
+    with pytest.raises(InputError, match="--resume"):
+        train(data_set, config, tmp_path / "killed")
+    resumed = train(data_set, config, tmp_path / "killed", resume=True)
+    assert resumed.training == whole.training
+    assert resumed.validation == whole.validation
+    for name in ("best/detector.yaml", "best/model.weights.h5", "losses.png", "checkpoint/state.json"):
+        assert (tmp_path / "killed" / name).is_file()
+    assert set(whole.training[0]) == {"loss", *LOSSES}
+    again = weights.load(tmp_path / "killed" / "best")
+    image = _batch(data_set / "train")["image"]
+    assert np.isfinite(again.predict_on_batch({"image": image})["boxes"]).all()
+
+
+class _KilledAfter:
+    """A progress that interrupts in the middle of an epoch, as Ctrl-C does."""
+
+    def __new__(cls, epochs: int):
+        from pipeline.progress import Progress
+
+        class Killer(Progress):
+            def advance(self, fraction: float) -> None:
+                if self.current == f"epoch {epochs}":
+                    raise KeyboardInterrupt
+
+        return Killer()
+
+
+@pytest.mark.parametrize("size", [28, 56, 112])
+def test_masks_have_the_size_of_the_config(size):
+    model = MaskRCNN(SMALL.model_copy(update={"head": HeadConfig(mask_size_px=size, detections=5, hidden_units=16)}))
+    answer = model({"image": np.zeros((1, SIDE, SIDE, 2), np.float32)})
+    assert answer["masks"].shape == (1, 5, size, size)
+    assert answer["boxes"].shape == (1, 5, 4)
+
+
+@pytest.mark.parametrize(("name", "millions"), [("resnet50", 23.5), ("resnet101", 42.5)])
+def test_the_backbones_are_the_papers(name, millions):
+    """Parameters of the convolutions of He et al. without the classifier; the first takes one channel in place of three."""
+    from pipeline.detect.backbone import feature_pyramid
+
+    model = feature_pyramid(name, 64, 1, 256)
+    backbone = sum(
+        int(np.prod(weight.shape)) for weight in model.weights if "lateral" not in weight.path and "pyramid_" not in weight.path
+    )
+    assert backbone / 1e6 == pytest.approx(millions, abs=0.1)
+
+
+def test_the_shipped_configs_load():
+    from pipeline.bundled import configs_folder
+
+    for path in sorted((configs_folder() / "detectors").glob("*.yaml")):
+        assert load_train_config(path).detector.backbone == path.stem
+
+
+def test_weights_of_another_network_are_refused(tmp_path):
+    weights.save(MaskRCNN(SMALL), tmp_path)
+    other = SMALL.model_copy(update={"pyramid_channels": 40})
+    (tmp_path / weights.CONFIG).write_text(json.dumps(other.model_dump(mode="json")))
+    with pytest.raises(InputError, match="does not fit"):
+        weights.load(tmp_path)
+    (tmp_path / weights.WEIGHTS).write_bytes(b"no weights")
+    with pytest.raises(InputError, match="does not fit"):
+        weights.load(tmp_path)
+    with pytest.raises(InputError, match="holds no detector"):
+        weights.load(tmp_path / "nowhere")
+
+
+def test_a_window_keeps_what_it_shows_at_least_half_of(data_set):
+    labelled = CocoFolder(data_set / "train").labelled(0)
+    part = window(labelled, 64, np.random.default_rng(5))
+    assert part.difference.shape == part.labels.shape == (64, 64)
+    assert part.labels.max() == len(part.boxes)
+    for number, (y0, x0, y1, x1) in enumerate(part.boxes, start=1):
+        rows, columns = np.nonzero(part.labels == number)
+        assert_allclose((rows.min(), columns.min(), rows.max() + 1, columns.max() + 1), (y0, x0, y1, x1), atol=1)
