@@ -100,7 +100,7 @@ class ScannerPreset(Config):
 
     def scanner_values(self) -> dict[str, Any]:
         """What the preset knows of a `ScannerConfig`, as its keys and values."""
-        known: dict[str, Any] = {}
+        known: dict[str, Any] = {"name": self.name}
         if self.zenith_limits_deg is not None:
             known["zenith_limits_rad"] = tuple(float(np.radians(limit)) for limit in self.zenith_limits_deg.value)
         for key, figure in (("azimuth_step_rad", self.azimuth_step_deg), ("zenith_step_rad", self.zenith_step_deg)):

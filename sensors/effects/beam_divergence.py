@@ -18,8 +18,8 @@ class BeamDivergence(Effect):
     first return is recorded, the strongest, the mean of all, or (multiple) the strongest in the grid of the scan and every other
     one beside it. Ranging by phase: all echoes add as phasors; the mode does not matter. On a tilted plane the footprint is
     D R / cos i long, and the mean is the axis's range to second order in D. The block label is that of the strongest echo in the
-    return. At edges a return leans to the surface that is hit more squarely, whose echo is stronger: 0.18 +- 0.03 mm on average over
-    a rough wall of 1 M pulses at 105 m; with equal echoes it would be -0.01 +- 0.02, so the sub-rays have no bias of their own.
+    return. At edges a return leans to the surface that is hit more squarely, whose echo is stronger: 0.18 +- 0.03 mm on average
+    over a rough wall of 1 M pulses at 105 m; with equal echoes it is -0.01 +- 0.02, so the sub-rays have no bias of their own.
     """
 
     name: Literal["beam_divergence"] = "beam_divergence"

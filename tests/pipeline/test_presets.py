@@ -111,6 +111,7 @@ def test_a_preset_fills_scanner_and_model(bare: Path, override: str) -> None:
     config = load_config(bare, [override], "tls", None)
     expected = read_preset("leica_p40")
     assert config.scanner == expected.scanner()
+    assert config.scanner.name == "Leica ScanStation P40"
     assert config.scanner.zenith_limits_rad == (0.0, pytest.approx(np.radians(145)))
     assert config.tls_model() == expected.model()
 
