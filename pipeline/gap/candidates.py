@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scene.mesh import FloatArray
 
+Rows = NDArray[np.int64]
 _KNOTS = 5
+_STEPS = 13
+"""Places at which a step in a covariate is tried: quantiles of it."""
+_MOST_CYCLES = 12.0
+_CHUNK = 32
+PLACE = "place along"
+_DIRECTIONS = (30, 60, 120, 150)
+"""Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
 
 
 @dataclass(frozen=True)
@@ -21,28 +31,112 @@ class Wave:
     x: FloatArray
 
     def columns(self, period: float) -> FloatArray:
-        """(n, 2) the two columns at another period."""
+        """(n, 2) the two columns at one period."""
         angle = 2 * np.pi / period * self.x
         return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+    def with_slope(self, period: float, coefficients: FloatArray) -> FloatArray:
+        """(n, 3) the two columns, and the change of their sum, weighted by `coefficients` (2,), by the frequency 1 / period."""
+        sine, cosine = self.columns(period).T
+        slope = 2 * np.pi * self.x * (coefficients[0] * cosine - coefficients[1] * sine)
+        return np.stack([sine, cosine, slope], axis=1)
+
+    def part(self, rows: Rows) -> Wave:
+        """The wave on some of the points."""
+        return Wave(self.key, self.factor[rows], self.x[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One explanation. columns: (n, k) observable per unit of each coefficient; parameters: coefficients to the effect's values.
+    """One explanation. matrix: (n, k) observable per unit of each coefficient; parameters: coefficients to the effect's values.
 
-    names: the parameters that the coefficients stand for; scales: parameter per coefficient where they are proportional; fixed:
-    searched or chosen values that belong to this variant, such as a period or the camera; errors: standard deviations of those.
+    names: the parameters that the coefficients stand for; fixed: searched or chosen values that belong to this variant, such as
+    the camera; form: of an empirical one; wave: of a searched sine, whose period is `period`.
     """
 
     name: str
-    columns: FloatArray
+    matrix: FloatArray | None
     parameters: Callable[[FloatArray], dict[str, float]]
     names: tuple[str, ...]
-    scales: tuple[float, ...]
     fixed: Mapping[str, float | str] = field(default_factory=dict)
     empirical: bool = False
+    form: str = ""
     wave: Wave | None = None
-    errors: Mapping[str, float] = field(default_factory=dict)
+    period: float = 0.0
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """(n, k) the design."""
+        if self.matrix is not None:
+            return self.matrix
+        assert self.wave is not None
+        return self.wave.columns(self.period)
+
+    @property
+    def family(self) -> str:
+        """Variants of one family differ in searched or chosen values only."""
+        return f"free {self.name} {self.form}" if self.empirical else self.name
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A sine of which evenly spaced frequencies are tried. amplitude: name of the parameter; fixed: values of all variants."""
+
+    name: str
+    amplitude: str
+    wave: Wave
+    frequencies: FloatArray
+    fixed: Mapping[str, float | str] = field(default_factory=dict)
+    empirical: bool = False
+
+    def candidate(self, index: int) -> Candidate:
+        """The variant at one of the frequencies."""
+        return self.at(1 / float(self.frequencies[index]))
+
+    def at(self, period: float) -> Candidate:
+        """The variant of any period: its coefficients are those of sine and cosine, and where given a change of the frequency."""
+        amplitude, key = self.amplitude, self.wave.key
+
+        def parameters(values: FloatArray) -> dict[str, float]:
+            changed = 1 / (1 / period + (values[2] if len(values) > 2 else 0.0))
+            return amplitude_and_phase(values[:2], amplitude) | {key: float(changed)}
+
+        names = (amplitude, "phase_rad", key)
+        form = "wave" if self.empirical else ""
+        fixed = {**self.fixed, key: period}
+        return Candidate(self.name, None, parameters, names, fixed, self.empirical, form, self.wave, period)
+
+    def chunks(self, rows: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
+        """Some frequencies at a time, with their columns (n, 2 f) times `rows` (n,): sine and cosine of each, one after another.
+
+        Frequencies are evenly spaced, so that each is the one before turned by the same angle.
+        """
+        count = len(self.frequencies)
+        spacing = float(self.frequencies[1] - self.frequencies[0]) if count > 1 else 0.0
+        factor, turn = self.wave.factor * rows, np.exp(2j * np.pi * spacing * self.wave.x)
+        for start in range(0, count, _CHUNK):
+            stop = min(start + _CHUNK, count)
+            columns = np.empty((2 * (stop - start), len(factor)))
+            phasor = factor * np.exp(2j * np.pi * float(self.frequencies[start]) * self.wave.x)
+            for row in range(stop - start):
+                columns[2 * row], columns[2 * row + 1] = phasor.imag, phasor.real
+                phasor = phasor * turn
+            yield slice(start, stop), columns.T
+
+    def part(self, rows: Rows) -> Grid:
+        """The grid on some of the points."""
+        return replace(self, wave=self.wave.part(rows))
+
+
+def variants(families: list[Candidate | Grid]) -> list[Candidate]:
+    """Every candidate, the searched ones at each of their frequencies."""
+    return [
+        candidate
+        for family in families
+        for candidate in (
+            [family.candidate(index) for index in range(len(family.frequencies))] if isinstance(family, Grid) else [family]
+        )
+    ]
 
 
 def amplitude_and_phase(values: FloatArray, amplitude: str) -> dict[str, float]:
@@ -50,29 +144,41 @@ def amplitude_and_phase(values: FloatArray, amplitude: str) -> dict[str, float]:
     return {amplitude: float(np.hypot(*values)), "phase_rad": float(np.arctan2(values[1], values[0]))}
 
 
-def searched(name: str, amplitude: str, wave: Wave, period: float, **fixed: float | str) -> Candidate:
-    """A sine of one of the periods that are tried."""
-    values: dict[str, float | str] = {**fixed, wave.key: period}
-    return Candidate(
-        name,
-        wave.columns(period),
-        lambda c: amplitude_and_phase(c, amplitude),
-        (amplitude, "phase_rad"),
-        (1.0, 1.0),
-        values,
-        wave=wave,
-    )
+def frequencies(low: float, high: float, step: float, most: int = 200) -> FloatArray:
+    """Evenly from low to high by about `step`, at most some hundreds."""
+    return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
-def free_form(covariate: str, values: FloatArray) -> Candidate:
-    """A smooth function of one covariate: truncated-power cubic with knots at its quantiles, standardised."""
-    spread = float(values.std()) or 1.0
-    x = (values - values.mean()) / spread
+def free_forms(covariate: str, values: FloatArray) -> list[Candidate | Grid]:
+    """Forms of one covariate that stand for no effect: a line, a parabola, a smooth curve, a step, a wave."""
+    x = (values - values.mean()) / (float(values.std()) or 1.0)
     knots = np.quantile(x, np.linspace(0, 1, _KNOTS)[1:-1])
     columns = [x, x**2, x**3, *(np.maximum(x - knot, 0) ** 3 for knot in knots)]
-    matrix = np.stack(columns, axis=1)
-    matrix = matrix / np.maximum(matrix.std(axis=0), 1e-12)
+    smooth = np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
+    steps = np.unique(np.quantile(x, np.linspace(0, 1, _STEPS + 2)[1:-1]))
+    found: list[Candidate | Grid] = [
+        _free(covariate, "line", smooth[:, :1]),
+        _free(covariate, "parabola", smooth[:, :2]),
+        _free(covariate, "smooth", smooth),
+        *(_free(covariate, "step", (x > place).astype(np.float64)[:, None]) for place in steps),
+    ]
+    reach = float(np.ptp(np.quantile(x, [0.005, 0.995])))
+    if reach > 0:
+        wave = Wave("period", np.ones_like(x), x)
+        found.append(Grid(covariate, "amplitude", wave, frequencies(0.8 / reach, _MOST_CYCLES / reach, 0.5 / reach), {}, True))
+    return found
+
+
+def places(at: FloatArray) -> list[Candidate | Grid]:
+    """Free forms of places (n, 2) on the wall in slanting directions, which no sensor knows of.
+
+    What they gain is the reference's doing, in all likelihood, and so may as much be that a covariate gains which changes along
+    the wall too.
+    """
+    turned = [(angle, at @ np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])) for angle in _DIRECTIONS]
+    return [form for angle, x in turned for form in free_forms(f"{PLACE} {angle}", x)]
+
+
+def _free(covariate: str, form: str, matrix: FloatArray) -> Candidate:
     names = tuple(f"c{index}" for index in range(matrix.shape[1]))
-    return Candidate(
-        covariate, matrix, lambda c: dict(zip(names, map(float, c), strict=True)), names, (1.0,) * len(names), empirical=True
-    )
+    return Candidate(covariate, matrix, lambda c: dict(zip(names, map(float, c), strict=True)), names, {}, True, form)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scene.mesh import FloatArray
 
-_MOST_CELLS = 1100
+_MOST_CELLS = 800
 _FEWEST_POINTS = 3
 BLOCK_CELLS = 3
 """Side of a block in cells: blocks are held out, and drawn in a bootstrap, as a whole."""
@@ -45,6 +45,13 @@ def block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
     """(n,) number of the block, BLOCK_CELLS cells of `side_m` wide, in which each point lies."""
     column, row = (np.floor((at[:, axis] - at[:, axis].min()) / (BLOCK_CELLS * side_m)).astype(np.int64) for axis in (0, 1))
     return column + 100_000 * row
+
+
+def patches(at: FloatArray, points: float) -> NDArray[np.int64]:
+    """(n,) number of the square patch, of about so many points, in which each point lies."""
+    side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
+    column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
+    return np.asarray(np.unique(column + 100_000 * row, return_inverse=True)[1])
 
 
 def held_out_blocks(at: FloatArray, side_m: float) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from pipeline.gap.candidates import Candidate
 from pipeline.gap.missing import MissingFound
 from pipeline.gap.quantization import Comb
 from pipeline.gap.residuals import Residuals
-from pipeline.gap.selection import Chosen, MeanSearch
+from pipeline.gap.selection import Chosen, MeanSearch, split
 from pipeline.gap.spread import SpreadFound
 from scene.config import parse
 from scene.mesh import FloatArray
@@ -106,21 +106,20 @@ def from_mean(search: MeanSearch, chosen: list[Chosen], part: Residuals) -> list
     """Effects on the mean, fitted together with pose and correlated error."""
     if not chosen:
         return []
-    candidates, coefficients, covariance = search.refined(chosen)
-    named, start = [], 0
-    for item, candidate in zip(chosen, candidates, strict=True):
-        stop = start + candidate.columns.shape[1]
-        values, spread = coefficients[start:stop], covariance[start:stop, start:stop]
+    candidates, fit = search.refined([item.candidate for item in chosen])
+    places = split(np.arange(len(fit.coefficients)), candidates)
+    named = []
+    for item, candidate, place in zip(chosen, candidates, places, strict=True):
+        values, spread = fit.coefficients[place], fit.covariance[np.ix_(place, place)]
         named.append(
             _empirical(candidate, values, item, part) if candidate.empirical else _physical(candidate, values, spread, item, part)
         )
-        start = stop
     return named
 
 
 def _physical(candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals) -> Named:
     fixed = {key: value for key, value in candidate.fixed.items() if key not in _ONLY_OURS}
-    entry = {"name": candidate.name, **candidate.parameters(values), **fixed}
+    entry = {"name": candidate.name, **fixed, **candidate.parameters(values)}
     std = _uncertainty(candidate, values, covariance)
     alike = tuple(f"{part.sensor}.{name}" for name in item.alike)
     return Named(f"{part.sensor}.{candidate.name}", "physical", _plain(entry), std, alike, item.p_value, item.gain)
@@ -137,13 +136,13 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
             for step, unit in zip(steps, np.eye(len(values)), strict=True)
         ]
         std[key] = float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
-    return {**std, **candidate.errors}
+    return std
 
 
 def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:
     """A free form as a polynomial: of the lowest degree that leaves 2 % of its variance, at most 5."""
     x = part.covariates[candidate.name]
-    curve = candidate.columns @ values
+    curve = candidate.columns @ values[: candidate.columns.shape[1]]
     centre, scale = float(x.mean()), float(x.std()) or 1.0
     t = np.clip((x - centre) / scale, -4, 4)
     fits = [

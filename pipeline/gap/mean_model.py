@@ -1,34 +1,41 @@
 """Mean effects by generalised least squares, with a correlated error of the reference.
 
 The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over
-metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process with a
-Matern 3/2 covariance of unknown amplitude and length plus the noise of a mean; the deviations within cells are white. Both parts
-add their information on b. For each length one eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that
-the likelihood of each candidate is maximised over the covariance too, and the null distribution of the largest gain over all
-candidates is simulated with the same maximisation.
+metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process plus the
+noise of a mean; the deviations within cells are white. Both parts add their information on b. How the reference's error is
+correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy (isotropic waves of about one length, whose covariance is
+Bessel's J0) forms of several lengths are kept as far as the data allow. For each of them one eigendecomposition serves every
+amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised over the covariance too.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.distance import cdist
+from scipy.special import j0
 
 from pipeline.gap.cells import Cells
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
-_LENGTHS_IN_CELLS = (1.0, 2.0, 4.0, 8.0)
-_RATIOS = np.concatenate([[0.0], np.geomspace(0.003, 300.0, 14)])
+_ROUGH, _SMOOTH, _WAVY = (1.0, 2.0, 4.0, 8.0), (1.5, 3.0, 6.0), (2.5, 3.5, 5.0, 7.0)
+"""Lengths in cells of the three forms of correlation."""
+_RATIOS = np.geomspace(0.003, 300.0, 25)
 """Variance of the reference's error over the median variance of a cell's mean."""
+_MOST_RATIOS = 6
+_WORSE = 12.0
+"""A length of correlation whose likelihood falls short of the best by more, whatever is fitted, is not carried along."""
 _RIDGE = 1e-12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Covariance:
-    """One covariance of the cell means. length_m, ratio: of the correlated part; weight: (m,) inverse eigenvalues."""
+    """One covariance of the cell means. length: number of the basis; ratio: of the correlated part; weight: (m,) inverse
+    eigenvalues."""
 
     length: int
     ratio: float
@@ -46,45 +53,96 @@ class Fit:
 
 
 class MeanModel:
-    """The linear algebra of one set of points: values and columns are projected once, candidates are then cheap."""
+    """The linear algebra of one set of points. Rows of whatever it takes are those of `rows`: points in cells, cell by cell."""
 
     def __init__(self, cells: Cells, sigma: FloatArray) -> None:
-        self._cells, self._inside = cells, cells.cell >= 0
-        self._cell = cells.cell[self._inside]
-        self._root = 1 / sigma[self._inside]
-        self._total = np.bincount(self._cell, self._root**2, len(cells))
+        inside = np.flatnonzero(cells.cell >= 0)
+        self.rows = inside[np.argsort(cells.cell[inside], kind="stable")]
+        self._cell = cells.cell[self.rows]
+        self._starts = np.flatnonzero(np.diff(self._cell, prepend=-1))
+        self.root = 1 / sigma[self.rows]
+        self._total = np.add.reduceat(self.root**2, self._starts)
         scale = 1 / np.sqrt(self._total)
         self.typical_sigma = typical = float(np.median(scale))
-        distance = cdist(cells.centre, cells.centre)
+        distance = cdist(cells.centre, cells.centre) / cells.side_m
         self._bases: list[tuple[FloatArray, FloatArray]] = []
-        for length in _LENGTHS_IN_CELLS:
-            reach = np.sqrt(3.0) * distance / (length * cells.side_m)
-            kernel = (1 + reach) * np.exp(-reach) * (typical**2 / np.outer(scale, scale))
-            values, vectors = eigh(kernel, driver="evd")
+        for kernel in _correlations(distance):
+            values, vectors = eigh(kernel * (typical**2 / np.outer(scale, scale)), driver="evd", overwrite_a=True)
             self._bases.append((np.maximum(values, 0.0), vectors))
+        self._white = Covariance(0, 0.0, np.ones(len(self._total)))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def _at(self, length: int, ratio: float) -> Covariance:
+        return Covariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
+
+    def narrowed(self, designs: list[Projected], value: Projected) -> tuple[list[Covariance], list[int]]:
+        """Covariances under which the value is likely, whichever of the designs is fitted (the least and the most of them).
+
+        Bases that none of them needs are forgotten: returns also which are kept, for `Projected.kept` of what there is already.
+        """
+        ratios = [0.0, *map(float, _RATIOS)]
+        tops = np.empty((len(designs), len(self._bases)), dtype=int)
+        heights = np.empty(tops.shape)
+        for row, design in enumerate(designs):
+            normal = _Normal.of(design, value)
+            for basis in range(len(self._bases)):
+                found = [normal.at(self._at(basis, ratio)).log_likelihood for ratio in ratios]
+                tops[row, basis], heights[row, basis] = int(np.argmax(found)), max(found)
+        kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
+        self._bases = [self._bases[basis] for basis in kept]
+        chosen: list[Covariance] = []
+        for number, basis in enumerate(kept):
+            low, high = max(tops[:, basis].min() - 1, 0), min(tops[:, basis].max() + 1, len(ratios) - 1)
+            places = np.unique(np.rint(np.linspace(low, high, min(_MOST_RATIOS, high - low + 1))).astype(int))
+            chosen += [self._at(number, ratios[place]) for place in places]
+        return [*dict.fromkeys(chosen)], kept
 
     @property
-    def covariances(self) -> list[Covariance]:
-        """The grid of covariances."""
-        found = [Covariance(0, 0.0, np.ones(len(self._cells)))]
-        for length, (values, _) in enumerate(self._bases):
-            found += [Covariance(length, float(ratio), 1 / (1 + ratio * values)) for ratio in _RATIOS[1:]]
-        return found
+    def fine(self) -> list[Covariance]:
+        """Every covariance of the bases in use."""
+        return [self._at(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
 
-    def project(self, columns: FloatArray) -> Projected:
-        """Columns (n, k) as deviations within cells and as whitened cell means in each basis."""
-        chosen = columns[self._inside] * self._root[:, None]
-        total = np.sqrt(self._total)[:, None]
-        sums = np.stack([np.bincount(self._cell, self._root * column, len(self._cells)) for column in chosen.T], axis=1)
-        means = sums / total
-        within = chosen - (means / total)[self._cell] * self._root[:, None]
-        return Projected(within, [np.einsum("ij,ik->jk", vectors, means) for _, vectors in self._bases])
+    def sums(self, weighted: FloatArray) -> FloatArray:
+        """(m, k) sums over each cell of columns (n, k)."""
+        return np.asarray(np.add.reduceat(weighted, self._starts, axis=0))
+
+    def means(self, weighted: FloatArray) -> FloatArray:
+        """(m, k) cell means over their standard deviations, of columns (n, k) that are already over sigma."""
+        return self.sums(weighted * self.root[:, None]) / np.sqrt(self._total)[:, None]
+
+    def within(self, weighted: FloatArray, means: FloatArray, rows: slice = slice(None)) -> FloatArray:
+        """Deviations from the cells' means, of `rows`; columns over sigma."""
+        cell = self._cell[rows]
+        spread = (means / np.sqrt(self._total)[:, None])[cell] * self.root[rows, None]
+        return np.asarray(weighted[rows] - spread)
+
+    def between(self, means: FloatArray) -> list[FloatArray]:
+        """Cell means (m, k) in each basis."""
+        return [vectors.T @ means for _, vectors in self._bases]
+
+    def project(self, weighted: FloatArray) -> Projected:
+        """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
+        means = self.means(weighted)
+        return Projected(self.within(weighted, means), self.between(means))
 
     def null_draws(self, at: Covariance, count: int, random: KeyedRandom) -> list[FloatArray]:
         """Draws of the cell means under the covariance `at`, (m, count) in each basis."""
-        draws = random.generator().standard_normal((len(self._cells), count)) / np.sqrt(at.weight)[:, None]
+        draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
         vectors = self._bases[at.length][1]
         return [draws if index == at.length else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
+
+
+def _correlations(distance: FloatArray) -> Iterator[FloatArray]:
+    """Correlation matrices for cells at these distances, in cells."""
+    for length in _ROUGH:
+        reach = np.sqrt(3.0) * distance / length
+        yield (1 + reach) * np.exp(-reach)
+    for length in _SMOOTH:
+        yield np.exp(-0.5 * (distance / length) ** 2)
+    for length in _WAVY:
+        yield j0(2 * np.pi * distance / length) * np.exp(-0.5 * (distance / (1.5 * length)) ** 2)
 
 
 @dataclass(frozen=True)
@@ -94,52 +152,51 @@ class Projected:
     within: FloatArray
     between: list[FloatArray]
 
-    def columns(self, chosen: list[int]) -> Projected:
-        return Projected(self.within[:, chosen], [part[:, chosen] for part in self.between])
+    def some(self, columns: list[int]) -> Projected:
+        """Some of the columns."""
+        return Projected(self.within[:, columns], [part[:, columns] for part in self.between])
+
+    def kept(self, bases: list[int]) -> Projected:
+        """In some of the bases."""
+        return Projected(self.within, [self.between[basis] for basis in bases])
+
+    def beside(self, other: Projected) -> Projected:
+        """These columns and then those of another."""
+        both = zip(self.between, other.between, strict=True)
+        return Projected(np.concatenate([self.within, other.within], axis=1), [np.concatenate(pair, axis=1) for pair in both])
 
 
 @dataclass(frozen=True)
-class Normal:
-    """Normal equations at one covariance, of all columns with each other and with the value."""
+class _Normal:
+    """What the normal equations of one design hold at any covariance."""
 
-    at: Covariance
-    matrix: FloatArray
+    columns: Projected
+    value: Projected
+    gram: FloatArray
     right: FloatArray
-    constant: FloatArray
+    square: float
 
     @classmethod
-    def all(cls, model: MeanModel, columns: Projected, value: Projected) -> list[Normal]:
-        """Over the model's grid. Several values at once: right (k, v), constant (v,), log-likelihood without any column."""
-        gram_within = columns.within.T @ columns.within
-        right_within = columns.within.T @ value.within
-        square_within = np.einsum("nv,nv->v", value.within, value.within)
-        found = []
-        for at in model.covariances:
-            basis, y = columns.between[at.length], value.between[at.length]
-            weighted = basis * at.weight[:, None]
-            constant = np.log(at.weight).sum() - np.einsum("mv,m,mv->v", y, at.weight, y) - square_within
-            found.append(cls(at, gram_within + weighted.T @ basis, right_within + weighted.T @ y, 0.5 * constant))
-        return found
+    def of(cls, columns: Projected, value: Projected) -> _Normal:
+        y = value.within[:, 0]
+        return cls(columns, value, columns.within.T @ columns.within, columns.within.T @ y, float(y @ y))
+
+    def at(self, at: Covariance) -> Fit:
+        """All columns fitted."""
+        basis, y = self.columns.between[at.length], self.value.between[at.length][:, 0]
+        weighted = basis * at.weight[:, None]
+        constant = 0.5 * (np.log(at.weight).sum() - y @ (at.weight * y) - self.square)
+        return _solve(self.gram + weighted.T @ basis, self.right + weighted.T @ y, float(constant), at)
 
 
-def gain(normal: Normal, base: list[int], added: list[int]) -> tuple[FloatArray, FloatArray]:
-    """(v,) log-likelihood with the columns `base`, and with `base` and `added`."""
-    return _explained(normal, base), _explained(normal, base + added)
+def fitted(covariances: list[Covariance], columns: Projected, value: Projected) -> Fit:
+    """All columns fitted to one value, at the most likely of the covariances."""
+    normal = _Normal.of(columns, value)
+    return max((normal.at(each) for each in covariances), key=lambda fit: fit.log_likelihood)
 
 
-def _explained(normal: Normal, chosen: list[int]) -> FloatArray:
-    if not chosen:
-        return normal.constant
-    matrix, right = normal.matrix[np.ix_(chosen, chosen)], normal.right[chosen]
+def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> Fit:
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    regular = matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(chosen))
-    solved = np.linalg.solve(regular, right * scale[:, None])
-    return np.asarray(normal.constant + 0.5 * np.einsum("kv,kv->v", right * scale[:, None], solved))
-
-
-def solve(normal: Normal, chosen: list[int]) -> Fit:
-    """Coefficients of the chosen columns for the first value."""
-    matrix, right = normal.matrix[np.ix_(chosen, chosen)], normal.right[chosen, 0]
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(chosen))) * np.outer(scale, scale)
-    return Fit(inverse @ right, inverse, float(_explained(normal, chosen)[0]), normal.at)
+    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(right))) * np.outer(scale, scale)
+    coefficients = inverse @ right
+    return Fit(coefficients, inverse, constant + 0.5 * float(right @ coefficients), at)

@@ -1,18 +1,22 @@
-"""Which effects explain the mean: greedy, with the null distribution of the largest gain, classes, and a check by free forms.
+"""Which effects explain the mean: sets of up to three, the null distribution of the largest gain, classes, a check by free forms.
 
 The score of a candidate is its gain in log-likelihood less twice what it gains on average where there is nothing (for k free
-columns k, as Akaike's criterion; more where a period is searched): the expected gain on new data.
+columns k, as Akaike's criterion; more where a period is searched): the expected gain on new data. Sets are grown from the few
+best of each size, so that two effects are found too where neither, or a third that looks like their sum, is best alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.gap.candidates import Candidate
+from pipeline.gap.candidates import PLACE, Candidate, Grid
 from pipeline.gap.cells import Cells
-from pipeline.gap.mean_model import Fit, MeanModel, Normal, gain, solve
+from pipeline.gap.mean_model import Fit, MeanModel, Projected, fitted
+from pipeline.gap.normal_equations import Waves, assembled, extended, wave_products
 from pipeline.gap.residuals import Residuals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -20,28 +24,36 @@ from scene.mesh import FloatArray
 ALPHA = 0.004
 DRAWS = 499
 CLASS_MARGIN = 3.0
-"""Scores within this of the best belong to its class: e^-3 in likelihood."""
-_FREE_MARGIN = 5.0
+"""Scores within this of the best belong to its class: e^-3 in likelihood, which bounds by 5 % how often the truth is left out."""
+FREE_MARGIN = 5.0
 """A free form must score as much more than the catalogue's best to be called unknown."""
 _LEAST_SCORE = 4.0
+_LEAST_FREE_SCORE = 12.0
+"""Of a free form: the reference's error is not quite as its model says, and a flexible form takes that up first."""
 _MOST_EFFECTS = 3
+_WIDTH = 5
+"""Sets of one size that are grown further."""
+_NULL_ROWS = 8_000
+_NEAR_NULL = 8
+_NOT_PLACES = ("intensity", "disparity_fraction")
+"""Covariates that do not change along the wall."""
 POSE = tuple(range(6))
 
 
 @dataclass(frozen=True)
 class Tried:
-    """What a family of candidates gained. name; score; gain; variant: index of the best candidate in the search's list."""
+    """What a family of candidates gained beside the effects of a set. name; score; gain; candidate: its best variant."""
 
     name: str
     empirical: bool
     score: float
     gain: float
-    variant: int
+    candidate: Candidate
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """One explanation that was accepted. alike: others that score as well; fit: of its columns, beside all else."""
+    """One explanation that was accepted. alike: others that score as well; tried: all that stood beside it."""
 
     candidate: Candidate
     alike: tuple[str, ...]
@@ -51,206 +63,299 @@ class Chosen:
     tried: tuple[Tried, ...]
 
 
-def _without_pose(columns: FloatArray, sigma: FloatArray) -> FloatArray:
-    """The columns with those of the pose made orthonormal and taken out of the others, which keeps every other coefficient.
+@dataclass(frozen=True)
+class _Set:
+    """Some effects of the catalogue together, and what was tried beside them. score: of all together."""
 
-    A shift and a turn of a distant sensor are so much alike that the normal equations would lose what tells them apart.
-    """
-    weighted = columns / sigma[:, None]
-    pose = np.linalg.qr(weighted[:, POSE])[0]
-    rest = weighted[:, len(POSE) :]
-    rest = rest - pose @ (pose.T @ rest)
-    return np.concatenate([pose, rest], axis=1) * sigma[:, None]
+    members: tuple[Tried, ...]
+    score: float
+    tried: tuple[Tried, ...]
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(member.name for member in self.members)
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        return [member.candidate for member in self.members]
+
+    @property
+    def catalogue(self) -> list[Tried]:
+        """Of what was tried, the effects of the catalogue that are not in the set yet, best first."""
+        return [item for item in self.tried if not item.empirical and item.name not in self.names]
+
+    @property
+    def free(self) -> Tried | None:
+        """The best free form; of a covariate that changes along the wall only where it does better than mere places do."""
+        decoy = max((item.score for item in self.tried if item.name.startswith(PLACE)), default=-np.inf)
+        found = (item for item in self.tried if item.empirical and not item.name.startswith(PLACE))
+        return next((item for item in found if item.name in _NOT_PLACES or item.score > decoy + FREE_MARGIN), None)
 
 
 class MeanSearch:
     """All candidates on one set of points."""
 
-    def __init__(self, residuals: Residuals, candidates: list[Candidate], random: KeyedRandom) -> None:
-        self.candidates, self._random = candidates, random
-        self._columns: list[list[int]] = []
-        matrices, start = [residuals.pose], len(POSE)
-        for candidate in candidates:
-            width = candidate.columns.shape[1]
-            self._columns.append(list(range(start, start + width)))
-            matrices.append(candidate.columns)
-            start += width
+    def __init__(self, residuals: Residuals, families: list[Candidate | Grid], random: KeyedRandom) -> None:
+        self._random = random
+        self._plain = [family for family in families if isinstance(family, Candidate)]
         self.cells = Cells.over(residuals.at)
         self.model = MeanModel(self.cells, residuals.sigma)
-        columns = _without_pose(np.concatenate([*matrices, residuals.value[:, None]], axis=1), residuals.sigma)
-        self._matrix, self._values = columns[:, :-1], columns[:, -1]
-        self._pose, self._raw, self._sigma = residuals.pose, residuals.value, residuals.sigma
-        self._projected, value = self.model.project(columns[:, :-1]), self.model.project(columns[:, -1:])
-        self._normals = Normal.all(self.model, self._projected, value)
-        self.null = max(self._normals, key=lambda normal: float(gain(normal, list(POSE), [])[0][0])).at
-        self._nulls = self._null_gains()
+        self._residuals = residuals
+        rows, root = self.model.rows, self.model.root[:, None]
+        self._full_grids = [family for family in families if isinstance(family, Grid)]
+        self._grids = [grid.part(rows) for grid in self._full_grids]
+        self._pose = np.linalg.qr(residuals.pose[rows] * root)[0]
+        self.value = self.model.project(residuals.value[rows, None] * root)
+        matrices = [candidate.columns[rows] * root for candidate in self._plain]
+        self._place: dict[int, list[int]] = {}
+        start = len(POSE)
+        for candidate in self._plain:
+            self._place[id(candidate)] = list(range(start, start + candidate.columns.shape[1]))
+            start += candidate.columns.shape[1]
+        signatures = self._without_pose(np.concatenate(matrices, axis=1))
+        self._fixed = self.model.project(np.concatenate([self._pose, signatures], axis=1))
+        self._assemble()
+        self._promoted: dict[int, tuple[Candidate, list[int]]] = {}
 
-    def _families(self) -> dict[str, list[int]]:
-        families: dict[str, list[int]] = {}
-        for index, candidate in enumerate(self.candidates):
-            families.setdefault(("free " if candidate.empirical else "") + candidate.name, []).append(index)
-        return families
+    def _assemble(self) -> None:
+        """Normal equations of the data, and the gains of every family where there is nothing."""
+        pose = list(POSE)
+        covariances, bases = self.model.narrowed([self._fixed.some(pose), self._fixed], self.value)
+        self._fixed, self.value = self._fixed.kept(bases), self.value.kept(bases)
+        thin = slice(None, None, max(len(self.model) // _NULL_ROWS, 1))
+        count = len(self._fixed.within[thin])
+        noise = self._random.child("within").generator().standard_normal((count, DRAWS)) * np.sqrt(len(self.model) / count)
+        self._waves = Waves.of(self.model, self._grids, self._fixed.within, self.value.within, noise, thin)
+        self.equations = assembled(self.model, covariances, self._fixed, self.value, self._waves)
+        ranked = np.argsort(-self.equations.log_likelihood(pose)[:, 0], kind="stable")
+        self.null = self.equations.at[ranked[0]]
+        self._nulls = self._null_gains([int(index) for index in ranked[:_NEAR_NULL]], self._fixed.within[thin].T @ noise)
 
-    def _profile(self, normals: list[Normal], base: list[int], variants: list[int]) -> FloatArray:
-        """(variants, values) largest log-likelihood over the covariances."""
-        return np.stack([np.max([gain(normal, base, self._columns[v])[1] for normal in normals], axis=0) for v in variants])
-
-    def _null_gains(self) -> dict[str, FloatArray]:
+    def _null_gains(self, chosen: list[int], within: FloatArray) -> dict[str, FloatArray]:
         """Gains of every family where there is nothing but pose, correlated error and noise, (DRAWS,) each."""
-        gram = self._projected.within.T @ self._projected.within
-        values, vectors = np.linalg.eigh(gram)
-        normal = self._random.child("within").generator().standard_normal((len(gram), DRAWS))
-        within = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * normal)
-        between = self.model.null_draws(self.null, DRAWS, self._random.child("between"))
-        normals = []
-        for found in self._near_null():
-            at, basis = found.at, self._projected.between[found.at.length]
-            weighted = between[at.length] * at.weight[:, None]
-            constant = 0.5 * (np.log(at.weight).sum() - np.einsum("mv,mv->v", between[at.length], weighted))
-            normals.append(Normal(at, found.matrix, within + basis.T @ weighted, constant))
-        plain = np.max([gain(normal, list(POSE), [])[0] for normal in normals], axis=0)
+        near = self.equations.some(chosen)
+        draws = self.model.null_draws(self.null, DRAWS, self._random.child("between"))
+        sines = self.model.between(self._waves.means)
+        right, constant, waves = [], [], []
+        for at in near.at:
+            weighted = draws[at.length] * at.weight[:, None]
+            constant.append(0.5 * (np.log(at.weight).sum() - np.sum(draws[at.length] * weighted, axis=0)))
+            right.append(within + self._fixed.between[at.length].T @ weighted)
+            waves.append(self._waves.noise + sines[at.length].T @ weighted)
+        plain, fixed, searched = near.of_values(np.stack(right), np.stack(constant), np.stack(waves)).profile(
+            list(POSE), [self._place[id(candidate)] for candidate in self._plain]
+        )
         return {
-            name: np.maximum(self._profile(normals, list(POSE), variants).max(axis=0) - plain, 0.0)
-            for name, variants in self._families().items()
+            name: np.maximum(np.concatenate([fixed[rows], searched[sines]]).max(axis=0) - plain, 0.0)
+            for name, (rows, sines) in self._families().items()
         }
 
-    def _near_null(self) -> list[Normal]:
-        """Covariances that the data allow: those whose likelihood comes within 30 of the best, thinned to a dozen."""
-        ranked = sorted(self._normals, key=lambda normal: -float(gain(normal, list(POSE), [])[0][0]))
-        return ranked[:8]
+    def _families(self) -> dict[str, tuple[list[int], list[int]]]:
+        """Of each family the numbers of its plain candidates and of its sines."""
+        families: dict[str, tuple[list[int], list[int]]] = {}
+        for row, candidate in enumerate(self._plain):
+            families.setdefault(candidate.family, ([], []))[0].append(row)
+        start = 0
+        for grid in self._full_grids:
+            stop = start + len(grid.frequencies)
+            families.setdefault(grid.candidate(0).family, ([], []))[1].extend(range(start, stop))
+            start = stop
+        return families
 
-    def tried(self, base: list[int]) -> list[Tried]:
-        """Every family's best variant over the columns `base`, best score first."""
-        plain = max(float(gain(normal, base, [])[0][0]) for normal in self._normals)
+    def _sine(self, number: int) -> Candidate:
+        for grid in self._full_grids:
+            if number < len(grid.frequencies):
+                return grid.candidate(number)
+            number -= len(grid.frequencies)
+        raise IndexError(number)
+
+    def _without_pose(self, columns: FloatArray) -> FloatArray:
+        """A shift and a turn of a distant sensor are so much alike that the normal equations would lose what tells them apart."""
+        return columns - self._pose @ (self._pose.T @ columns)
+
+    def _columns(self, candidate: Candidate) -> list[int]:
+        """Numbers of a candidate's fixed columns; a sine's period is refined and its columns become fixed."""
+        if id(candidate) in self._place:
+            return self._place[id(candidate)]
+        if id(candidate) not in self._promoted:
+            (found,) = self.refined([candidate])[0]
+            added = self._projected([found])
+            start = self._fixed.within.shape[1]
+            products = wave_products(self._grids, added.within, self.model.root)
+            self.equations = extended(self.model, self.equations, self._fixed, self.value, added, products, self._waves.means)
+            self._fixed = self._fixed.beside(added)
+            self._promoted[id(candidate)] = candidate, list(range(start, start + added.within.shape[1]))
+        return self._promoted[id(candidate)][1]
+
+    def _projected(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> Projected:
+        """The columns of some candidates, without pose; of a sine with its change by the frequency where `slopes` say so."""
+        rows, root = self.model.rows, self.model.root[:, None]
+        matrices = []
+        for candidate, slope in zip(candidates, slopes or [None] * len(candidates), strict=True):
+            wave = candidate.wave
+            columns = candidate.columns if wave is None or slope is None else wave.with_slope(candidate.period, slope)
+            matrices.append(columns[rows] * root)
+        return self.model.project(self._without_pose(np.concatenate(matrices, axis=1)))
+
+    def tried(self, members: tuple[Tried, ...]) -> tuple[Tried, ...]:
+        """Every family's best variant beside some effects, best score first."""
+        base = [*POSE, *(column for member in members for column in self._columns(member.candidate))]
+        plain, fixed, searched = self.equations.profile(base, [self._place[id(candidate)] for candidate in self._plain])
         found = []
-        for name, variants in self._families().items():
-            gains = self._profile(self._normals, base, variants)[:, 0] - plain
+        for name, (rows, sines) in self._families().items():
+            gains = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
             best = int(np.argmax(gains))
+            candidate = self._plain[rows[best]] if best < len(rows) else self._sine(sines[best - len(rows)])
             penalty = 2 * float(self._nulls[name].mean())
-            found.append(
-                Tried(
-                    name.removeprefix("free "),
-                    name.startswith("free "),
-                    float(gains[best]) - penalty,
-                    float(gains[best]),
-                    variants[best],
-                )
-            )
-        return sorted(found, key=lambda item: -item.score)
+            found.append(Tried(candidate.name, candidate.empirical, float(gains[best]) - penalty, float(gains[best]), candidate))
+        return tuple(sorted(found, key=lambda item: -item.score))
 
-    def p_value(self, item: Tried) -> float:
+    def p_value(self, score: float) -> float:
         """Of the largest score over all families where there is nothing: (1 + b) / (1 + N)."""
         scores = np.stack([gains - 2 * gains.mean() for gains in self._nulls.values()])
-        return float((1 + np.sum(scores.max(axis=0) >= item.score)) / (1 + DRAWS))
+        return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + DRAWS))
 
-    def fit(self, base: list[int]) -> Fit:
-        """The columns `base` at their most likely covariance."""
-        best = max(self._normals, key=lambda normal: float(gain(normal, base, [])[0][0]))
-        return solve(best, base)
+    def _significant(self, score: float) -> bool:
+        return score >= _LEAST_SCORE and self.p_value(score) <= ALPHA
 
-    def columns(self, variants: list[int]) -> list[int]:
-        """Pose and the columns of some candidates."""
-        return [*POSE, *(column for variant in variants for column in self._columns[variant])]
+    def select(self) -> tuple[list[Chosen], tuple[Tried, ...]]:
+        """Explanations, and what was tried beside all of them."""
+        empty = _Set((), 0.0, self.tried(()))
+        levels = [[empty]]
+        while len(levels) <= _MOST_EFFECTS:
+            grown = self._grown(levels[-1])
+            if not grown or not self._significant(grown[0].score - levels[-1][0].score):
+                break
+            levels.append(grown)
+        best = levels[-1][0]
+        free = self._free(levels)
+        if free is not None:
+            members, form = free
+            chosen = [self._chosen(_Set(members, 0.0, ()), item) for item in members]
+            chosen.append(Chosen(form.candidate, (), self.p_value(form.score), form.gain, form.score, empty.tried))
+            return chosen, self.tried(members)
+        return [self._chosen(best, item) for item in best.members], best.tried
 
-    def select(self) -> tuple[list[Chosen], list[Tried]]:
-        """Explanations in order, and what was tried after the last of them."""
-        chosen: list[Chosen] = []
-        variants: list[int] = []
-        while True:
-            had = {item.candidate.name for item in chosen}
-            tried = [item for item in self.tried(self.columns(variants)) if item.name not in had]
-            best = self._best(tried, variants)
-            if best is None or len(chosen) == _MOST_EFFECTS:
-                return chosen, tried
-            chosen.append(self._chosen(best, tried, variants))
-            variants.append(best.variant)
-            if best.empirical:
-                return chosen, self.tried(self.columns(variants))
+    def _grown(self, level: list[_Set]) -> list[_Set]:
+        """The best sets of one effect more, best first."""
+        found: dict[frozenset[str], tuple[Tried, ...]] = {}
+        scores: dict[frozenset[str], float] = {}
+        for each in level:
+            for item in each.catalogue[:_WIDTH]:
+                names, score = each.names | {item.name}, each.score + item.score
+                if score > scores.get(names, -np.inf):
+                    scores[names], found[names] = score, (*each.members, item)
+        ranked = sorted(scores, key=lambda names: -scores[names])[:_WIDTH]
+        return [_Set(found[names], scores[names], self.tried(found[names])) for names in ranked]
 
-    def _best(self, tried: list[Tried], variants: list[int]) -> Tried | None:
-        """What to add next: the catalogue's best unless a free form clearly beats it and any pair that starts with it."""
-        top = tried[0]
-        if top.score < _LEAST_SCORE or self.p_value(top) > ALPHA:
-            return None
-        named = [item for item in tried if not item.empirical]
-        if not top.empirical:
-            return top
-        if top.score < named[0].score + _FREE_MARGIN:
-            return named[0] if self.p_value(named[0]) <= ALPHA and named[0].score >= _LEAST_SCORE else top
-        for first in named[:3]:
-            pair = [item for item in self.tried(self.columns([*variants, first.variant])) if not item.empirical]
-            if first.score + pair[0].score + _FREE_MARGIN > top.score and first.score > _LEAST_SCORE:
-                return first
-        return top
+    def _free(self, levels: list[list[_Set]]) -> tuple[tuple[Tried, ...], Tried] | None:
+        """A free form that the data ask for beside or in place of effects of the catalogue, and the effects it stands beside."""
+        best, empty = levels[-1][0], levels[0][0]
+        if best.free is not None and best.free.score >= _LEAST_FREE_SCORE and self._significant(best.free.score):
+            found: tuple[_Set, Tried] | None = None
+            for state in (level[0] for level in levels):
+                form = state.free
+                if form is None:
+                    continue
+                # more effects of the catalogue beside it only where the data ask for them too
+                if found is None or self._significant(state.score + form.score - found[0].score - found[1].score):
+                    found = state, form
+            assert found is not None
+            return found[0].members, found[1]
+        alone = empty.free
+        margin = FREE_MARGIN if len(best.members) < 2 else 0.0
+        if best.members and alone is not None and alone.score > best.score + margin:
+            return (), alone
+        return None
 
-    def _chosen(self, best: Tried, tried: list[Tried], variants: list[int]) -> Chosen:
-        alike = () if best.empirical else self._alike(best, tried)
-        return Chosen(self.candidates[best.variant], alike, self.p_value(best), best.gain, best.score, tuple(tried))
+    def _chosen(self, among: _Set, item: Tried) -> Chosen:
+        """An effect with those that would do as well in its place beside the others."""
+        others = tuple(member for member in among.members if member is not item)
+        beside = [each for each in self.tried(others) if not each.empirical and each.name not in {o.name for o in others}]
+        mine = next(each for each in beside if each.name == item.name)
+        alike = tuple(each.name for each in beside if each is not mine and each.score > mine.score - CLASS_MARGIN)
+        return Chosen(item.candidate, alike, self.p_value(mine.score), mine.gain, mine.score, self.tried(others))
 
-    def _alike(self, best: Tried, tried: list[Tried]) -> tuple[str, ...]:
-        return tuple(i.name for i in tried if i is not best and not i.empirical and i.score > best.score - CLASS_MARGIN)
+    def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> Fit:
+        """Pose and some candidates, at their most likely covariance."""
+        pose = self._fixed.some(list(POSE))
+        return fitted(self.model.fine, pose.beside(self._projected(candidates, slopes)) if candidates else pose, self.value)
 
     def reference_sigma(self, chosen: list[Chosen]) -> float:
         """Standard deviation of the reference's correlated error, in the observable's unit."""
-        at = self.fit(self.columns([self.candidates.index(item.candidate) for item in chosen])).at
+        at = self.fit([item.candidate for item in chosen]).at
         return float(np.sqrt(at.ratio)) * self.model.typical_sigma
 
     def without(self, chosen: list[Chosen]) -> FloatArray:
-        """(n,) residuals less pose and the chosen effects at their most likely values."""
-        columns = self.columns([self.candidates.index(item.candidate) for item in chosen])
-        return np.asarray(self._values - self._matrix[:, columns] @ self.fit(columns).coefficients)
+        """(n,) residuals less the chosen effects at their most likely values, and less a pose that fits the rest."""
+        found = self._residuals
+        value = found.value
+        if chosen:
+            candidates, fit = self.refined([item.candidate for item in chosen])
+            for candidate, coefficients in zip(candidates, split(fit.coefficients, candidates), strict=True):
+                value = value - candidate.columns @ coefficients[: candidate.columns.shape[1]]
+        weight = 1 / found.sigma
+        pose = np.linalg.lstsq(found.pose * weight[:, None], value * weight, rcond=None)[0]
+        return np.asarray(value - found.pose @ pose)
 
-    def refined(self, chosen: list[Chosen]) -> tuple[list[Candidate], FloatArray, FloatArray]:
-        """The chosen candidates with their periods refined between the grid's, coefficients and covariance of all of them."""
-        candidates = [self._refined(item.candidate, chosen) for item in chosen]
-        columns = np.concatenate([self._pose, *(each.columns for each in candidates), self._raw[:, None]], axis=1)
-        clean = _without_pose(columns, self._sigma)
-        projected, value = self.model.project(clean[:, :-1]), self.model.project(clean[:, -1:])
-        base = list(range(clean.shape[1] - 1))
-        normals = Normal.all(self.model, projected, value)
-        found = solve(max(normals, key=lambda normal: float(gain(normal, base, [])[0][0])), base)
-        return candidates, found.coefficients[len(POSE) :], found.covariance[len(POSE) :, len(POSE) :]
+    def refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], Fit]:
+        """Candidates with their periods at the top of the likelihood (Gauss-Newton), and the fit of pose and all of them.
 
-    def _refined(self, candidate: Candidate, chosen: list[Chosen]) -> Candidate:
-        """The period at the top of the white likelihood near the grid's best, with its standard error by the curvature."""
-        wave = candidate.wave
-        if wave is None:
-            return candidate
-        others = [item.candidate.columns for item in chosen if item.candidate is not candidate]
-        base = np.linalg.qr(np.concatenate([self._pose, *others], axis=1) / self._sigma[:, None])[0]
-        value = self._raw / self._sigma
-        value = value - base @ (base.T @ value)
-
-        def explained(frequency: float) -> float:
-            columns = wave.columns(1 / frequency) / self._sigma[:, None]
-            columns = columns - base @ (base.T @ columns)
-            return float(0.5 * value @ columns @ np.linalg.lstsq(columns, value, rcond=None)[0])
-
-        centre, step = 1 / float(candidate.fixed[wave.key]), 0.5 / float(np.ptp(wave.x))
-        for width in (step, step / 10):
-            trial = centre + np.linspace(-width, width, 21)
-            centre = float(trial[int(np.argmax([explained(each) for each in trial]))])
-        width = step / 20
-        curvature = (2 * explained(centre) - explained(centre - width) - explained(centre + width)) / width**2
-        error = 1 / np.sqrt(max(curvature, 1e-12)) / centre**2
-        return replace(
-            candidate,
-            columns=wave.columns(1 / centre),
-            fixed={**candidate.fixed, wave.key: 1 / centre},
-            errors={wave.key: float(error)},
-        )
+        Each sine has three columns in that fit: sine, cosine and the change by its frequency.
+        """
+        found = list(candidates)
+        slopes: list[FloatArray | None] = [None] * len(found)
+        if any(candidate.wave is not None for candidate in found):
+            for number in range(rounds):
+                fit = self.fit(found, slopes)
+                start = len(POSE)
+                for index, candidate in enumerate(found):
+                    width = candidate.columns.shape[1] + (slopes[index] is not None)
+                    values, start = fit.coefficients[start : start + width], start + width
+                    if candidate.wave is None:
+                        continue
+                    if slopes[index] is not None and number:
+                        reach = 0.3 / float(np.ptp(candidate.wave.x))
+                        period = 1 / (1 / candidate.period + float(np.clip(values[2], -reach, reach)))
+                        found[index] = _moved(candidate, period)
+                    slopes[index] = values[:2]
+        return found, self.fit(found, slopes)
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of the families, cosines of their signatures after the pose fit, and the share that survives the pose fit."""
-        normal = next(found for found in self._normals if found.at == self.null)
-        names, first = [], []
-        for name, variants in self._families().items():
-            if not name.startswith("free "):
+        row = next(row for row, at in enumerate(self.equations.at) if at is self.null)
+        names, matrices = [], []
+        rows, root = self.model.rows, self.model.root[:, None]
+        for name, (plain, sines) in self._families().items():
+            candidate = self._plain[plain[0]] if plain else self._sine(sines[len(sines) // 2])
+            if not candidate.empirical:
                 names.append(name)
-                first.append(self._columns[variants[0]][0])
-        matrix, pose = normal.matrix, list(POSE)
-        cross = np.linalg.lstsq(matrix[np.ix_(pose, pose)], matrix[np.ix_(pose, first)], rcond=None)[0]
-        left = matrix[np.ix_(first, first)] - matrix[np.ix_(first, pose)] @ cross
-        size, whole = np.sqrt(np.maximum(np.diag(left), 0)), np.sqrt(np.maximum(np.diag(matrix)[first], 1e-300))
-        scale = np.maximum(size, 1e-12 * whole)
-        return names, np.clip(left / np.outer(scale, scale), -1, 1), size / whole
+                matrices.append(candidate.columns[rows, :1] * root)
+        whole, left = np.concatenate(matrices, axis=1), self._without_pose(np.concatenate(matrices, axis=1))
+        weight = self.equations.at[row].weight[:, None]
+        grams = []
+        for columns in (whole, left):
+            projected = self.model.project(columns)
+            between = projected.between[self.null.length]
+            grams.append(projected.within.T @ projected.within + (between * weight).T @ between)
+        matrix, pose = grams[1], self.equations.fixed[row][: len(POSE), : len(POSE)]
+        between, base = self.model.project(left), self._fixed
+        cross = base.within[:, : len(POSE)].T @ between.within
+        cross += base.between[self.null.length][:, : len(POSE)].T @ (weight * between.between[self.null.length])
+        matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
+        size, full = np.sqrt(np.maximum(np.diag(matrix), 0)), np.sqrt(np.maximum(np.diag(grams[0]), 1e-300))
+        scale = np.maximum(size, 1e-12 * full)
+        return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
+
+
+def split(values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
+    """The part of a fit's last axis that belongs to each candidate after the pose, a sine's with that of its frequency."""
+    widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
+    return np.split(values[len(POSE) :], np.cumsum(widths)[:-1])
+
+
+def _moved(candidate: Candidate, period: float) -> Candidate:
+    """The same sine with another period."""
+    wave = candidate.wave
+    assert wave is not None
+    return Grid(candidate.name, candidate.names[0], wave, np.empty(0), candidate.fixed, candidate.empirical).at(period)

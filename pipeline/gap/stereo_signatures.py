@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.candidates import Candidate, Wave, searched
+from pipeline.gap.candidates import Candidate, Grid, Wave, frequencies, variants
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.stereo_residuals import NominalPair, StereoGeometry, real_pair, seen_disparity
@@ -40,14 +40,18 @@ _CAMERA: tuple[tuple[type[Effect], tuple[tuple[str, ...], ...], float], ...] = (
     (CameraShift, (("x_m", "y_m", "z_m"),), 1e-3),
 )
 """Effect, the sets of its parameters that are tried, and the step of the finite differences."""
-_FEWEST_ROWS = 24.0
-_FREQUENCIES = 60
+_FEWEST_ROWS = 20.0
 
 
 def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
     """Every effect of the catalogue on the mean disparity, cameras and searched parameters as variants."""
+    return variants(mean_families(residuals, measurement))
+
+
+def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | Grid]:
+    """The same with each searched sine as one grid."""
     geometry, nominal = residuals.geometry, NominalPair.of(measurement)
-    found = [
+    found: list[Candidate | Grid] = [
         candidate
         for effect, sets, step in _CAMERA
         for side in _SIDES
@@ -77,7 +81,6 @@ def _camera_variants(
             np.stack([columns[key] for key in names], axis=1),
             partial(_by_name, names),
             names,
-            (1.0,) * len(names),
             {"camera": side},
         )
         for names in sets
@@ -88,14 +91,13 @@ def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
     return dict(zip(names, map(float, values), strict=True))
 
 
-def _row_jitter(geometry: StereoGeometry) -> list[Candidate]:
+def _row_jitter(geometry: StereoGeometry) -> list[Grid]:
     """dx in the left image adds to the disparity, in the right image it is taken off, at the right image's row."""
     height = float(np.ptp(geometry.v))
-    frequencies = np.geomspace(0.7 / height, 1 / _FEWEST_ROWS, _FREQUENCIES)
+    tried = frequencies(0.7 / height, 1 / _FEWEST_ROWS, 0.3 / height)
     return [
-        searched("row_jitter", "amplitude_px", Wave("rows_per_cycle", np.full(len(rows), sign), rows), float(1 / f), camera=side)
+        Grid("row_jitter", "amplitude_px", Wave("rows_per_cycle", np.full(len(rows), sign), rows), tried, {"camera": side})
         for side, rows, sign in (("left", geometry.v, 1.0), ("right", geometry.v_right, -1.0))
-        for f in frequencies
     ]
 
 
@@ -111,7 +113,6 @@ def _locking(geometry: StereoGeometry) -> list[Candidate]:
                 column[:, None],
                 lambda values: {"amplitude_px": float(values[0])},
                 ("amplitude_px",),
-                (1.0,),
                 fixed,
             )
         )

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.candidates import Candidate, Wave, amplitude_and_phase, searched
+from pipeline.gap.candidates import Candidate, Grid, Wave, amplitude_and_phase, frequencies, variants
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.tls_spread import slant
 from scene.mesh import FloatArray
 
-_FEWEST_LINES = 6.0
+_FEWEST_LINES = 4.0
+_LONGEST_M, _SHORTEST_M = 15.0, 0.3
+"""Periods that are searched: the catalogue's typical ones and half as much again."""
 
 
 def log_over_median(power: FloatArray) -> FloatArray:
@@ -25,8 +27,13 @@ def log_over_median(power: FloatArray) -> FloatArray:
 
 def mean_candidates(residuals: Residuals) -> list[Candidate]:
     """Every effect of the catalogue on the mean that the recorded fields allow, searched parameters as variants."""
+    return variants(mean_families(residuals))
+
+
+def mean_families(residuals: Residuals) -> list[Candidate | Grid]:
+    """The same with each searched sine as one grid."""
     geometry = residuals.geometry
-    found = [*_plain(geometry), *_eccentric(geometry), *_cyclic(geometry)]
+    found: list[Candidate | Grid] = [*_plain(geometry), *_eccentric(geometry), _cyclic(geometry)]
     if geometry.power is not None:
         column = log_over_median(geometry.power)
         found.append(_single("range_intensity_bias", "coefficient_m", column))
@@ -39,7 +46,7 @@ def mean_candidates(residuals: Residuals) -> list[Candidate]:
 
 def _single(name: str, parameter: str, column: FloatArray, scale: float = 1.0) -> Candidate:
     """One amplitude; `scale` units of the parameter per unit of the column."""
-    return Candidate(name, column[:, None], lambda values: {parameter: values[0] * scale}, (parameter,), (scale,))
+    return Candidate(name, column[:, None], lambda values: {parameter: float(values[0]) * scale}, (parameter,))
 
 
 def _plain(geometry: Any) -> list[Candidate]:
@@ -68,33 +75,23 @@ def _eccentric(geometry: Any) -> list[Candidate]:
 def _wave(name: str, factor: FloatArray, angle: FloatArray, amplitude: str, fixed: dict[str, float]) -> Candidate:
     columns = np.stack([factor * np.sin(angle), factor * np.cos(angle)], axis=1)
     return Candidate(
-        name, columns, lambda values: amplitude_and_phase(values, amplitude) | fixed, (amplitude, "phase_rad"), (1.0, 1.0), fixed
+        name, columns, lambda values: amplitude_and_phase(values, amplitude) | fixed, (amplitude, "phase_rad"), fixed
     )
 
 
-def _cyclic(geometry: Any) -> list[Candidate]:
+def _cyclic(geometry: Any) -> Grid:
     """Periods on a grid as fine as the spread of the ranges can tell apart."""
     reach = max(float(np.ptp(np.quantile(geometry.range_m, [0.01, 0.99]))), 1.0)
     wave = Wave("period_m", np.ones_like(geometry.range_m), geometry.range_m)
-    return [
-        searched("range_cyclic", "amplitude_m", wave, float(1 / f))
-        for f in _frequencies(1 / min(12.0, reach), 1 / 0.4, 0.3 / reach)
-    ]
+    return Grid("range_cyclic", "amplitude_m", wave, frequencies(1 / _LONGEST_M, 1 / _SHORTEST_M, 0.3 / reach))
 
 
-def _wobble(geometry: Any) -> list[Candidate]:
+def _wobble(geometry: Any) -> list[Grid]:
     lines = float(np.ptp(geometry.line))
     if lines < 4 * _FEWEST_LINES:
         return []
     wave = Wave("lines_per_cycle", -geometry.by_zenith, geometry.line)
-    return [
-        searched("wobble", "amplitude_rad", wave, float(1 / f)) for f in _frequencies(2 / lines, 1 / _FEWEST_LINES, 0.3 / lines)
-    ]
-
-
-def _frequencies(low: float, high: float, step: float) -> FloatArray:
-    """From low to high by `step`, at most some hundreds."""
-    return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, 200)))
+    return [Grid("wobble", "amplitude_rad", wave, frequencies(2 / lines, 1 / _FEWEST_LINES, 0.3 / lines))]
 
 
 def _drift(geometry: Any) -> Candidate:
@@ -103,5 +100,5 @@ def _drift(geometry: Any) -> Candidate:
     by_y = -geometry.share * (-cot * sin_a * geometry.by_azimuth + cos_a * geometry.by_zenith)
     names = ("rate_x_rad", "rate_y_rad")
     return Candidate(
-        "tilt_drift", np.stack([by_x, by_y], axis=1), lambda values: dict(zip(names, values, strict=True)), names, (1.0, 1.0)
+        "tilt_drift", np.stack([by_x, by_y], axis=1), lambda values: dict(zip(names, map(float, values), strict=True)), names
     )

@@ -1,8 +1,9 @@
 """The gap before and after, on blocks that no step has used, by simulating again through the sensor's own code.
 
-Measure: the continuous ranked probability score of the measured residuals against an ensemble of simulated ones, in metres; a
-proper score, which neither a wrong mean nor an inflated spread can lower (Gneiting & Raftery 2007, eq. 21, fair ensemble form).
-Floor: the same score of a draw of the model itself.
+Measure: the continuous ranked probability score of measured patches of the wall against an ensemble of simulated ones, in metres;
+a proper score, which neither a wrong mean nor an inflated spread can lower (Gneiting & Raftery 2007, eq. 21, fair ensemble form).
+A patch is scored twice, by the mean and by the standard deviation of its residuals: in single points either drowns in noise.
+Floor: the same score of draws of the model itself.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pipeline.gap.cells import patches
 from pipeline.gap.directed import simulate_ranges
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import Residuals
@@ -22,14 +25,17 @@ from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 from sensors.stereo import REDUCTION, StereoPair
 
-MEASURE = "mean continuous ranked probability score of the residuals against an ensemble simulated with the model"
-_DRAWS = 6
+MEASURE = "mean continuous ranked probability score of patches (mean and spread of their residuals) against simulated ones"
+_DRAWS = 8
 _MOST_POINTS = 30_000
+_POINTS_PER_PATCH = 30.0
+_FEWEST_POINTS = 8
+_MOST_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Scores in m on held-out points. error: standard error of before - after; floor_error: of after - floor."""
+    """Scores in m on held-out points. error: standard error of before - after; floor_error: of before - floor."""
 
     before: float
     after: float
@@ -51,7 +57,7 @@ class Gap:
     @property
     def uncertain(self) -> bool:
         """Whether before - floor is within its own uncertainty."""
-        return self.before - self.floor <= 2 * self.floor_error
+        return self.before - self.floor <= _MOST_SIGMAS * self.floor_error
 
     def to_dict(self) -> dict[str, Any]:
         """As gap.json holds it."""
@@ -112,32 +118,62 @@ def observed(residuals: Residuals) -> FloatArray:
 
 
 def measure_gap(
-    measurement: Measurement, before: Version, after: Version, residuals: Residuals, reference_sigma: float, random: KeyedRandom
-) -> Gap:
-    """Score two versions of the model on held-out residuals, with common random numbers.
+    measurement: Measurement,
+    before: Version,
+    after: Version,
+    residuals: Residuals,
+    reference_sigma: float,
+    largest: float,
+    random: KeyedRandom,
+) -> Gap | None:
+    """Score two versions of the model on held-out residuals, with common random numbers; None where too few points remain.
 
-    reference_sigma: standard deviation of the reference's own error in the observable's unit, which is part of every draw.
+    reference_sigma: standard deviation of the reference's own error in the observable's unit, which is part of every draw;
+    largest: predicted sigmas at which residuals are cut off, measured and simulated ones alike.
     """
-    versions = [_draws(measurement, version, residuals, reference_sigma, random.child("ensemble")) for version in (before, after)]
-    truth = _draws(measurement, after, residuals, reference_sigma, random.child("floor"))
-    usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
-    value, unit = observed(residuals)[usable], residuals.unit_m[usable]
-    old, new = (_scores(draws[:, usable], value) * unit for draws in versions)
-    floor = np.mean([_scores(versions[1][:, usable], draw[usable]) for draw in truth], axis=0) * unit
-    count = max(int(usable.sum()), 1)
+    patch = patches(residuals.at, _POINTS_PER_PATCH)
+    centre, reach = residuals.pose @ after.pose, largest * residuals.sigma
+
+    def draws(version: Version, purpose: str) -> FloatArray:
+        return centre + np.clip(_draws(measurement, version, residuals, random.child(purpose)) - centre, -reach, reach)
+
+    versions = [draws(version, "ensemble") for version in (before, after)]
+    truth = draws(after, "floor")
+    usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0) & np.isin(
+        patch, np.flatnonzero(np.bincount(patch) >= _FEWEST_POINTS)
+    )
+    if not usable.any():
+        return None
+    _, number = np.unique(patch[usable], return_inverse=True)
+    unit = np.bincount(number, residuals.unit_m[usable]) / np.bincount(number)
+    errors = reference_sigma * random.child("reference").generator().standard_normal((3, _DRAWS, len(unit)))
+    measured = centre + np.clip(observed(residuals) - centre, -reach, reach)
+    value = _summaries(measured[None, usable], number)[:, 0]
+    ensembles = [_summaries(drawn[:, usable], number, errors[0]) for drawn in versions]
+    drawn = _summaries(truth[:, usable], number, errors[1])
+    old, new = (np.sum([_scores(e, v) for e, v in zip(found, value, strict=True)], axis=0) * unit for found in ensembles)
+    floors = [np.sum([_scores(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_DRAWS)]
+    floor, count = np.mean(floors, axis=0) * unit, len(unit)
     return Gap(
         before=float(old.mean()),
         after=float(new.mean()),
         floor=float(floor.mean()),
         error=float((old - new).std() / np.sqrt(count)),
-        floor_error=float(np.hypot(old.std(), floor.std()) / np.sqrt(count)),
-        points=count,
+        floor_error=float((old - floor).std() / np.sqrt(count)),
+        points=int(usable.sum()),
     )
 
 
-def _draws(measurement: Measurement, version: Version, residuals: Residuals, sigma: float, random: KeyedRandom) -> FloatArray:
-    error = sigma * random.child("reference").generator().standard_normal((_DRAWS, len(residuals)))
-    return error + np.stack([simulated(measurement, version, residuals, random.child(number)) for number in range(_DRAWS)])
+def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+    return np.stack([simulated(measurement, version, residuals, random.child(number)) for number in range(_DRAWS)])
+
+
+def _summaries(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
+    """(2, d, p) mean, with an error (d, p) of the reference, and standard deviation of each of p patches in draws (d, n)."""
+    count = np.bincount(patch)
+    mean = np.stack([np.bincount(patch, row) for row in draws]) / count
+    square = np.stack([np.bincount(patch, (row - m[patch]) ** 2) for row, m in zip(draws, mean, strict=True)])
+    return np.stack([mean if error is None else mean + error, np.sqrt(square / np.maximum(count - 1, 1))])
 
 
 def _scores(draws: FloatArray, value: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.gap import stereo_signatures, tls_signatures
-from pipeline.gap.candidates import Candidate, free_form
+from pipeline.gap.candidates import PLACE, Candidate, Grid, free_forms, places, variants
 from pipeline.gap.cells import Cells, held_out_blocks
 from pipeline.gap.changes import SceneChange, find_changes
 from pipeline.gap.entries import Named, from_comb, from_mean, from_missing, from_spread, with_effects
@@ -31,7 +31,8 @@ _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
 _CLIP = 5.0
 _EARLY_SIGMAS, _EARLY_M = 8.0, 0.5
-_NOT_FREE = ("edge_step", "line")
+_NOT_FREE = {"tls": ("edge_step", "line"), "stereo": ("edge_step", "incidence")}
+"""Covariates by sensor that an empirical term cannot be a function of."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
         Version(model, _pose(replace(residuals, value=value).part(sound)))
         for model, value in ((measurement.model, residuals.value), (after, corrected))
     )
-    gap = _gap(measurement, versions, residuals, usable & held_out, naming.reference_sigma, random)
+    gap = _gap(measurement, versions, residuals, residuals.smooth & ~changed & held_out, naming.reference_sigma, scale, random)
     clock.lap("verification")
     return Diagnosis(
         verdict=_verdict(named),
@@ -173,11 +174,21 @@ def _pose(residuals: Residuals) -> FloatArray:
     return np.asarray(np.linalg.lstsq(weighted, residuals.value / residuals.sigma, rcond=None)[0])
 
 
+def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | Grid]:
+    """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
+    named = tls_signatures.mean_families(part) if part.sensor == "tls" else stereo_signatures.mean_families(part, measurement)
+    free = [
+        form
+        for name, values in part.covariates.items()
+        if name not in _NOT_FREE[part.sensor] and np.ptp(values) > 0
+        for form in free_forms(name, values)
+    ]
+    return [*named, *free, *places(part.at)]
+
+
 def candidates_of(measurement: Measurement, part: Residuals) -> list[Candidate]:
-    """Every explanation that the fields of `part` allow, the catalogue's and free forms."""
-    named = tls_signatures.mean_candidates(part) if part.sensor == "tls" else stereo_signatures.mean_candidates(part, measurement)
-    free = [free_form(name, values) for name, values in part.covariates.items() if name not in _NOT_FREE and np.ptp(values) > 0]
-    return [*named, *free]
+    """The same, with each searched sine at each of its frequencies."""
+    return variants(families_of(measurement, part))
 
 
 def _name(measurement: Measurement, part: Residuals, scale: float, random: KeyedRandom) -> tuple[list[Named], _Naming]:
@@ -188,24 +199,21 @@ def _name(measurement: Measurement, part: Residuals, scale: float, random: Keyed
         named.append(from_comb(comb, part))
         part = replace(part, sigma=np.sqrt(part.sigma**2 + comb.step_m**2 / 12))
         scale = 1.0
-    candidates = candidates_of(measurement, part)
-    search = MeanSearch(replace(part, sigma=part.sigma * scale), candidates, random)
+    families, cells = families_of(measurement, part), Cells.over(part.at)
+    spread = find_spread(part, cells, _registered(part)[0], random)
+    sigma = part.sigma * scale if spread is None else np.sqrt(part.sigma**2 + spread.variance)
+    search = MeanSearch(replace(part, sigma=sigma), families, random)
     chosen, tried = search.select()
-    value = search.without(chosen)
-    spread = find_spread(part, search.cells, value, random)
-    if spread is not None and scale > 1.02:  # weigh the mean by the spread that was found
-        search = MeanSearch(replace(part, sigma=np.sqrt(part.sigma**2 + spread.variance)), candidates, random)
-        chosen, tried = search.select()
-        spread = find_spread(part, search.cells, search.without(chosen), random) or spread
+    if chosen:
+        spread = find_spread(part, cells, search.without(chosen), random)
     named += from_mean(search, chosen, part)
     if spread is not None:
         named.append(from_spread(spread))
     names, cosines, survival = search.identifiability()
-    left = tried[0] if tried else None
-    remaining = {"p_value": search.p_value(left) if left else 1.0, "note": "; ".join(part.notes)}
+    remaining = {"p_value": search.p_value(tried[0].score) if tried else 1.0, "note": "; ".join(part.notes)}
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
-    everything = list(chosen[0].tried) if chosen else tried
-    return named, _Naming(tuple(everything), remaining, table, search.reference_sigma(chosen))
+    everything = tuple(item for item in (chosen[0].tried if chosen else tried) if not item.name.startswith(PLACE))
+    return named, _Naming(everything, remaining, table, search.reference_sigma(chosen))
 
 
 def _names(measurement: Measurement, name: str) -> bool:
@@ -226,13 +234,14 @@ def _gap(
     residuals: Residuals,
     rows: BoolArray,
     reference_sigma: float,
+    scale: float,
     random: KeyedRandom,
 ) -> Gap | None:
     chosen = np.flatnonzero(rows)
     if len(chosen) < 100:
         return None
     part = residuals.part(chosen[thinned(len(chosen))])
-    return measure_gap(measurement, versions[0], versions[1], part, reference_sigma, random.child("verify"))
+    return measure_gap(measurement, versions[0], versions[1], part, reference_sigma, _CLIP * scale, random.child("verify"))
 
 
 def _verdict(named: list[Named]) -> str:
