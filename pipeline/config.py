@@ -13,6 +13,7 @@ from pipeline.bundled import bundled_config
 from pipeline.difference import DifferenceConfig
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import PairConfig, read_cameras_yaml
+from pipeline.m3c2 import M3c2Config
 from pipeline.mesh import SurfaceConfig
 from pipeline.noise.settings import CalibrationConfig
 from pipeline.overrides import apply_overrides
@@ -127,6 +128,7 @@ class SimulationConfig(Config):
     fusion: FusionConfig = FusionConfig()
     icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: left out")
     difference: DifferenceConfig = DifferenceConfig()
+    m3c2: M3c2Config | None = Field(None, description="M3C2 distances beside the difference maps; none: left out")
     annotation: AnnotationConfig = AnnotationConfig()
     tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")
     products: ProductsConfig = ProductsConfig()

@@ -12,6 +12,7 @@ from pipeline.closest_points import ReferenceSurface
 from pipeline.config import SimulationConfig
 from pipeline.difference import BlockStatistics, SurfaceRaster, block_statistics, difference, raster_grid, surface_raster
 from pipeline.look import Look, look, reconstruct
+from pipeline.m3c2 import M3c2Map, m3c2
 from pipeline.progress import Progress
 from pipeline.register import Registration, register_to
 from pipeline.site import Site
@@ -44,7 +45,8 @@ class Epoch:
     """A later epoch.
 
     seen: what the sensor saw; solids: the blocks; blocks: records of what was carved, with what the difference map shows of each;
-    surface: reconstructed, before registration; raster: after it; difference: (h, w) float32, m, reference minus epoch.
+    surface: reconstructed, before registration; raster: after it; difference: (h, w) float32, m, reference minus epoch; m3c2:
+    distances of the registered surface's vertices, where the config asks for them.
     """
 
     number: int
@@ -57,6 +59,7 @@ class Epoch:
     raster: SurfaceRaster
     difference: NDArray[np.float32]
     statistics: BlockStatistics
+    m3c2: M3c2Map | None = None
 
 
 STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "difference": 2.0, "write": 8.0}
@@ -105,11 +108,14 @@ def observe_epoch(
         change = difference(reference.raster, raster)
         measured = measure_blocks(change, raster, len(records))
         statistics = block_statistics(change, raster.block)
+        clouds = None
+        if config.m3c2 is not None:
+            clouds = m3c2(reference.surface.vertices, registered.vertices, reference.raster, raster.block, config.m3c2)
     found = [
         {**record, "world_position_m": to_world(site, record["position_m"]), **values}
         for record, values in zip(records, measured, strict=True)
     ]
-    return Epoch(number, seen, carved, blocks, found, surface, registration, raster, change, statistics)
+    return Epoch(number, seen, carved, blocks, found, surface, registration, raster, change, statistics, clouds)
 
 
 def as_observed(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:

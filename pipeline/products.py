@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.annotate import LabelledImage, coco
 from pipeline.config import SimulationConfig
+from pipeline.difference import statistics
 from pipeline.epoch import Epoch, Reference
 from pipeline.formats.atomic import write_bytes, write_json
 from pipeline.formats.e57 import write_e57
@@ -21,6 +23,7 @@ from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import write_xyz
 from pipeline.look import Look
+from pipeline.m3c2 import M3c2Map
 from pipeline.metashape_export import write_metashape_export
 from pipeline.recorded_points import recorded_points, scans_of
 from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
@@ -32,6 +35,8 @@ from scene.imported import ImportedWall
 from scene.mesh import WALL, FloatArray, TriangleMesh
 
 EPOCH_RECORD = "epoch.json"
+M3C2_ANNOTATIONS = "annotations_m3c2"
+"""Key of an epoch's record, and the name of the run's file."""
 
 
 def epoch_folder(out: Path, number: int) -> Path:
@@ -65,6 +70,8 @@ def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Refe
         )
         if config.products.block_meshes:
             _write_block_meshes(folder / "blocks", site.mesh, epoch.solids)
+        if epoch.m3c2 is not None:
+            _write_m3c2(out, epoch.number, epoch.m3c2)
         images = list(_images(out, config, epoch, reference, name))
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
         masks = epoch.raster.block != WALL
@@ -93,7 +100,26 @@ def _record(config: SimulationConfig, epoch: Epoch, images: list[LabelledImage],
         },
         "blocks": epoch.blocks,
         "annotations": coco(images, config.annotation),
+        **({} if epoch.m3c2 is None else _m3c2_record(config, epoch.number, epoch.m3c2)),
     }
+
+
+def _m3c2_record(config: SimulationConfig, number: int, found: M3c2Map) -> dict[str, Any]:
+    image = LabelledImage(f"m3c2_{number:03d}.tif", found.block, found.grid, number)
+    return {"m3c2": found.summary(), M3C2_ANNOTATIONS: coco([image], config.annotation)}
+
+
+def _write_m3c2(out: Path, number: int, found: M3c2Map) -> None:
+    """The distances and their level of detection as maps, the distances as a picture, and all of it as points."""
+    write_geotiff(out / f"m3c2_{number:03d}.tif", found.distance, found.grid, description="M3C2, m; missing rock is positive")
+    write_geotiff(out / f"m3c2_lod_{number:03d}.tif", found.level, found.grid, description="M3C2 level of detection 95 %, m")
+    calm = statistics(found.distance[found.block == WALL])
+    sigma = max(calm.nmad, 1e-4) if calm.count else 1e-3
+    write_bytes(out / f"m3c2_{number:03d}.png", difference_figure(found.distance, found.grid, found.block, sigma, "M3C2"))
+    maps: dict[str, NDArray[Any]] = {"distance_m": found.distance, "lod_m": found.level, "block": found.block}
+    maps["significant"] = found.significant.astype(np.uint8)
+    extra = {name: values.ravel()[found.place] for name, values in maps.items()}
+    write_laz(out / f"m3c2_{number:03d}.laz", found.points, extra=extra)
 
 
 def _seen_record(seen: Look) -> dict[str, Any]:

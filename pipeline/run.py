@@ -16,7 +16,7 @@ from pipeline.annotate import merge
 from pipeline.config import SensorName, SimulationConfig
 from pipeline.epoch import STAGES, observe_epoch, observe_reference
 from pipeline.formats.atomic import write_json
-from pipeline.products import EPOCH_RECORD, epoch_folder, write_epoch, write_reference
+from pipeline.products import EPOCH_RECORD, M3C2_ANNOTATIONS, epoch_folder, write_epoch, write_reference
 from pipeline.progress import Progress
 from pipeline.provenance import versions
 from pipeline.report.assemble import write_run_report
@@ -124,6 +124,9 @@ def _finish(out: Path, identity: dict[str, Any], site: Site, progress: Progress,
     report = write_run_report(out, identity, site, records, complete=complete)
     annotations = [record.pop("annotations") for record in records]
     write_json(out / "annotations.json", merge(annotations))
+    if any(M3C2_ANNOTATIONS in record for record in records):
+        beside = [record.pop(M3C2_ANNOTATIONS) for record in records if M3C2_ANNOTATIONS in record]
+        write_json(out / f"{M3C2_ANNOTATIONS}.json", merge(beside))
     run = {
         **identity,
         "complete": complete,
