@@ -123,8 +123,11 @@ class SizeClass:
 
 @dataclass(frozen=True)
 class Detection:
-    """The blocks and how many were seen. by_size, by_depth: curves, None for fewer than ten blocks, and classes; table: shares
-    seen, (sizes, depths), NaN without blocks; alarms of trials: footprints on stable ground that were taken for blocks."""
+    """The blocks and how many were seen.
+
+    by_size, by_depth: curves over the blocks in view, None for fewer than ten, and classes of them; table: shares seen of them,
+    (sizes, depths), NaN without blocks; alarms of trials: footprints on stable ground that were taken for blocks.
+    """
 
     blocks: list[BlockSeen]
     by_size: DetectionCurve | None
@@ -139,6 +142,7 @@ class Detection:
         """As JSON holds it; the blocks are in blocks.csv."""
         return {
             "blocks": len(self.blocks),
+            "in_view": sum(block.in_view for block in self.blocks),
             "seen": sum(block.seen for block in self.blocks),
             "by_size": None if self.by_size is None else self.by_size.to_dict(),
             "by_depth": None if self.by_depth is None else self.by_depth.to_dict(),
@@ -281,11 +285,11 @@ def _detection(trial: Trial, seen: Seen, stable: Raster, test: MeanTest, random:
     blocks: list[BlockSeen] = []
     alarms = trials = 0
     for number, (epoch, change) in enumerate(zip(trial.epochs, seen.changes, strict=True)):
-        blocks += blocks_seen(epoch.number, change, epoch.block, epoch.change, epoch.records, test)
+        blocks += blocks_seen(epoch.number, change, epoch.block, epoch.change, epoch.records, seen.visible, test)
         shapes = [shape for _, _, shape in footprints(epoch.block, epoch.change)]
         found, of = false_alarms(stable[number], shapes, test, random.child("alarms", number))
         alarms, trials = alarms + found, trials + of
-    shown = [block for block in blocks if block.footprint_px]
+    shown = [block for block in blocks if block.in_view]
     size, depth = (np.array([getattr(block, name) for block in shown]) for name in ("size_m", "depth_m"))
     hit = np.array([block.seen for block in shown], dtype=bool)
     return Detection(

@@ -13,8 +13,9 @@ differs over the wall (Hugonnet et al. 2022). A block of which less than half ha
 The test is held against the truth: the same footprints, laid on stable ground, should be taken for blocks in 2.5 % of cases, and
 how often they are is reported.
 
-Over block sizes x the share seen follows P(x) = (1 - l) Phi((ln x - m) / w), by maximum likelihood; l is the share of blocks that
-no size makes visible, as they lie where the sensor does not look.
+Over the sizes x of the blocks in view the share seen follows P(x) = (1 - l) Phi((ln x - m) / w), by maximum likelihood; l is the
+share that no size makes visible, as the niche is hidden even where the block was not. Blocks that fall out of the sensor's view
+are counted apart: no precision helps there, another station does.
 """
 
 from __future__ import annotations
@@ -71,7 +72,8 @@ class BlockSeen:
 
     size_m: geometric mean of its three axes; depth_m: true mean depth over its footprint; footprint_px: pixels of the map on
     which it changed the wall; data_share: of these, with data; mean_m: of the differences there, None with too little data;
-    limit_m: level of detection of that mean; volume_m3, measured_volume_m3: true, and sum of the differences over the footprint.
+    limit_m: level of detection of that mean; volume_m3, measured_volume_m3: true, and sum of the differences over the footprint;
+    in_view: whether the sensor saw at least half of the footprint before the block fell.
     """
 
     epoch: int
@@ -84,6 +86,7 @@ class BlockSeen:
     limit_m: float | None
     volume_m3: float
     measured_volume_m3: float
+    in_view: bool
     seen: bool
 
     def to_dict(self) -> dict[str, Any]:
@@ -131,11 +134,13 @@ def blocks_seen(
     block: IntArray,
     true_change: NDArray[np.floating],
     records: Sequence[dict[str, Any]],
+    visible: BoolArray,
     test: MeanTest,
 ) -> list[BlockSeen]:
     """What the map `change` (h, w), m, of an epoch shows of each of its blocks.
 
-    block, true_change: (h, w) labels and change of the wall as it really is, reference minus epoch, m; records: of blocks.json.
+    block, true_change: (h, w) labels and change of the wall as it really is, reference minus epoch, m; records: of blocks.json;
+    visible: (h, w) where the sensor sees the untouched wall.
     """
     found = {label: (window, footprint) for label, window, footprint in footprints(block, true_change)}
     nowhere = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), dtype=bool)
@@ -158,6 +163,7 @@ def blocks_seen(
                 limit_m=limit,
                 volume_m3=record["volume_m3"],
                 measured_volume_m3=float(np.nansum(differences, dtype=np.float64) * area),
+                in_view=bool(count) and float(np.mean(visible[window][footprint])) >= LEAST_SHARE,
                 seen=mean is not None and limit is not None and mean > limit,
             )
         )

@@ -75,16 +75,16 @@ def answer(found: Assessment) -> str:
     """The sentence that people ask for: the smallest block that a sensor sees in 95 % of cases."""
     curve = found.detection.by_size
     if curve is None:
-        return f"{found.name}: too few blocks fell to say which are seen."
+        return f"{found.name}: too few blocks fell in its view to say which are seen."
     if curve.smallest_95_m is None:
-        return f"{found.name}: no size is seen in 95 % of cases; {curve.lapse:.0%} of the blocks stay unseen whatever their size."
+        return f"{found.name}: no size is seen in 95 % of cases; {curve.lapse:.0%} of the blocks in its view stay unseen at any size."
     if curve.smallest_95_m < curve.smallest_m:
-        return f"{found.name}: sees 95 % of the smallest blocks that fell, {100 * curve.smallest_m:.1f} cm."
+        return f"{found.name}: sees 95 % of the smallest blocks that fell in its view, {100 * curve.smallest_m:.1f} cm."
     if curve.smallest_95_m > curve.largest_m:
-        return f"{found.name}: sees less than 95 % of the largest blocks that fell, {100 * curve.largest_m:.0f} cm."
+        return f"{found.name}: sees less than 95 % of the largest blocks that fell in its view, {100 * curve.largest_m:.0f} cm."
     low, high = (_NOTHING if end is None else f"{100 * end:.1f}" for end in curve.interval_m)
     return (
-        f"{found.name}: the smallest block seen in 95 % of cases has a size of {100 * curve.smallest_95_m:.1f} cm "
+        f"{found.name}: the smallest block in its view that is seen in 95 % of cases has a size of {100 * curve.smallest_95_m:.1f} cm "
         f"(95 % interval {low} to {high} cm)."
     )
 
@@ -170,10 +170,8 @@ def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> lis
         ("Level of detection of a pixel, 95 %: median", [_mm(each.median_level_m) for each in noises]),
         ("Whole wall, against the truth: RMSE", simulated([_mm(each.wall.rmse) for each in found])),
         ("Whole wall, against the truth: NMAD", simulated([_mm(each.wall.nmad) for each in found])),
-        (
-            "Blocks seen",
-            simulated([f"{sum(b.seen for b in each.detection.blocks)} of {len(each.detection.blocks)}" for each in found]),
-        ),
+        ("Blocks that fell in view", simulated([_share(each, "in_view") for each in found])),
+        ("Blocks seen", simulated([_share(each, "seen") for each in found])),
         (
             "Stable ground taken for a block (2.5 % expected)",
             simulated([f"{each.detection.alarms} of {each.detection.trials:,}" for each in found]),
@@ -192,6 +190,11 @@ def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> lis
             simulated([_NOTHING if each.registration_rms_m is None else _mm(each.registration_rms_m) for each in found]),
         ),
     ]
+
+
+def _share(found: Assessment, field: str) -> str:
+    """How many of the blocks have a field set."""
+    return f"{sum(getattr(block, field) for block in found.detection.blocks)} of {len(found.detection.blocks)}"
 
 
 def _noise_rows(comparison: Comparison) -> Iterable[dict[str, Any]]:
