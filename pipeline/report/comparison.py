@@ -77,15 +77,15 @@ def answer(found: Assessment) -> str:
     if curve is None:
         return f"{found.name}: too few blocks fell in its view to say which are seen."
     if curve.smallest_95_m is None:
-        return f"{found.name}: no size is seen in 95 % of cases; {curve.lapse:.0%} of the blocks in its view stay unseen at any size."
+        return f"{found.name}: no size is seen in 95 % of cases; {curve.lapse:.0%} of those in view stay unseen."
     if curve.smallest_95_m < curve.smallest_m:
         return f"{found.name}: sees 95 % of the smallest blocks that fell in its view, {100 * curve.smallest_m:.1f} cm."
     if curve.smallest_95_m > curve.largest_m:
         return f"{found.name}: sees less than 95 % of the largest blocks that fell in its view, {100 * curve.largest_m:.0f} cm."
     low, high = (_NOTHING if end is None else f"{100 * end:.1f}" for end in curve.interval_m)
     return (
-        f"{found.name}: the smallest block in its view that is seen in 95 % of cases has a size of {100 * curve.smallest_95_m:.1f} cm "
-        f"(95 % interval {low} to {high} cm)."
+        f"{found.name}: the smallest block seen in 95 % of cases, of those in view, has a size of "
+        f"{100 * curve.smallest_95_m:.1f} cm (95 % interval {low} to {high} cm)."
     )
 
 
