@@ -14,7 +14,7 @@ import traceback
 from importlib import metadata
 from typing import Protocol
 
-from pipeline.cli import calibrate, compare, dataset, doctor, gap, init, inspect
+from pipeline.cli import calibrate, compare, dataset, detect, doctor, evaluate, gap, icp_study, init, inspect, train
 from pipeline.cli import simulate as simulate_command
 from pipeline.cli.parser import Parser
 from scene.errors import InputError, nearest
@@ -46,9 +46,13 @@ COMMANDS: dict[str, Command] = {
     "simulate": simulate_command,
     "inspect": inspect,
     "compare": compare,
+    "icp-study": icp_study,
     "calibrate": calibrate,
     "dataset": dataset,
     "gap": gap,
+    "train": train,
+    "detect": detect,
+    "evaluate": evaluate,
     "init": init,
     "doctor": doctor,
 }
