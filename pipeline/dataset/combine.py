@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.dataset.assemble import assemble, shards
-from pipeline.dataset.folder import Record, locked, read_dataset_file, sha256, shard_name, tile_files, write_shard
+from pipeline.dataset.folder import Record, is_free, locked, read_dataset_file, sha256, shard_name, tile_files, write_shard
 from pipeline.dataset.run import DatasetSummary, write_dataset_file
 from scene.errors import InputError, nearest
 
@@ -23,20 +23,20 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
     """
     if len(folders) < 2:
         raise InputError(f"needs two folders or more, got {len(folders)}", where="scarpsim dataset merge")
-    sets = {folder: _finished(folder) for folder in folders}
+    sets = [(folder, _finished(folder)) for folder in folders]
     sources: dict[str, Any] = {}
     epochs: dict[str, list[int]] = defaultdict(list)
-    for folder, dataset in sets.items():
+    for folder, dataset in sets:
         for source, indices in dataset["epochs"].items():
             if set(epochs[source]) & set(indices):
                 raise InputError("holds epochs that an earlier one holds too", where=str(folder), remedy="give each set once")
             epochs[source] = sorted({*epochs[source], *indices})
             sources[source] = {**dataset["sources"][source], "prefix": f"{source}_"}
     with locked(_new(out)):
-        for folder, dataset in sets.items():
+        for folder, dataset in sets:
             for record in shards(folder, dataset):
                 _copy(folder, out, record, dataset["sources"][record["source"]]["prefix"], f"{record['source']}_")
-        name = "-".join(dict.fromkeys(dataset["name"] for dataset in sets.values()))
+        name = "-".join(dict.fromkeys(dataset["name"] for _, dataset in sets))
         return _finish(out, name, sources, dict(epochs))
 
 
@@ -74,7 +74,7 @@ def _finished(folder: Path) -> Record:
 
 
 def _new(out: Path) -> Path:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not is_free(out):
         raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
     return out
 

@@ -60,7 +60,7 @@ class NoiseLevel(Config):
 class SizeClass(Config):
     """Blocks of one class of sizes."""
 
-    blocks_per_tile: float = Field(gt=0, description="blocks on the area of a tile; gives rockfall.count, whatever that says")
+    blocks_per_m2: float = Field(gt=0, description="blocks on the area of the wall; gives rockfall.count, whatever that says")
     rockfall: RockfallConfig = RockfallConfig()
 
 
@@ -78,7 +78,7 @@ class Part(Config):
 class DatasetConfig(Config):
     """A data set of tiles of difference maps."""
 
-    name: Name = Field("rockfall", description="name of the data set")
+    name: str = Field("rockfall", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name of the data set")
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
     sensors: tuple[SensorName, ...] = Field(("stereo", "tls"), min_length=1, description="sensors that observe every epoch")
     walls: dict[Name, SimulationConfig] = Field(

@@ -30,6 +30,9 @@ from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import WALL
 
+_DRAWS = 5
+"""Times that an epoch's blocks are drawn before the set-up is at fault."""
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -98,7 +101,7 @@ def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progr
         grid = stage.reference.raster.grid
         where = region(epoch.split, config.validation_region, grid, config.tiles)
         simulation = with_count(simulation_of(config, epoch), blocks_on(config, epoch.size, grid))
-        found = observe_epoch(simulation, stage.site, stage.reference, epoch.number, random_of_epoch(config, epoch), progress)
+        found, draw = _observed(config, simulation, epoch, stage, progress)
     except InputError as error:
         raise InputError(str(error), where=epoch.name) from None
     with progress.stage("tiles"):
@@ -108,7 +111,21 @@ def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progr
         raise InputError(
             "no tile has enough data", where=epoch.name, remedy="lower tiles.minimum_valid_share, or take a larger wall"
         )
-    return MadeEpoch(_record(config, epoch, found, simulation), cut)
+    return MadeEpoch({**_record(config, epoch, found, simulation), "draw": draw}, cut)
+
+
+def _observed(
+    config: DatasetConfig, simulation: SimulationConfig, epoch: PlannedEpoch, stage: Stage, progress: Progress
+) -> tuple[Epoch, int]:
+    """The epoch, and the draw that it came from: where blocks find no room all are drawn anew, a few times."""
+    for draw in range(1, _DRAWS + 1):
+        try:
+            random = random_of_epoch(config, epoch, draw)
+            return observe_epoch(simulation, stage.site, stage.reference, epoch.number, random, progress), draw
+        except InputError:
+            if draw == _DRAWS:
+                raise
+    raise AssertionError("the last draw has returned or raised")
 
 
 def with_count(simulation: SimulationConfig, count: int) -> SimulationConfig:

@@ -57,6 +57,11 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
+def is_free(folder: Path) -> bool:
+    """Whether a folder holds nothing but a lock."""
+    return folder.is_dir() and all(path.name == LOCK for path in folder.iterdir())
+
+
 def fingerprint(config: DatasetConfig) -> str:
     """What tells sets apart: a hash of the resolved config and of the files that its walls and cameras are read from."""
     digest = hashlib.sha256(config.model_dump_json().encode())

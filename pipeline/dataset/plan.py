@@ -72,8 +72,8 @@ def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfi
 
 def blocks_on(config: DatasetConfig, size: str, grid: Grid) -> int:
     """How many blocks fall from a wall whose difference maps have the pixels of `grid`."""
-    tiles = grid.width * grid.height / config.tiles.size_px**2
-    return max(1, round(config.sizes[size].blocks_per_tile * tiles))
+    area = grid.width * grid.height * grid.gsd**2
+    return max(1, round(config.sizes[size].blocks_per_m2 * area))
 
 
 def random_of_wall(config: DatasetConfig, wall: str) -> KeyedRandom:
@@ -85,8 +85,10 @@ def random_of_reference(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRand
     return KeyedRandom(config.seed).child("dataset", "reference", *epoch.stage)
 
 
-def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
-    return KeyedRandom(config.seed).child("dataset", "epoch", epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split)
+def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch, draw: int) -> KeyedRandom:
+    """Of an epoch's blocks, noise and registration; draw: counts from 1, where blocks find no room and are drawn anew."""
+    path = epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split
+    return KeyedRandom(config.seed).child("dataset", "epoch", *path, "draw", draw)
 
 
 @dataclass(frozen=True)

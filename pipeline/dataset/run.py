@@ -19,6 +19,7 @@ from pipeline.dataset.folder import (
     Damage,
     damages,
     fingerprint,
+    is_free,
     locked,
     read_dataset_file,
     remove_leftovers,
@@ -96,7 +97,7 @@ def _claim(out: Path, config: DatasetConfig, command: str) -> None:
             )
         require_same_makers(known["sources"][source], str(out))
         return
-    if any(not path.name.startswith(".") for path in out.iterdir()):
+    if not is_free(out):
         raise InputError("the folder exists and is not empty", where=f"--out {out}", remedy="choose another --out")
     entry = {"config": config.model_dump(mode="json"), "versions": makers(), "command": command, "prefix": ""}
     write_dataset_file(out, config.name, {source: entry}, {source: [epoch.index for epoch in planned_epochs(config)]})

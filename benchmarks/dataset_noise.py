@@ -1,0 +1,83 @@
+"""Noise of the difference maps of a data set's walls at its levels, outside blocks: what the scales in its config are chosen by.
+
+    python benchmarks/dataset_noise.py [CONFIG] [--maps 4] [--sensor stereo|tls] [--unit]
+
+Maps without blocks at half the walls' resolution and a GSD of 10 cm, as in noise_table.py (docs/noise.md says what that changes);
+mean of the StD, mm, by wall and level, with the largest and smallest. --unit: at scale 1 in place of the config's.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.bundled import bundled_config
+from pipeline.config import SensorName
+from pipeline.dataset.config import DatasetConfig, load_dataset_config
+from pipeline.dataset.plan import PlannedEpoch, planned_epochs, simulation_of
+from pipeline.difference import statistics
+from pipeline.noise.maps import noise_map
+from pipeline.site import Site, prepare_site
+from scene.keyed_random import KeyedRandom
+from scene.raycast import RayCaster
+
+
+def stds_mm(config: DatasetConfig, epochs: list[PlannedEpoch], maps: int) -> dict[str, list[float]]:
+    """StD of each map by level; `epochs` of one wall and sensor, one for each level."""
+    first = simulation_of(config, epochs[0])
+    coarse = {
+        "wall": first.wall.model_copy(update={"resolution_m": 2 * first.wall.resolution_m}),
+        "difference": first.difference.model_copy(update={"gsd_m": first.wall.resolution_m * 2}),
+    }
+    random = KeyedRandom(config.seed).child("noise of", epochs[0].wall)
+    site = prepare_site(first.model_copy(update=coarse), epochs[0].sensor, random)
+    caster = RayCaster(site.mesh)
+    found = {}
+    for epoch in epochs:
+        simulation = simulation_of(config, epoch).model_copy(update=coarse)
+        there = _with_model(site, simulation.sensor[0])
+        found[epoch.noise] = [
+            1e3 * statistics(noise_map(simulation, there, there, caster, random.child(number))).standard_deviation
+            for number in range(maps)
+        ]
+    return found
+
+
+def _with_model(site: Site, model: object) -> Site:
+    return replace(site, sensor=replace(site.sensor, model=model))  # type: ignore[type-var]
+
+
+def unscaled(config: DatasetConfig) -> DatasetConfig:
+    """The config with every scale at 1."""
+    values = config.model_dump(mode="json")
+    for level in values["noise"].values():
+        for model in level.values():
+            if model is not None:
+                model["scale"] = 1.0
+    return DatasetConfig.model_validate(values)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("config", nargs="?", type=Path, default=bundled_config("datasets", "rockfall_9"))
+    parser.add_argument("--maps", type=int, default=4)
+    parser.add_argument("--sensor", choices=["stereo", "tls"])
+    parser.add_argument("--unit", action="store_true")
+    asked = parser.parse_args()
+    config = load_dataset_config(asked.config)
+    config = unscaled(config) if asked.unit else config
+    sensors: tuple[SensorName, ...] = (asked.sensor,) if asked.sensor else config.sensors
+    print("| sensor | wall | noise | StD, mm | range |\n|---|---|---|---|---|")
+    for sensor in sensors:
+        for wall in config.walls:
+            one = {epoch.noise: epoch for epoch in planned_epochs(config) if (epoch.sensor, epoch.wall) == (sensor, wall)}
+            for noise, values in stds_mm(config, list(one.values()), asked.maps).items():
+                told = f"{np.mean(values):.1f} | {min(values):.1f} - {max(values):.1f}"
+                print(f"| {sensor} | {wall} | {noise} | {told} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

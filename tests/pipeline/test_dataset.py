@@ -1,0 +1,524 @@
+"""Data sets: the folder, who loads it, splits that do not overlap, repair, merging, splitting. Whole sets, small."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from pycocotools.coco import COCO
+
+from pipeline.bundled import bundled_config
+from pipeline.dataset.combine import merge_datasets, split_dataset
+from pipeline.dataset.config import DatasetConfig, load_dataset_config
+from pipeline.dataset.epoch import Stages, make_epoch
+from pipeline.dataset.folder import LOCK, locked
+from pipeline.dataset.loaders import Tiles
+from pipeline.dataset.plan import planned_epochs, region, simulation_of
+from pipeline.dataset.run import make_dataset, verify_dataset
+from pipeline.formats.geotiff import read_geotiff
+from pipeline.progress import Progress
+from pipeline.tiles import TileConfig
+from scene.config import parse
+from scene.errors import InputError
+from scene.grid import Grid
+
+ROOT = Path(__file__).parents[2]
+TINY: dict[str, Any] = {
+    "name": "tiny",
+    "seed": 3,
+    "sensors": ["stereo", "tls"],
+    "walls": {
+        "ledge": {
+            "wall": {"style": "glendale", "width_m": 9.0, "height_m": 5.0, "resolution_m": 0.1, "seed": 1},
+            "cameras": {"distance_m": 20.0, "base_m": 5.0},
+            "depth_map": "low",
+            "station": {"distance_m": 20.0},
+            "scanner": {"azimuth_step_rad": 0.004, "zenith_step_rad": 0.004},
+            "difference": {"gsd_m": 0.05},
+            "icp": {"max_iteration": 5},
+        }
+    },
+    "noise": {
+        "low": {
+            "stereo": {"model": {"sensor": "stereo", "noise": {"parallax_sigma_px": 0.2}}},
+            "tls": {"model": {"sensor": "tls"}, "scale": {"ledge": 2.0}},
+        }
+    },
+    "sizes": {"large": {"blocks_per_m2": 0.35, "rockfall": {"size_m": {"kind": "uniform", "low": 0.4, "high": 0.6}}}},
+    "tiles": {"size_px": 48, "minimum_valid_share": 0.3},
+    "parts": [{"walls": ["ledge"], "noise": ["low"], "sizes": ["large"], "train": 2, "val": 1, "test": 1}],
+    "truth": True,
+}
+EPOCHS = 8
+
+
+def tiny(**changes: Any) -> DatasetConfig:
+    return parse(DatasetConfig, {**TINY, **changes}, "test")
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Checksums of all that a set consists of; hidden files are the job's own."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith("."))
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def entries(folder: Path, split: str, kind: str) -> list[dict[str, Any]]:
+    return list(json.loads((folder / split / "annotations.json").read_text())[kind])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dataset") / "set"
+    make_dataset(tiny(), out, command="scarpsim dataset tiny.yaml --out DIR")
+    return out
+
+
+def test_every_split_loads_in_pycocotools_with_ids_of_its_own(made: Path) -> None:
+    image_ids: list[int] = []
+    annotation_ids: list[int] = []
+    for split in ("train", "val", "test"):
+        data_set = COCO(made / split / "annotations.json")
+        assert [category["name"] for category in data_set.loadCats(data_set.getCatIds())] == ["block"]
+        assert len(data_set.anns) > 0
+        image_ids += data_set.getImgIds()
+        annotation_ids += data_set.getAnnIds()
+        for annotation in data_set.loadAnns(data_set.getAnnIds()):
+            mask = data_set.annToMask(annotation)
+            assert mask.sum() == annotation["area"] > 0
+            rows, columns = np.nonzero(mask)
+            x, y = columns.min(), rows.min()
+            assert annotation["bbox"] == [x, y, columns.max() - x + 1, rows.max() - y + 1]
+            assert annotation["iscrowd"] == 0
+    assert sorted(image_ids) == list(range(1, len(image_ids) + 1))
+    assert sorted(annotation_ids) == list(range(1, len(annotation_ids) + 1))
+
+
+def test_the_folder_follows_the_conventions_of_torchvision_and_fiftyone(made: Path) -> None:
+    """CocoDetection joins its root and file_name; FiftyOne finds file_name below data_path and wants these keys."""
+    content = json.loads((made / "train/annotations.json").read_text())
+    assert {"info", "licenses", "categories", "images", "annotations"} <= content.keys()
+    for image in content["images"]:
+        assert Path(image["file_name"]).name == image["file_name"]
+        assert (made / "train" / image["file_name"]).is_file()
+        assert {"id", "width", "height"} <= image.keys()
+    for annotation in content["annotations"]:
+        assert {"id", "image_id", "category_id", "bbox", "area", "iscrowd", "segmentation"} <= annotation.keys()
+        assert isinstance(annotation["area"], int)
+        assert isinstance(annotation["segmentation"]["counts"], str)
+
+
+def test_a_tile_has_values_a_mask_and_its_place(made: Path) -> None:
+    masked = 0
+    for image in entries(made, "train", "images"):
+        with rasterio.open(made / "train" / image["file_name"]) as raster:
+            values, transform = raster.read(1), raster.transform
+            assert raster.dtypes == ("float32",)
+            np.testing.assert_array_equal(raster.dataset_mask() > 0, ~np.isnan(values))
+        masked += np.isnan(values).sum()
+        assert (transform.c, transform.f, transform.a) == pytest.approx((image["x_min_m"], image["y_max_m"], image["gsd_m"]))
+        assert image["valid_share"] == pytest.approx(np.mean(~np.isnan(values)), abs=1e-6)
+    assert masked
+
+
+def test_annotations_know_their_blocks(made: Path) -> None:
+    for split in ("train", "val", "test"):
+        for annotation in entries(made, split, "annotations"):
+            assert annotation["wall"] == "ledge"
+            assert annotation["noise"] == "low"
+            assert annotation["size_class"] == "large"
+            assert annotation["seed"] == 3
+            assert all(0.4 <= length <= 0.6 for length in annotation["size_m"])
+            assert 0 < annotation["volume_m3"] < 0.6**3 * 1.3
+            assert 0 < annotation["share_in_tile"] <= 1
+            assert annotation["measured_volume_m3"] == pytest.approx(annotation["volume_m3"], rel=0.5, abs=0.01)
+            assert annotation["depth_m"] > 0
+
+
+def test_the_truth_lies_beside_the_noise(made: Path) -> None:
+    """Noiseless heights: the sensor's difference departs from them by its noise; away from niches they are exactly 0."""
+    for image in entries(made, "test", "images"):
+        noisy, place = read_geotiff(made / "test" / image["file_name"])
+        truth, place_of_truth = read_geotiff(made / "test" / image["truth_file_name"])
+        assert place == place_of_truth
+        assert np.nanmedian(np.abs(noisy - truth)) < 0.02
+        assert np.mean(truth[~np.isnan(truth)] == 0) > 0.5
+        assert np.nanmin(truth) > -1e-4
+
+
+def test_validation_shares_neither_place_nor_epoch_with_training(made: Path) -> None:
+    def boxes(split: str) -> list[tuple[str, float, float]]:
+        images = entries(made, split, "images")
+        return [(image["sensor"], image["x_min_m"], image["x_min_m"] + 48 * image["gsd_m"]) for image in images]
+
+    for sensor, left, right in boxes("train"):
+        for other, first, last in boxes("val"):
+            assert sensor != other or right <= first + 1e-9 or last <= left + 1e-9
+    epochs = [{image["epoch"] for image in entries(made, split, "images")} for split in ("train", "val", "test")]
+    assert sum(map(len, epochs)) == len(set.union(*epochs)) == EPOCHS
+
+
+@pytest.mark.parametrize(("width", "overlap", "share"), [(3500, 0, 0.43), (3500, 64, 0.3), (200, 0, 0.5), (1024, 100, 0.5)])
+def test_regions_keep_apart(width: int, overlap: int, share: float) -> None:
+    config = TileConfig(size_px=100, overlap_px=overlap if overlap < 100 else 99)
+    grid = Grid(0.0, 0.0, 0.02, width, 500)
+    train, val = region("train", share, grid, config), region("val", share, grid, config)
+    assert train.end <= val.first
+    assert train.first == 0
+    with pytest.raises(InputError, match="columns of tiles is none of them"):
+        region("train", 1e-4, grid, config)
+
+
+def test_the_card_tells_what_is_there(made: Path) -> None:
+    text = (made / "README.md").read_text()
+    assert "scarpsim dataset tiny.yaml --out DIR" in text
+    assert "seed 3" in text
+    assert "mitsuba" in text
+    for name in ("sizes", "noise", "samples_stereo", "samples_tls"):
+        assert f"card/{name}.png" in text
+        assert (made / f"card/{name}.png").stat().st_size > 5000
+    for line in (made / "checksums.sha256").read_text().splitlines():
+        digest, _, name = line.partition("  ")
+        assert hashlib.sha256((made / name).read_bytes()).hexdigest() == digest
+    listed = {line.partition("  ")[2] for line in (made / "checksums.sha256").read_text().splitlines()}
+    assert set(digests(made)) - listed == {"dataset.json", "checksums.sha256"}
+
+
+def test_an_epoch_does_not_depend_on_those_before_it(made: Path) -> None:
+    """The last epoch of each sensor alone, its stage set up for it only, against the set's tiles."""
+    config = tiny()
+    epoch = planned_epochs(config)[-1]
+    found = make_epoch(config, epoch, Stages(config), Progress())
+    for each in found.tiles:
+        stored, grid = read_geotiff(made / epoch.split / f"{epoch.name}_{each.tile.name}.tif")
+        np.testing.assert_array_equal(stored, each.tile.values)
+        assert grid == each.tile.grid
+
+
+def test_a_stage_is_set_up_once_and_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = tiny(references=2, sensors=["tls"])
+    plan = planned_epochs(config)
+    assert [epoch.reference for epoch in plan] == [1, 1, 1, 2]
+    stages = Stages(config)
+    for epoch in plan[:3]:
+        make_epoch(config, epoch, stages, Progress())
+    assert stages.made == 1
+    stages.of(plan[3], Progress())
+    assert stages.made == 2
+
+
+def test_damage_is_found_and_made_again(made: Path, tmp_path: Path) -> None:
+    before = digests(made)
+    tiles = sorted((made / "train").glob("*.tif"))
+    tiles[0].write_bytes(tiles[0].read_bytes()[:1000])
+    flipped = bytearray(tiles[1].read_bytes())
+    flipped[len(flipped) // 2] ^= 1
+    tiles[1].write_bytes(flipped)
+    tiles[-1].unlink()
+    shard = sorted((made / "shards").iterdir())[-1]
+    shard.write_text(shard.read_text()[:-100])
+    (made / "val/annotations.json").unlink()
+    reported = verify_dataset(made, repair=False)
+    assert len(reported.damage) == 5
+    assert digests(made) != before
+    mended = verify_dataset(made)
+    assert {damage.file for damage in mended.damage} == {damage.file for damage in reported.damage}
+    assert 2 <= len(mended.made) <= 4
+    assert digests(made) == before
+    assert verify_dataset(made, repair=False).damage == []
+
+
+def test_sets_merge_and_split(made: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    make_dataset(tiny(seed=4, sensors=["tls"], truth=False), other)
+    merged = tmp_path / "merged"
+    summary = merge_datasets([made, other], merged)
+    for split in ("train", "val", "test"):
+        images = entries(merged, split, "images")
+        assert summary.images[split] == len(images) == len(entries(made, split, "images")) + len(entries(other, split, "images"))
+        assert len({image["file_name"] for image in images}) == len(images)
+    ids = [each["id"] for split in ("train", "val", "test") for each in entries(merged, split, "annotations")]
+    assert len(set(ids)) == len(ids)
+    next((merged / "train").glob("*.tif")).unlink()
+    before = digests(merged)
+    assert len(verify_dataset(merged).made) == 1, "a merged set knows how its epochs were made"
+    assert len(digests(merged)) == len(before) + 1
+    parts = split_dataset(merged, tmp_path / "parts", ["sensor"])
+    assert sorted(part.folder.name for part in parts) == ["stereo", "tls"]
+    tls = Tiles(tmp_path / "parts/tls/train")
+    assert {record["sensor"] for record in tls.records} == {"tls"}
+    assert len(tls) == sum(image["sensor"] == "tls" for image in entries(merged, "train", "images"))
+    with pytest.raises(InputError, match="holds epochs that an earlier one holds too"):
+        merge_datasets([made, made], tmp_path / "twice")
+    assert not (tmp_path / "twice").exists()
+    with pytest.raises(InputError, match="unknown key 'sensr'"):
+        split_dataset(merged, tmp_path / "more", ["sensr"])
+
+
+def test_numpy_iterator(made: Path) -> None:
+    tiles = Tiles(made / "train", sensor="stereo")
+    assert len(tiles) == sum(image["sensor"] == "stereo" for image in entries(made, "train", "images"))
+    for sample in tiles:
+        assert sample.image.dtype == np.float32
+        assert sample.image.shape == sample.valid.shape == (48, 48)
+        assert (sample.image[~sample.valid] == 0).all()
+        assert len(sample.boxes) == len(sample.masks) == len(sample.annotations)
+        for mask, box in zip(sample.masks, sample.boxes, strict=True):
+            assert np.ptp(np.nonzero(mask)[1]) + 1 == box[2]
+            assert np.ptp(np.nonzero(mask)[0]) + 1 == box[3]
+        assert sample.truth is not None
+    orders = [[sample.record["id"] for sample in tiles.shuffled(seed)] for seed in (1, 1, 2)]
+    assert orders[0] == orders[1] != orders[2]
+    assert sorted(orders[0]) == sorted(orders[2]) == [record["id"] for record in tiles.records]
+    with pytest.raises(InputError, match="unknown filter 'noises'; did you mean 'noise'"):
+        Tiles(made / "train", noises="low")
+    with pytest.raises(InputError, match="no tile has"):
+        Tiles(made / "train", noise="loud")
+    with pytest.raises(InputError, match="give the folder of a split"):
+        Tiles(made)
+
+
+def test_the_loaders_leave_the_simulation_alone() -> None:
+    program = (
+        "import sys, pipeline.dataset.loaders; raise SystemExit(bool({'mitsuba', 'cv2', 'open3d', 'scipy'} & set(sys.modules)))"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
+def test_tf_data(made: Path) -> None:
+    """In a process of its own: TensorFlow and the ray tracer bring LLVM each."""
+    pytest.importorskip("tensorflow")
+    program = f"""
+import numpy as np
+from pipeline.dataset.loaders import Tiles
+tiles = Tiles({str(made / "train")!r})
+dataset = tiles.tf_dataset()
+assert dataset.cardinality() == len(tiles)
+for sample, again in zip(tiles, dataset.as_numpy_iterator(), strict=True):
+    np.testing.assert_array_equal(sample.image, again["image"][..., 0])
+    np.testing.assert_array_equal(sample.valid, again["valid"][..., 0])
+    np.testing.assert_array_equal(sample.masks, again["masks"])
+    np.testing.assert_array_equal(sample.boxes, again["boxes"])
+    assert again["image_id"] == sample.record["id"]
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT, env={**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"})
+
+
+def test_two_jobs_on_one_folder_refuse_each_other(tmp_path: Path) -> None:
+    with locked(tmp_path / "set"), pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for it"):
+        make_dataset(tiny(), tmp_path / "set")
+    with locked(tmp_path / "set"):
+        assert (tmp_path / "set" / LOCK).exists()
+
+
+def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(InputError, match="exists and is not empty"):
+        make_dataset(tiny(), tmp_path)
+    with pytest.raises(InputError, match="the config is of another"):
+        make_dataset(tiny(seed=5), made)
+    known = json.loads((made / "dataset.json").read_text())
+    with pytest.raises(InputError, match="is not a data set"):
+        verify_dataset(tmp_path)
+    source = next(iter(known["sources"].values()))
+    changed = {**known, "sources": {known["fingerprint"]: {**source, "versions": {**source["versions"], "numpy": "0.1"}}}}
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    (copy / "dataset.json").write_text(json.dumps(changed))
+    with pytest.raises(InputError, match=r"begun with numpy 0.1 \(here"):
+        make_dataset(tiny(), copy)
+
+
+def test_a_finished_set_is_a_config(made: Path) -> None:
+    assert load_dataset_config(made / "dataset.json") == tiny()
+    assert load_dataset_config(made / "dataset.json", ["parts.0.train=5"], 9) == tiny(
+        seed=9, parts=[{**TINY["parts"][0], "train": 5}]
+    )
+
+
+@pytest.mark.parametrize("name", ["rockfall_9", "small"])
+def test_bundled_sets(name: str) -> None:
+    config = load_dataset_config(bundled_config("datasets", name))
+    plan = planned_epochs(config)
+    assert len({epoch.name for epoch in plan}) == len(plan)
+    assert [epoch.index for epoch in plan] == list(range(len(plan)))
+    stages = [epoch.stage for epoch in plan]
+    assert sum(a != b for a, b in pairwise(stages)) + 1 == len(set(stages)), "each stage is set up once"
+
+
+def test_the_thesis_matrix() -> None:
+    config = load_dataset_config(bundled_config("datasets", "rockfall_9"))
+    plan = planned_epochs(config)
+    sets = {(epoch.noise, epoch.size) for epoch in plan if epoch.split == "train"}
+    assert len(sets) == 9
+    assert {epoch.sensor for epoch in plan} == {"stereo", "tls"}
+    epochs = [epoch for epoch in plan if (epoch.sensor, epoch.noise, epoch.size) == ("stereo", "low", "small")]
+    tiles = {"train": 4 * 4, "val": 3 * 4}  # of 7 x 4.4 on 3500 x 2250 px
+    counts = {split: sum(tiles[split] for epoch in epochs if epoch.split == split) for split in tiles}
+    assert 1600 <= sum(counts.values()) <= 1800
+    assert counts["val"] / sum(counts.values()) == pytest.approx(0.2, abs=0.005)
+    walls = [epoch.wall for epoch in epochs]
+    assert walls.count("glendale") == walls.count("bulga")
+    assert len({epoch.wall for epoch in plan if epoch.split == "test"}) == 4
+    high, medium, low = (config.noise[level].stereo for level in ("high", "medium", "low"))
+    assert high is not None
+    assert medium is not None
+    assert low is not None
+    ratio = medium.on("bulga").noise.parallax_sigma_px / high.on("bulga").noise.parallax_sigma_px  # type: ignore[union-attr]
+    assert ratio == pytest.approx(0.66, abs=1e-3)
+
+
+def test_noise_is_scaled_and_its_grid_is_not() -> None:
+    config = load_dataset_config(bundled_config("datasets", "rockfall_9"))
+    level = config.noise["5cm"].stereo
+    assert level is not None
+    scaled, plain = level.on("bismantova").noise.model_dump(), level.model.noise.model_dump()
+    factor = level.scale["bismantova"]  # type: ignore[index]
+    assert scaled["parallax_sigma_px"] == pytest.approx(factor * plain["parallax_sigma_px"])
+    assert scaled["orientation"]["cx_px"]["sigma"] == pytest.approx(factor * plain["orientation"]["cx_px"]["sigma"])
+    assert scaled["regularization_step_px"] == plain["regularization_step_px"]
+    epoch = next(each for each in planned_epochs(config) if (each.noise, each.wall) == ("5cm", "bismantova"))
+    assert simulation_of(config, epoch).stereo_model() == level.on("bismantova")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"noise": {}}, "'noise'"),
+        ({"parts": [{"walls": ["ledg"], "noise": ["low"], "sizes": ["large"], "train": 1}]}, "did you mean 'ledge'"),
+        ({"parts": [{"walls": ["ledge"], "noise": ["low"], "sizes": ["large"]}]}, "has no epochs"),
+        ({"parts": [TINY["parts"][0], TINY["parts"][0]]}, "a second time"),
+        ({"noise": {"low": {"stereo": TINY["noise"]["low"]["stereo"]}}}, "needs noise.low.tls"),
+        ({"noise": {"low": {**TINY["noise"]["low"], "tls": {"model": {"sensor": "tls"}, "scale": {"x": 1}}}}}, "no factor"),
+        ({"walls": {"a_b": TINY["walls"]["ledge"]}}, "a_b"),
+        ({"tilez": {}}, "did you mean 'tiles'"),
+    ],
+)
+def test_mistakes_in_the_config(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        tiny(**changes)
+
+
+def test_blocks_too_many_for_the_wall_name_the_epoch(tmp_path: Path) -> None:
+    sizes = {"large": {"blocks_per_m2": 90, "rockfall": {"maximum_attempts": 16}}}
+    with pytest.raises(InputError, match="ledge_tls_low_large_train0001: rockfall: no room for a block"):
+        make_dataset(tiny(sizes=sizes, sensors=["tls"]), tmp_path / "set")
+
+
+# Interruptions: the job is a process of its own, as the command starts it.
+
+PROGRAM = """
+import json, sys
+from pipeline.dataset.config import DatasetConfig
+from pipeline.dataset.run import Workers, make_dataset
+if __name__ == "__main__":
+    config = DatasetConfig.model_validate(json.loads(sys.argv[1]))
+    command = "scarpsim dataset tiny.yaml --out DIR"
+    print(len(make_dataset(config, __import__("pathlib").Path(sys.argv[2]), Workers(int(sys.argv[3])), command=command).made))
+"""
+
+
+def job(folder: Path, out: Path, workers: int = 0) -> subprocess.Popen[str]:
+    program = folder / "job.py"
+    program.write_text(PROGRAM)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        [sys.executable, str(program), json.dumps(TINY), str(out), str(workers)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 300.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, "the job ended before the condition was met"
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(made: Path, tmp_path: Path) -> None:
+    """kill -9 in the middle of writing an epoch's tiles, before its shard; then between two epochs."""
+    out = tmp_path / "set"
+    for moment in (
+        lambda: any((out / ".staging").glob("*/*/*.tif")),
+        lambda: len(list((out / "shards").glob("*.json"))) >= 3,
+    ):
+        process = job(tmp_path, out)
+        wait_for(moment, process)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert not (out / "train/annotations.json").exists()
+    process = job(tmp_path, out)
+    assert 0 < int(process.communicate(timeout=300)[0]) < EPOCHS
+    assert digests(out) == digests(made)
+    assert not list(out.rglob(".*.part*"))
+    assert not (out / ".staging").exists()
+
+
+def test_a_killed_worker_costs_nothing(made: Path, tmp_path: Path) -> None:
+    """Dask starts another one and gives it the epoch; which worker makes an epoch, and in what order, leaves no trace."""
+    pytest.importorskip("distributed")
+    import psutil
+
+    out = tmp_path / "set"
+    process = job(tmp_path, out, workers=2)
+    wait_for(lambda: any((out / "shards").glob("*.json")), process)
+    workers = [
+        child for child in psutil.Process(process.pid).children(recursive=True) if "spawn_main" in " ".join(child.cmdline())
+    ]
+    workers[0].kill()
+    assert int(process.communicate(timeout=300)[0]) == EPOCHS
+    assert process.returncode == 0
+    assert digests(out) == digests(made)
+
+
+def test_a_full_disk_stops_the_job_and_the_next_goes_on(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.dataset import worker
+
+    out, writes = tmp_path / "set", iter(range(1000))
+    write = worker.write_geotiff
+
+    def full(path: Path, *arguments: Any, **options: Any) -> None:
+        if next(writes) == 9:
+            raise InputError("the disk is full, 0 MB are free", where=str(path), remedy="make room")
+        write(path, *arguments, **options)
+
+    monkeypatch.setattr(worker, "write_geotiff", full)
+    with pytest.raises(InputError, match="the disk is full"):
+        make_dataset(tiny(), out, command="scarpsim dataset tiny.yaml --out DIR")
+    monkeypatch.undo()
+    make_dataset(tiny(), out, command="scarpsim dataset tiny.yaml --out DIR")
+    assert digests(out) == digests(made)
+
+
+def test_an_interrupted_set_is_usable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.dataset import run
+
+    out = tmp_path / "set"
+    fill = run.fill
+
+    def interrupted(order: Any) -> dict[str, Any]:
+        if order.index == 1:
+            raise KeyboardInterrupt
+        return fill(order)
+
+    monkeypatch.setattr(run, "fill", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make_dataset(tiny(sensors=["tls"]), out)
+    assert len(COCO(out / "train/annotations.json").imgs) > 0
+    assert "Incomplete" in (out / "README.md").read_text()
+    with pytest.raises(InputError, match="is not finished"):
+        merge_datasets([out, out], tmp_path / "merged")
