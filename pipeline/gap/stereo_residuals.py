@@ -258,7 +258,7 @@ def predicted_variance(model: StereoModel) -> float:
     total = noise.parallax_sigma_px**2 + _REGULARIZATION_SHARE * noise.regularization_sigma_px**2
     for effect in model.effects:
         values: Any = effect
-        if effect.name == "parallax_noise":
+        if effect.name in ("parallax_noise", "heavy_tailed_noise"):
             total += values.sigma_px**2
         elif effect.name == "regularization_noise":
             total += _REGULARIZATION_SHARE * values.sigma_px**2

@@ -11,7 +11,7 @@ from pipeline.planning.surface import BoolArray, Places, slide, turned
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.camera import Camera, CameraPair
-from sensors.effects import ParallaxNoise, RegularizationNoise
+from sensors.effects import HeavyTailedNoise, ParallaxNoise, RegularizationNoise
 from sensors.effects.base import Effect, Stage, apply_stage
 from sensors.model import OrientationNoise, Spread
 from sensors.rectify import Rectification, rectify
@@ -20,7 +20,7 @@ from sensors.stereo import REDUCTION, StereoPair
 _BILINEAR = 4 / 9
 """Share of the nodes' variance that bilinear interpolation between them keeps, on average."""
 
-COUNTED = {"parallax_noise", "regularization_noise"}
+COUNTED = {"parallax_noise", "regularization_noise", "heavy_tailed_noise"}
 """The effects that a plan takes into account, besides the noise of the orientation."""
 
 
@@ -61,8 +61,11 @@ class DisparityNoise:
     def of(cls, effects: tuple[Effect, ...]) -> DisparityNoise:
         """The sources in quadrature; the coarsest step of several."""
         white = [effect.sigma_px for effect in effects if isinstance(effect, ParallaxNoise)]
-        smooth = [effect for effect in effects if isinstance(effect, RegularizationNoise) and not effect.is_null]
-        variance = _BILINEAR * sum(effect.sigma_px**2 for effect in smooth)
+        smooth = [
+            effect for effect in effects if isinstance(effect, RegularizationNoise | HeavyTailedNoise) and not effect.is_null
+        ]
+        shares = (_BILINEAR if isinstance(effect, RegularizationNoise) else 1.0 for effect in smooth)
+        variance = sum(share * effect.sigma_px**2 for share, effect in zip(shares, smooth, strict=True))
         step = max((effect.step_px for effect in smooth), default=np.inf)
         return cls(float(np.sqrt(sum(sigma**2 for sigma in white))), float(np.sqrt(variance)), step)
 
