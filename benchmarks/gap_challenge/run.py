@@ -48,7 +48,7 @@ def run(
         with ProcessPoolExecutor(jobs, mp_context=_CONTEXT) as pool:
             list(pool.map(_make, [(case, _folder(out, case), _truth(out, case)) for case in missing]))
     _diagnose_all(open_cases, out, jobs, limit_s, keep)
-    found = score([_pair(out, case) for case in cases])
+    found = {"settings": {"cases": count, "seed": seed, "small": small}, **score([_pair(out, case) for case in cases])}
     (out / "results.json").write_text(json.dumps(found, indent=1))
     (out / "table.md").write_text(markdown(found))
     return found
@@ -183,11 +183,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--small", action="store_true", help="small cases, as in the test")
     parser.add_argument("--keep", action="store_true", help="keep the measurements and everything the command wrote")
-    parser.add_argument("--table", type=Path, help="write the table there too (docs/gap_challenge.md)")
+    parser.add_argument("--table", type=Path, help="write the table there too (docs/gap_challenge.md), and its figures beside it")
     arguments = parser.parse_args()
     found = run(arguments.cases, arguments.seed, arguments.jobs, arguments.out, small=arguments.small, keep=arguments.keep)
     if arguments.table:
         arguments.table.write_text(markdown(found))
+        figures = {key: value for key, value in found.items() if key != "rows"}
+        arguments.table.with_suffix(".json").write_text(json.dumps(figures, indent=1) + "\n")
     print(markdown(found))
 
 

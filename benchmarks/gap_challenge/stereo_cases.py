@@ -16,6 +16,7 @@ from benchmarks.gap_challenge.stereo_cameras import INTERIOR, Frame, Pair, Recti
 from benchmarks.gap_challenge.stereo_effects import Image, Parameters
 from benchmarks.gap_challenge.strength import (
     Strength,
+    Target,
     Whitener,
     mean_strength,
     scaled,
@@ -245,24 +246,23 @@ def _drawn(
     chosen: Array,
     random: Random,
 ) -> Drawn:
-    """Effects with magnitudes such that each alone has the signal-to-noise ratio that is drawn for it; strengths are beside
-    the others."""
+    """Effects with magnitudes such that each alone is as strong as is drawn for it; strengths are those beside the others."""
     white = np.full(len(part.u), scene.noise[0] ** 2 + 4 / 9 * scene.noise[1] ** 2)
     found: list[tuple[str, Parameters, Strength | None]] = []
     for kind in kinds:
-        target = float(np.exp(random.uniform(np.log(2.0), np.log(120.0))))
+        target = Target.draw(random)
         if kind in _LINEAR:
             start, most = _LINEAR[kind]
             unit = effects.shape(kind, part, random)
-            alone = mean_strength(kind, _shown(scene, kind, unit, part), base, {}, _whitener(scene, white, part, where))
-            found.append((kind, effects.times(unit, min(target / alone.snr, most / start)), None))
+            alone = mean_strength(kind, _shown(scene, kind, unit, part), base, families, _whitener(scene, white, part, where))
+            found.append((kind, effects.times(unit, min(target.value / max(target.of(alone), 1e-9), most / start)), None))
         elif kind == "regularization_noise":
-            found.append((kind, *_regularization(scene, part, effects.shape(kind, part, random), target)))
+            found.append((kind, *_regularization(scene, part, effects.shape(kind, part, random), target.value)))
         elif kind in _SPREADING:
             start, most = _SPREADING[kind]
             unit = effects.shape(kind, part, random)
             added = effects.variance(kind, unit, part)
-            factor = scaled(lambda f: spread_distance(white + f**2 * added, white), target, most / start)  # noqa: B023
+            factor = scaled(lambda f: spread_distance(white + f**2 * added, white), target.value, most / start)  # noqa: B023
             found.append((kind, effects.times(unit, factor), None))
         else:
             found.append((kind, *_raster(kind, scene, plain, chosen, white[0], random)))

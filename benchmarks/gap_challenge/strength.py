@@ -3,7 +3,7 @@
 For an effect on the mean the distance is that of Mahalanobis: white noise within cells, and between cells also the reference's
 error, correlated over metres. For an effect on the spread or on losses it is the square root of twice the Kullback-Leibler
 divergence per measurement, summed, which is the same thing for small effects. The distance to "nothing" is the signal-to-noise
-ratio; to the nearest other effect at its best parameters it is signal-to-noise x sin(angle between the signatures).
+ratio; to an effect of another class at its best parameters it is signal-to-noise x sin(angle between the signatures).
 """
 
 from __future__ import annotations
@@ -21,19 +21,36 @@ Families = Mapping[str, Sequence[Array]]
 _CELLS = 450
 _MOST_POINTS = 9000
 _LARGEST = 1e4
+_ALIKE = 0.1
+_TARGETS = (2.0, 120.0)
 
 
 @dataclass(frozen=True)
 class Strength:
-    """snr; nearest: the other effect that comes nearest; distance: to it, snr x sin(angle)."""
+    """snr; nearest: the effect of another class that comes nearest; distance: to it, snr x sin(angle); alike: effects whose
+    signature is the same but for less than a tenth (sin < 0.1), which make one class with this one whatever its strength."""
 
     snr: float
     nearest: str
     distance: float
+    alike: tuple[str, ...] = ()
+
+    @classmethod
+    def among(cls, snr: float, others: Mapping[str, float]) -> Strength:
+        """others: distance to each other effect."""
+        alike = tuple(sorted(name for name, distance in others.items() if distance < _ALIKE * snr))
+        apart = {name: distance for name, distance in others.items() if name not in alike}
+        nearest = min(apart, key=lambda name: apart[name], default="")
+        return cls(snr, nearest, apart.get(nearest, snr), alike)
 
     def to_dict(self) -> dict[str, Any]:
         """For the truth's file."""
-        return {"snr": min(self.snr, _LARGEST), "nearest": self.nearest, "snr_sin_angle": min(self.distance, _LARGEST)}
+        return {
+            "snr": min(self.snr, _LARGEST),
+            "nearest": self.nearest,
+            "snr_sin_angle": min(self.distance, _LARGEST),
+            "alike": self.alike,
+        }
 
 
 class Whitener:
@@ -85,8 +102,7 @@ def mean_strength(name: str, signature: Array, base: Array, families: Families, 
     clean = _without(fixed, whiten(signature))[:, 0]
     snr = float(np.linalg.norm(clean))
     others = {other: _nearest(clean, fixed, variants, whiten) for other, variants in families.items() if other != name}
-    nearest = min(others, key=lambda other: others[other], default="")
-    return Strength(snr, nearest, others.get(nearest, snr))
+    return Strength.among(snr, others)
 
 
 def _without(fixed: Array, columns: Array) -> Array:
@@ -123,14 +139,30 @@ def spread_strength(name: str, added: Array, variance: Array, forms: Mapping[str
         if other != name
     }
     snr = spread_distance(true, variance)
-    nearest = min(others, key=lambda other: others[other], default="")
-    return Strength(snr, nearest, others.get(nearest, snr))
+    return Strength.among(snr, others)
 
 
 def loss_distance(true: Array, assumed: Array) -> float:
     """Between chances of a loss (n,)."""
     p, q = np.clip(true, 1e-6, 1 - 1e-6), np.clip(assumed, 1e-6, 1 - 1e-6)
     return float(np.sqrt(max(2 * np.sum(p * np.log(p / q) + (1 - p) * np.log((1 - p) / (1 - q))), 0.0)))
+
+
+@dataclass(frozen=True)
+class Target:
+    """How strong an effect is to be: its signal-to-noise ratio, or what of that is its own beside the nearest other effect."""
+
+    value: float
+    own: bool
+
+    @classmethod
+    def draw(cls, random: np.random.Generator) -> Target:
+        """From below what can be detected to far above it."""
+        return cls(float(np.exp(random.uniform(*np.log(_TARGETS)))), bool(random.uniform() < 0.5))
+
+    def of(self, strength: Strength) -> float:
+        """The figure that is to reach the value."""
+        return strength.distance if self.own else strength.snr
 
 
 def scaled(snr_of: Callable[[float], float], target: float, most: float) -> float:

@@ -25,8 +25,9 @@ def markdown(found: Json) -> str:
         f"{len(found['rows'])} measurements with hidden truth, made by `benchmarks/gap_challenge`, which shares no code with the "
         "sensors or the diagnosis, each diagnosed by `scarpsim gap`. S/N: of the effect's signature after the pose fit, against "
         "noise and the reference's correlated error; x sin(angle): what is left of it when the nearest "
-        "other effect is fitted too.",
+        "effect of another class is fitted too (signatures with sin < 0.1 make one class).",
         _figures(found["figures"]),
+        _command(found["settings"]),
         f"A case took {found['seconds'].get('median', 0):.0f} s (median), {found['seconds'].get('longest', 0):.0f} s at most.",
         "## Beside two baselines\n\nBoth take residuals for independent and give one name: the effect with the largest |z| above "
         "3, and the best by BIC if by more than 10.\n\n" + _baselines(found),
@@ -36,6 +37,11 @@ def markdown(found: Json) -> str:
         "## All failures\n\n" + _failures(found["failures"]),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _command(settings: Json) -> str:
+    words = f"python benchmarks/gap_challenge/run.py --cases {settings['cases']} --seed {settings['seed']}"
+    return f"From `{words}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table docs/gap_challenge.md`."
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:

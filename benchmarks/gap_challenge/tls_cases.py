@@ -15,6 +15,7 @@ from benchmarks.gap_challenge.casting import Array, Surface
 from benchmarks.gap_challenge.files import write_mesh, write_points, write_yaml
 from benchmarks.gap_challenge.strength import (
     Strength,
+    Target,
     Whitener,
     loss_distance,
     mean_strength,
@@ -222,28 +223,27 @@ def _sigma(scene: Set, rays: Rays) -> Array:
 def _drawn(
     scene: Set, kinds: list[str], rays: Rays, usable: Array, pose: Array, at: Array, random: Random
 ) -> list[tuple[str, Parameters, Strength]]:
-    """Effects with magnitudes such that each alone has the signal-to-noise ratio that is drawn for it; strengths are beside
-    the others."""
+    """Effects with magnitudes such that each alone is as strong as is drawn for it; strengths are those beside the others."""
     part, sigma = rays.part(usable), _sigma(scene, rays.part(usable))
     families, forms = effects.families(part, scene.fields), effects.forms(part, scene.fields)
     found: list[tuple[str, Parameters, Strength | None]] = []
     for kind in kinds:
-        target = float(np.exp(random.uniform(np.log(2.0), np.log(120.0))))
+        target = Target.draw(random)
         if kind in _LINEAR:
             start, most = _LINEAR[kind]
             unit = effects.shape(kind, part, random)
             alone = mean_strength(
-                kind, effects.signature(kind, unit, part), pose[usable], {}, _whitener(scene, sigma, at[usable])
+                kind, effects.signature(kind, unit, part), pose[usable], families, _whitener(scene, sigma, at[usable])
             )
-            found.append((kind, effects.times(unit, min(target / alone.snr, most / start)), None))
+            found.append((kind, effects.times(unit, min(target.value / max(target.of(alone), 1e-9), most / start)), None))
         elif kind in _SPREADING:
             start, most = _SPREADING[kind]
             unit = effects.shape(kind, part, random)
             added = effects.variance(kind, unit, part)
-            factor = scaled(lambda f: spread_distance(sigma**2 + f**2 * added, sigma**2), target, most / start)  # noqa: B023
+            factor = scaled(lambda f: spread_distance(sigma**2 + f**2 * added, sigma**2), target.value, most / start)  # noqa: B023
             found.append((kind, effects.times(unit, factor), None))
         else:
-            found.append((kind, *_special(kind, scene, part, sigma, target, random)))
+            found.append((kind, *_special(kind, scene, part, sigma, random)))
     added = {kind: effects.variance(kind, p, part) for kind, p, _ in found}
     shown = {kind: effects.signature(kind, p, part)[:, None] for kind, p, _ in found if kind in _LINEAR}
     whole = sum(added.values(), sigma**2)
@@ -267,7 +267,7 @@ def _whitener(scene: Set, sigma: Array, at: Array) -> Whitener:
     return Whitener(sigma, at, features)
 
 
-def _special(kind: str, scene: Set, rays: Rays, sigma: Array, target: float, random: Random) -> tuple[Parameters, Strength]:
+def _special(kind: str, scene: Set, rays: Rays, sigma: Array, random: Random) -> tuple[Parameters, Strength]:
     """Steps of the range, footprints and losses, which are neither a mean nor a spread."""
     base = np.full(len(rays.R), _LOST)
     if kind == "range_quantization":

@@ -40,18 +40,18 @@ class Rays:
 
 
 MEAN: dict[str, tuple[float, float]] = {
-    "range_offset": (1e-3, 0.03),
-    "range_scale": (10.0, 600.0),
+    "range_offset": (1e-3, 0.02),
+    "range_scale": (10.0, 300.0),
     "range_cyclic": (1e-3, 0.02),
     "range_intensity_bias": (1e-3, 0.03),
     "range_incidence_bias": (1e-3, 0.03),
-    "vertical_index": (10 * SECOND, 600 * SECOND),
-    "collimation": (10 * SECOND, 600 * SECOND),
-    "trunnion_tilt": (10 * SECOND, 600 * SECOND),
-    "horizontal_eccentricity": (10 * SECOND, 600 * SECOND),
-    "vertical_eccentricity": (10 * SECOND, 600 * SECOND),
-    "wobble": (5 * SECOND, 200 * SECOND),
-    "tilt_drift": (10 * SECOND, 600 * SECOND),
+    "vertical_index": (10 * SECOND, 150 * SECOND),
+    "collimation": (10 * SECOND, 150 * SECOND),
+    "trunnion_tilt": (10 * SECOND, 150 * SECOND),
+    "horizontal_eccentricity": (10 * SECOND, 150 * SECOND),
+    "vertical_eccentricity": (10 * SECOND, 150 * SECOND),
+    "wobble": (5 * SECOND, 60 * SECOND),
+    "tilt_drift": (10 * SECOND, 150 * SECOND),
 }
 """Effects on the mean: an amplitude to start from, and the largest that is drawn."""
 SPREAD: dict[str, tuple[float, float]] = {
@@ -59,7 +59,7 @@ SPREAD: dict[str, tuple[float, float]] = {
     "range_noise_proportional": (20.0, 600.0),
     "range_noise_incidence": (1e-3, 0.02),
     "range_noise_intensity": (1e-3, 0.02),
-    "angle_noise": (10 * SECOND, 300 * SECOND),
+    "angle_noise": (10 * SECOND, 100 * SECOND),
 }
 OTHER = ("range_quantization", "beam_divergence", "detection_limit", "precipitation")
 NEEDS = {
