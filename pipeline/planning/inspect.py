@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.config import SensorName, SimulationConfig
 from pipeline.formats.atomic import empty_folder, write_json
 from pipeline.formats.geotiff import write_geotiff
-from pipeline.planning.maps import Plan, plan
+from pipeline.planning.maps import Plan, plans
 from pipeline.provenance import versions
 from pipeline.report.plan import write_plan_report
 from pipeline.site import prepare_site
@@ -20,27 +20,28 @@ PLAN_FILE = "plan.json"
 
 def inspect(config: SimulationConfig, sensors: Sequence[SensorName]) -> list[Plan]:
     """What each sensor promises on the config's wall; nothing is simulated."""
-    return [plan(config, prepare_site(config, sensor, KeyedRandom(config.seed))) for sensor in sensors]
+    return [each for sensor in sensors for each in plans(config, prepare_site(config, sensor, KeyedRandom(config.seed)))]
 
 
-def write_plans(out: Path, config: SimulationConfig, plans: Sequence[Plan]) -> Path:
-    """Write maps (<sensor>_<map>.tif, SI, wall frame), plan.json and report.html; returns the report's path.
+def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> Path:
+    """Write maps, plan.json and report.html; returns the report's path.
 
+    Maps are called <sensor>_<map>.tif, of one of several stations <sensor>_station_<n>_<map>.tif; SI, wall frame.
     Raises InputError where the folder is in use.
     """
     empty_folder(out)
-    for each in plans:
-        for found in each.maps:
-            path = out / f"{each.sensor}_{found.name}.tif"
-            write_geotiff(path, each.raster.image(found.values), each.raster.grid, description=found.title)
+    for each in found:
+        for plotted in each.maps:
+            path = out / f"{each.prefix}_{plotted.name}.tif"
+            write_geotiff(path, each.raster.image(plotted.values), each.raster.grid, description=plotted.title)
     record: dict[str, Any] = {
         "schema": 1,
         "seed": config.seed,
-        "plans": [each.to_dict() for each in plans],
+        "plans": [each.to_dict() for each in found],
         "config": config.model_dump(mode="json"),
         "versions": versions(),
     }
     write_json(out / PLAN_FILE, record)
     report = out / "report.html"
-    write_plan_report(report, plans, config.model_dump(mode="json"))
+    write_plan_report(report, found, config.model_dump(mode="json"))
     return report

@@ -1,4 +1,4 @@
-"""The maps and figures of a planned set-up: one sensor in front of one wall, before anything is simulated."""
+"""The maps and figures of a planned set-up: sensors in front of one wall, before anything is simulated."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from sensors.tls import LaserScanner
 _MIDDLE_SHARE = 0.1
 """The middle of the wall are the places within this share of its smaller side from the middle of its extent."""
 _CURVE_POINTS = 80
+_FACES = {1: "", 2: "mean of two faces"}
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,13 @@ class Curve:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sensor promises on a wall. figures: single numbers, SI, by name; curves: detection probability; ignored: effects of
+    """What a sensor promises on a wall. instrument: what it is called; station: its number where a scanner has several, None for
+    the only one and for all together; figures: single numbers, SI, by name; curves: detection probability; ignored: effects of
     the model that a plan does not count."""
 
     sensor: str
+    instrument: str
+    station: int | None
     wall: str
     raster: WallRaster
     maps: list[PlanMap]
@@ -74,6 +78,11 @@ class Plan:
     curves: list[Curve]
     ignored: list[str]
     config: PlanningConfig
+
+    @property
+    def prefix(self) -> str:
+        """What the names of its files begin with."""
+        return self.sensor if self.station is None else f"{self.sensor}_station_{self.station}"
 
     def middle(self) -> BoolArray:
         """(n,) the places in the middle of the wall."""
@@ -86,6 +95,8 @@ class Plan:
         middle = self.middle()
         return {
             "sensor": self.sensor,
+            "instrument": self.instrument,
+            "station": self.station,
             "wall": self.wall,
             "figures": self.figures,
             "maps": {each.name: each.summary(middle) for each in self.maps},
@@ -103,15 +114,24 @@ class Plan:
         }
 
 
-def plan(config: SimulationConfig, site: Site) -> Plan:
-    """Map what the sensor of `site` promises; raises InputError where it sees nothing of the wall."""
-    caster = RayCaster(site.mesh)
+def plans(config: SimulationConfig, site: Site) -> list[Plan]:
+    """Map what the sensor of `site` promises; of several stations, what they promise together and then one by one.
+
+    The rock is as wet as the config says. Raises InputError where the sensor, or one of its stations, sees nothing of the wall.
+    """
+    caster = RayCaster(site.mesh if config.wetness is None else config.wetness.wetted(site.mesh))
     raster = wall_raster(caster, config.planning.gsd_m)
     if isinstance(site.sensor, StereoPair):
-        return _stereo_plan(site.name, site.sensor, caster, raster, config.planning)
-    if isinstance(site.sensor, LaserScanner):
-        return _tls_plan(site.name, site.sensor, caster, raster, config.planning)
-    raise TypeError(f"no plan for a {type(site.sensor).__name__}")
+        return [_stereo_plan(site.name, site.sensor, caster, raster, config.planning)]
+    if not isinstance(site.sensor, LaserScanner):
+        raise TypeError(f"no plan for a {type(site.sensor).__name__}")
+    if not site.further_stations:
+        return [_tls_plan(site.name, site.sensor, None, caster, raster, config.planning)]
+    single = [
+        _tls_plan(site.name, scanner, number, caster, raster, config.planning)
+        for number, scanner in enumerate((site.sensor, *site.further_stations), start=1)
+    ]
+    return [_together(single), *single]
 
 
 def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRaster, config: PlanningConfig) -> Plan:
@@ -157,15 +177,19 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
 
     curves = _curves(sampling_of, views, config, ("depth map's cell, px of the frame", float(REDUCTION[pair.quality])))
     ignored = _ignored(effect.name for effect in pair.model.effects if effect.name not in stereo.COUNTED)
-    return Plan("stereo", wall, raster, maps, figures, curves, ignored, config)
+    return Plan("stereo", "Stereo pair", None, wall, raster, maps, figures, curves, ignored, config)
 
 
-def _tls_plan(wall: str, scanner: LaserScanner, caster: RayCaster, raster: WallRaster, config: PlanningConfig) -> Plan:
+def _tls_plan(
+    wall: str, scanner: LaserScanner, station: int | None, caster: RayCaster, raster: WallRaster, config: PlanningConfig
+) -> Plan:
     places = raster.places
     found = tls.tls_geometry(scanner, places)
     in_sight = seen_from(caster, places, scanner.position)
     seen = in_sight & found.reached
-    _require_seen(seen, "no part of the wall is seen by the scanner", "station")
+    _require_seen(
+        seen, "no part of the wall is seen by the scanner", "station" if station is None else f"station, number {station}"
+    )
     sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
     maps = [
         PlanMap("views", "Scanners that see the wall", seen.astype(float), "scanners"),
@@ -186,12 +210,13 @@ def _tls_plan(wall: str, scanner: LaserScanner, caster: RayCaster, raster: WallR
         _map("power", "Received power over that of albedo 1 at 100 m", found.power, seen),
         *_detection_maps(found.sampling, seen, config),
     ]
+    pulses = scanner.pattern.lines * scanner.pattern.pulses * scanner.config.faces
     figures = {
         "seen": float(seen.mean()),
         "hidden": float((~in_sight).mean()),
         "beyond_window_or_reach": float((in_sight & ~seen).mean()),
-        "pulses": float(scanner.pattern.lines * scanner.pattern.pulses),
-        "seconds_to_scan": scanner.pattern.lines * scanner.pattern.pulses / scanner.config.pulse_rate_hz,
+        "pulses": float(pulses),
+        "seconds_to_scan": pulses / scanner.config.pulse_rate_hz,
     }
 
     def sampling_of(virtual: Places) -> tuple[Sampling, BoolArray]:
@@ -202,7 +227,33 @@ def _tls_plan(wall: str, scanner: LaserScanner, caster: RayCaster, raster: WallR
     views = _middle_views(raster, seen, scanner.position, scanner.rotation[:, 2])
     curves = _curves(sampling_of, views, config, ("angular step, mrad", step * 1e3))
     ignored = _ignored(effect.name for effect in scanner.model.effects if effect.name not in tls.COUNTED)
-    return Plan("tls", wall, raster, maps, figures, curves, ignored, config)
+    words = "Laser scanner", scanner.config.name, station and f"station {station}", _FACES[scanner.config.faces]
+    instrument = ", ".join(str(word) for word in words if word)
+    return Plan("tls", instrument, station, wall, raster, maps, figures, curves, ignored, config)
+
+
+def _together(single: list[Plan]) -> Plan:
+    """Several stations as one plan: at each place the figures of the station with the best precision along the normal there.
+
+    That is the one whose surface the merged surface takes (`pipeline.stations`).
+    """
+    first = single[0]
+    seen = np.sum([_values(plan, "views") for plan in single], axis=0)
+    precision = np.nan_to_num(np.stack([_values(plan, "normal_sigma_m") for plan in single]), nan=np.inf)
+    best = np.argmin(precision, axis=0)
+    maps = [replace(each, values=np.choose(best, [_values(plan, each.name) for plan in single])) for each in first.maps]
+    maps[0] = replace(first.maps[0], values=seen)
+    figures = {
+        "seen": float((seen > 0).mean()),
+        "seen_by_several": float((seen > 1).mean()),
+        **{name: sum(plan.figures[name] for plan in single) for name in ("pulses", "seconds_to_scan")},
+    }
+    name = first.instrument.replace("station 1", f"{len(single)} stations together")
+    return replace(first, instrument=name, station=None, maps=maps, figures=figures, curves=[])
+
+
+def _values(plan: Plan, name: str) -> FloatArray:
+    return next(found.values for found in plan.maps if found.name == name)
 
 
 def _ignored(names: Any) -> list[str]:

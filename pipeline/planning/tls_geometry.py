@@ -72,7 +72,8 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
 
     With u the beam's direction, e_az and e_ze the unit vectors towards rising azimuth and zenith, and white noise of range (R)
     and angles, the covariance is  s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam that
-    leaves in another direction than recorded makes the same error along the normal as a point moved across.
+    leaves in another direction than recorded makes the same error along the normal as a point moved across. The mean of two
+    faces has half of these variances; each of its beams misses a niche's floor as often as a single one.
     """
     effects = scanner.model.chain()
     local = turned(scanner.rotation.T, places.points - scanner.position)
@@ -82,7 +83,8 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
     cosine = -np.einsum("ni,ni->n", sight, places.normals)
     echo = Echoes(range_m, cosine, _power(scanner, places.albedo, cosine, range_m))
     axes = np.stack([sight, rising_azimuth, rising_zenith], axis=1)
-    sigma = np.stack([_range_sigma(effects, echo), *_across_sigma(effects, range_m, zenith)], axis=1)
+    single = np.stack([_range_sigma(effects, echo), *_across_sigma(effects, range_m, zenith)], axis=1)
+    sigma = single / np.sqrt(scanner.config.faces)  # of the mean of two faces with noise of their own
     covariance = np.einsum("nk,nki,nkj->nij", sigma**2, axes, axes)
     normal_sigma = np.sqrt(np.einsum("ni,nij,nj->n", places.normals, covariance, places.normals))
     ray, step = sight * range_m[:, None], scanner.pattern
@@ -107,8 +109,8 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
         sampling=Sampling(
             **steps,
             white=normal_sigma,
-            blur_a=steps["step_a"] * sigma[:, 1] / (range_m * np.sin(zenith) * step.azimuth_step),
-            blur_b=steps["step_b"] * sigma[:, 2] / (range_m * step.zenith_step),
+            blur_a=steps["step_a"] * single[:, 1] / (range_m * np.sin(zenith) * step.azimuth_step),
+            blur_b=steps["step_b"] * single[:, 2] / (range_m * step.zenith_step),
         ),
     )
 

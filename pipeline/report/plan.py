@@ -14,10 +14,10 @@ from pipeline.planning.maps import Plan, PlanMap
 from pipeline.report.figures import CurvePanel, curves_figure, map_figure
 from pipeline.report.page import template
 
-_INSTRUMENTS = {"stereo": "Stereo pair", "tls": "Laser scanner"}
 _NOTHING = "\N{EN DASH}"
 _FIGURES: dict[str, tuple[str, str, float]] = {
     "seen": ("Wall seen", "%", 100.0),
+    "seen_by_several": ("Wall seen from several stations", "%", 100.0),
     "seen_by_both": ("Wall seen by both cameras", "%", 100.0),
     "seen_by_one": ("Wall seen by one camera", "%", 100.0),
     "seen_by_none": ("Wall seen by no camera", "%", 100.0),
@@ -55,13 +55,13 @@ class _Part:
     figures: list[tuple[str, str]]
     rows: list[_Row]
     ignored: str
-    curves: bytes
+    curves: bytes | None
     pictures: list[_Picture]
 
 
 def summary(plan: Plan) -> str:
     """The figures of a plan as aligned lines of text."""
-    lines = [f"{_INSTRUMENTS[plan.sensor]}, wall {plan.wall}", f"  {answer(plan)}"]
+    lines = [f"{plan.instrument}, wall {plan.wall}", f"  {answer(plan)}"]
     lines += [f"  {title:<52}{value:>12}" for title, value in _figures(plan)]
     lines.append(f"  {'map':<52}{'middle':>12}{'median':>10}{'5 %':>10}{'95 %':>10}")
     lines += [f"  {row.title:<52}" + "{:>12}{:>10}{:>10}{:>10}".format(*row.values) + f"  {row.unit}" for row in _rows(plan)]
@@ -72,7 +72,7 @@ def answer(plan: Plan) -> str:
     """The sentence that planners ask for: the smallest block that is seen."""
     share = f"{plan.config.probability:.0%}"
     middle = next(found for found in plan.maps if found.name == "smallest_block_m").summary(plan.middle())["middle"]
-    name = _INSTRUMENTS[plan.sensor]
+    name = plan.instrument
     if middle is None:
         return f"{name}: in the middle of the wall no block is seen in {share} of cases."
     return f"{name}: the smallest block seen in {share} of cases in the middle of the wall has sides of {100 * middle:.1f} cm."
@@ -91,7 +91,7 @@ def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, An
 
 def _part(plan: Plan) -> _Part:
     return _Part(
-        instrument=_INSTRUMENTS[plan.sensor],
+        instrument=plan.instrument,
         answer=answer(plan),
         figures=_figures(plan),
         rows=_rows(plan),
@@ -120,7 +120,10 @@ def _picture(plan: Plan, found: PlanMap) -> _Picture:
     return _Picture(found.title, map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, unit, found.title))
 
 
-def _curves(plan: Plan) -> bytes:
+def _curves(plan: Plan) -> bytes | None:
+    """The figure of the detection probability's curves; None for several stations together, which have no one range."""
+    if not plan.curves:
+        return None
     panels = [
         CurvePanel(
             curve.label,
