@@ -1,0 +1,390 @@
+"""The pages in docs/gap: one for each verdict of `scarpsim gap` with an example, and the table from symptoms to causes.
+
+    PYTHONPATH=tests python docs/make_gap_pages.py [symptoms] [VERDICT ...]
+
+Symptoms: a wall in Glendale's style is observed with each effect of the catalogue at its typical values and without it, as for
+the gallery; the difference is registered to the wall by a shift and a turn, as a diagnosis does, and what is left is mapped and
+sorted by the covariate that it depends on. Examples: measurements by the tests' generator (tests/gap_cases.py), diagnosed.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from make_gallery import SEED, STEREO_QUIET, TLS_QUIET, Comparison, Stage, example
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.config import SimulationConfig
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.gap.figures import gap_figure, maps_figure
+from pipeline.gap.identifiability import ALIKE, Identifiability, identifiability
+from pipeline.gap.in_words import VERDICTS, paragraph
+from pipeline.gap.measurement import Measurement, read_measurement
+from pipeline.gap.naming import residuals_of
+from pipeline.gap.planned import planned_survey
+from pipeline.gap.report import summary
+from pipeline.gap.residuals import Residuals
+from pipeline.gap.where import bins, where
+from pipeline.gap.workflow import Diagnosis, diagnose
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.procedural import ProceduralWall
+from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS, Effect
+from sensors.model import StereoModel, TlsModel
+from sensors.placement import RigConfig, StationConfig, Target
+from sensors.stereo import REDUCTION
+
+FOLDER = Path(__file__).parent / "gap"
+_BINS = 24
+_DEPENDS = 0.25
+"""Share of the variance along a covariate from which the mean counts as depending on it."""
+_SMOOTH = 0.3
+"""Share of the variance between pixels of some metres from which a map counts as smooth."""
+_LOST, _NOTHING, _AT_EDGES = 0.002, 1e-6, 3.0
+"""Share of returns lost that counts; what counts as no change; how many times larger residuals are that belong to edges."""
+_PIXEL_M = 0.7
+_SKIPPED = ("edge_step",)
+_WORDS = {
+    "range": "range", "azimuth": "azimuth", "zenith": "zenith angle", "incidence": "incidence angle", "intensity": "intensity",
+    "line": "scan line", "time": "time", "edge": "distance to depth edges", "depth": "depth", "image_x": "image column",
+    "image_y": "image row", "radius": "distance from the image centre", "disparity": "disparity",
+    "disparity_fraction": "fraction of the disparity",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """How an effect shows. kind: of _KINDS; pattern: in words; left: share that survives the pose fit."""
+
+    name: str
+    kind: str
+    pattern: str
+    left: float
+    picture: bytes
+
+
+@dataclass(frozen=True)
+class View:
+    """One sensor's cells without any effect, as residuals with pose and covariates. cells: (n,) flat cell of each row."""
+
+    residuals: Residuals
+    cells: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, stage: Stage, sensor: str) -> View:
+        """The sensor of the gallery in front of the gallery's wall."""
+        seen, target = stage.without[sensor], Target(stage.wall)
+        valid = np.flatnonzero(seen.valid.ravel())
+        points, reference, frame = seen.points.reshape(-1, 3)[valid], stage.caster.mesh, stage.frame
+        if sensor == "tls":
+            assert seen.intensity is not None
+            position, rotation = StationConfig().place(target)
+            cloud = PointCloud(points, seen.intensity.ravel()[valid], valid.astype(np.float64))
+            station = stage.frame.to_wall(position), stage.frame.rotation @ rotation
+            measurement = Measurement("tls", cloud, model=TlsModel(noise=TLS_QUIET.model_copy(update={"range_sigma_m": 0.003})),
+                                      station=station, reference=reference, frame=frame)  # fmt: skip
+        else:
+            step, columns = REDUCTION["medium"], seen.depth.shape[1]
+            pixels = {"pixel_x": (valid % columns + 0.5) * step, "pixel_y": (valid // columns + 0.5) * step}
+            model = StereoModel(noise={**STEREO_QUIET, "parallax_sigma_px": 0.3})
+            measurement = Measurement("stereo", PointCloud(points, extra=pixels), model=model,
+                                      cameras=RigConfig().place(target), reference=reference, frame=frame)  # fmt: skip
+        measurement.__dict__["scene"] = stage.caster
+        found = residuals_of(measurement)
+        return cls(found, valid[found.index])
+
+
+def symptom(view: View, effect: type[Effect], comparison: Comparison, *, on_the_mean: bool) -> Symptom:
+    """What an effect leaves after registration, and what that depends on. on_the_mean: its signature is one of the mean."""
+    name, r = f"{effect.sensor}.{effect.model_fields['name'].default}", view.residuals
+    metres = comparison.difference.ravel()[view.cells]
+    known = np.isfinite(metres) & r.smooth
+    value = np.where(np.isfinite(metres), metres, 0.0) / r.unit_m
+    kept = known & (np.abs(value) <= 8 * max(1.4826 * float(np.median(np.abs(value[known]))), 1e-9))
+    pose = np.linalg.lstsq(r.pose[kept], value[kept], rcond=None)[0]
+    left = np.where(np.isfinite(metres), value - r.pose @ pose, np.nan)
+    whole = float(np.linalg.norm(value[kept]))
+    share = float(np.linalg.norm(left[kept])) / whole if whole > 0 else 1.0
+    lost = comparison.lost.ravel()[view.cells]
+    same = float(np.mean(np.abs(left[np.isfinite(left)]) > _NOTHING)) < _LOST
+    if same and comparison.gained.sum() > _LOST * len(view.cells):
+        kind, pattern = "gained", "points stand where only one camera sees the rock"
+    else:
+        kind, pattern = _mean_pattern(r, left, kept) if on_the_mean else _other_pattern(r, left, kept, lost)
+    return Symptom(name, kind, pattern, share, _picture(r, 1e3 * left * r.unit_m, lost))
+
+
+def _mean_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_]) -> tuple[str, str]:
+    means = {name: _explained(x[kept], left[kept]) for name, x in r.covariates.items() if name not in _SKIPPED}
+    best = sorted(means, key=lambda key: -means[key])
+    if means[best[0]] > _DEPENDS:
+        with_it = [_WORDS[key] for key in best[1:3] if means[key] > 0.9 * means[best[0]]]
+        also = f" (and {', '.join(with_it)}, which vary together here)" if with_it else ""
+        return "mean", f"the mean follows the {_WORDS[best[0]]}{also}"
+    if _explained_by(_pixels(r)[kept], left[kept]) > _SMOOTH:
+        return "smooth", "the mean varies smoothly over the wall, along no single covariate"
+    return "relief", f"the mean follows the relief, facet by facet; of single covariates the {_WORDS[best[0]]} explains most"
+
+
+def _other_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_], lost: NDArray[np.bool_]) -> tuple[str, str]:
+    covariates = {name: x for name, x in r.covariates.items() if name not in _SKIPPED}
+    size, edges = np.abs(left), np.isfinite(left) & ~r.smooth
+    if lost.mean() > _LOST and np.median(size[kept]) < _NOTHING:
+        shares = {name: _explained(x, lost.astype(float)) for name, x in covariates.items()}
+        return "lost", f"returns are missing, most of all by {_WORDS[max(shares, key=lambda key: shares[key])]}"
+    if np.mean(size[edges] > _NOTHING) > _AT_EDGES * np.mean(size[kept] > _NOTHING) or (
+        np.median(size[edges]) > _AT_EDGES * np.median(size[kept])
+    ):
+        return "edges", "large residuals at depth edges and on rough parts, few or small ones elsewhere"
+    spreads = {name: _explained(x[kept], size[kept]) for name, x in covariates.items()}
+    name = max(spreads, key=lambda key: spreads[key])
+    if spreads[name] > 0.02:
+        return "spread", f"the mean stays, the spread depends on the {_WORDS[name]}"
+    return "spread", "the mean stays, the spread is larger everywhere alike"
+
+
+def _explained(x: FloatArray, values: FloatArray) -> float:
+    """Share of the variance of the values that lies between bins of x."""
+    edges, group = bins(x, _BINS)
+    return _explained_by(group, values) if len(edges) > 2 else 0.0
+
+
+def _explained_by(group: Any, values: FloatArray) -> float:
+    _, number = np.unique(group, return_inverse=True)
+    count = np.bincount(number)
+    mean = np.bincount(number, values) / count
+    chance = (len(count) - 1) / len(values)
+    return float(np.sum(count * (mean - values.mean()) ** 2) / max(np.sum((values - values.mean()) ** 2), 1e-300)) - chance
+
+
+def _pixels(r: Residuals) -> NDArray[np.int64]:
+    column, row = (np.floor((r.at[:, axis] - r.at[:, axis].min()) / (4 * _PIXEL_M)).astype(np.int64) for axis in (0, 1))
+    return np.asarray(column + 10_000 * row)
+
+
+def _picture(r: Residuals, millimetres: FloatArray, lost: NDArray[np.bool_]) -> bytes:
+    low = r.at.min(axis=0)
+    column, row = (np.floor((r.at[:, axis] - low[axis]) / _PIXEL_M).astype(np.int64) for axis in (0, 1))
+    shape = int(row.max()) + 1, int(column.max()) + 1
+    known = np.isfinite(millimetres)
+    pixel, size = row * shape[1] + column, shape[0] * shape[1]
+    count = np.bincount(pixel[known], minlength=size)
+    mean = np.where(count > 0, np.bincount(pixel[known], millimetres[known], size) / np.maximum(count, 1), np.nan).reshape(shape)
+    limit = max(float(np.nanpercentile(np.abs(mean), 97)), 1e-3)
+    figure = Figure(figsize=(3.2, 2.1), dpi=75, layout="constrained")
+    panel = figure.subplots()
+    image = panel.imshow(mean, cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower", interpolation="nearest")
+    gone = np.bincount(pixel[lost], minlength=size).reshape(shape) > 0.5 * np.bincount(pixel, minlength=size).reshape(shape)
+    panel.contourf(gone, levels=[0.5, 1.5], colors=["black"]) if gone.any() else None
+    panel.set_axis_off()
+    figure.colorbar(image, ax=panel, shrink=0.8).ax.tick_params(labelsize=6)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    buffer = io.BytesIO()
+    Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(32, dither=Image.Dither.NONE).save(
+        buffer, "PNG", optimize=True
+    )
+    return buffer.getvalue()
+
+
+_KINDS = {
+    "mean": "The mean of the residual follows one covariate",
+    "smooth": "The mean varies smoothly over the wall",
+    "relief": "The mean follows the relief",
+    "spread": "The spread is not what the model says",
+    "edges": "Residuals at depth edges",
+    "lost": "Returns are missing",
+    "gained": "Points where the model has none",
+}
+
+
+def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> str:
+    """The table from the pattern in the residual map to the likely effect."""
+    lines = [
+        "# From symptom to cause",
+        "",
+        "Written by `docs/make_gap_pages.py` from the effects themselves; do not edit. Each effect of the catalogue at its"
+        " typical values, on a wall in Glendale's style seen from 105 m, without noise: recorded range or depth with the"
+        " effect minus that without it, **after a shift and a turn of the sensor are fitted**, mm; black: returns lost."
+        " Your wall and distance change the pattern: `scarpsim gap --identifiability CONFIG` computes what can be told apart"
+        " there.",
+        "",
+        f'"Looks like" lists effects whose signature has a cosine of at least {ALIKE:g} with this one on that wall.',
+    ]
+    for kind, title in _KINDS.items():
+        rows = [each for each in found if each.kind == kind]
+        if not rows:
+            continue
+        lines += [
+            "",
+            f"## {title}",
+            "",
+            "| residual map | pattern | likely effect | left by the pose fit | looks like |",
+            "|---|---|---|---|---|",
+        ]
+        for each in sorted(rows, key=lambda item: (item.name.partition(".")[0], item.pattern)):
+            cell = f"[{each.name}](../effects/{each.name}.md)"
+            alike = _alike(each.name, tables[each.name.partition(".")[0]])
+            lines.append(f"| ![{each.name}](images/{each.name}.png) | {each.pattern} | {cell} | {each.left:.0%} | {alike} |")
+    return "\n".join(lines) + "\n"
+
+
+def _alike(name: str, table: Identifiability) -> str:
+    if name not in table.names:
+        return ""
+    return ", ".join(table.names[other].partition(".")[2] for other in table.alike(table.names.index(name)))
+
+
+def make_symptoms() -> None:
+    """Write docs/gap/symptoms.md and its pictures."""
+    wall = ProceduralWall(style="glendale", resolution_m=0.1)
+    stage, config = Stage(wall.mesh(KeyedRandom(SEED))), SimulationConfig(wall=wall, seed=SEED)
+    (FOLDER / "images").mkdir(parents=True, exist_ok=True)
+    found, tables = [], {}
+    for sensor, effects in (("tls", TLS_EFFECTS), ("stereo", STEREO_EFFECTS)):
+        view = View.of(stage, sensor)
+        tables[sensor] = identifiability(planned_survey(config, "tls" if sensor == "tls" else "stereo"))
+        for effect in effects:
+            comparison = Comparison(stage.without[sensor], stage.observe(sensor, (example(effect),)))
+            name = f"{sensor}.{effect.model_fields['name'].default}"
+            found.append(symptom(view, effect, comparison, on_the_mean=name in tables[sensor].names))
+            (FOLDER / "images" / f"{found[-1].name}.png").write_bytes(found[-1].picture)
+    (FOLDER / "symptoms.md").write_text(symptoms_page(found, tables))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A verdict's page: when it is given, what to do, and a case of tests/gap_cases.py that gets it."""
+
+    when: str
+    what_to_do: str
+    case: str
+    make: Callable[[Path], None]
+
+
+def _wobble(azimuth: Any, zenith: Any, line: Any) -> Any:
+    return 0 * azimuth, 8e-5 * np.sin(2 * np.pi * line / 37 + 1)
+
+
+def _noisy(scan: Any) -> Any:
+    return scan.R + 0.004 * scan.power**-0.5 * scan.rng.standard_normal(len(scan.R))
+
+
+def _case(**values: Any) -> Callable[[Path], None]:
+    from gap_cases import write_scan
+
+    return lambda folder: write_scan(folder, **values)
+
+
+def verdicts() -> dict[str, Verdict]:
+    """By name, with their examples."""
+    return {
+        "named": Verdict(
+            "The model without the effect is rejected (p-value of the largest gain over all candidates at most 0.004), one effect"
+            " of the catalogue explains the disagreement, no free form explains clearly more, and no other effect comes near it.",
+            "Look at the effect's value against what the maker or a calibration says, and simulate on with model_after.yaml.",
+            "A mirror that wobbles by 80 microradians with a period of 37 scan lines.",
+            _case(seed=11, angles=_wobble),
+        ),
+        "several": Verdict(
+            "As `named`, for more than one effect at once: each still gains beside the others.",
+            "The effects are sorted by how much they explain. Each has its own class; a class of more than one is no name yet.",
+            "The wobble above, and noise that falls with the received power.",
+            _case(seed=12, angles=_wobble, ranges=_noisy),
+        ),
+        "ambiguous": Verdict(
+            "Something of the catalogue explains the disagreement, but others explain it as well: their score is within 3 of the"
+            " best one's (e^3 = 20 in likelihood). `cannot_be_told_from` holds the class.",
+            "Make the measurement in `split_by`, or ask `scarpsim gap --identifiability` what would part the class at this site."
+            " The model after serves surveys of the same geometry, whichever of the class is true; elsewhere it may be wrong.",
+            "An offset of all ranges by 2 mm: most of it looks like a shift of the scanner, the rest like a scale.",
+            _case(seed=13, ranges=lambda scan: scan.R + 0.002),
+        ),
+        "unknown": Verdict(
+            "The model is rejected, and a free form of a covariate explains clearly more (a score higher by 5) than any effect of"
+            " the catalogue, so the nearest name would be wrong.",
+            "Read along which covariate it goes and in what form; the empirical term in model_after.yaml lets simulations go on."
+            " Outside the covariate's range that was measured it says nothing.",
+            "Ranges that jump by 4 mm in the middle of the scan, as after a knock.",
+            _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
+        ),
+        "no_gap": Verdict(
+            "No candidate is more than chance would give. Registration is a nuisance and is reported, regions where rock moved"
+            " are set aside and listed under `scene_changes`: neither is a gap.",
+            "Nothing has to be added. How large an effect could hide: `scarpsim gap MEASUREMENT --identifiability`.",
+            "Nothing but noise, a pose slightly off, a reference wrong by fractions of a millimetre, lost returns.",
+            _case(seed=1),
+        ),
+        "insufficient_data": Verdict(
+            "Fewer than 800 points lie on smooth parts of the reference, where a residual has a meaning.",
+            "Scan more finely, or bring a reference that covers what was scanned.",
+            "A scan in steps of 0.05 rad.",
+            _case(seed=1, step_rad=0.05),
+        ),
+    }  # fmt: skip
+
+
+def verdict_page(name: str, verdict: Verdict, found: Diagnosis) -> str:
+    """The Markdown page."""
+    pictures = [f"![maps](images/verdict_{name}.png)"] if found.gap is not None else []
+    pictures += [f"![gap](images/gap_{name}.png)"] if found.gap is not None else []
+    parts = [
+        f"# {name}",
+        VERDICTS[name],
+        f"**Given when**: {verdict.when}",
+        f"**What to do**: {verdict.what_to_do}",
+        f"## Example\n\n{verdict.case} Made by the tests' generator; this page is by `docs/make_gap_pages.py`.",
+        f"> {paragraph(found, where(found))}",
+        f"```text\n{summary(found)}\n```",
+        *pictures,
+        "[From symptom to cause](symptoms.md)",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def make_verdicts(wanted: list[str]) -> None:
+    """Write docs/gap/<verdict>.md and pictures; says where an example gets another verdict than its page's."""
+    (FOLDER / "images").mkdir(parents=True, exist_ok=True)
+    for name, verdict in verdicts().items():
+        if wanted and name not in wanted:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            verdict.make(Path(folder))
+            found = diagnose(read_measurement(Path(folder)))
+        if found.verdict != name:
+            raise SystemExit(f"the example of {name} is {found.verdict}: {summary(found)}")
+        (FOLDER / f"{name}.md").write_text(verdict_page(name, verdict, found))
+        if found.gap is not None:
+            (FOLDER / "images" / f"verdict_{name}.png").write_bytes(small_png(maps_figure(found)))
+            (FOLDER / "images" / f"gap_{name}.png").write_bytes(small_png(gap_figure(found.gap)))
+
+
+def small_png(png: bytes) -> bytes:
+    """The picture at two thirds of its size, PNG of 64 colours."""
+    buffer = io.BytesIO()
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    picture = picture.resize((picture.width * 2 // 3, picture.height * 2 // 3), Image.Resampling.LANCZOS)
+    picture.quantize(64, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def main(wanted: list[str]) -> None:
+    names = [name for name in wanted if name != "symptoms"]
+    if not wanted or "symptoms" in wanted:
+        make_symptoms()
+    if not wanted or names:
+        make_verdicts(names)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
