@@ -147,12 +147,9 @@ def _figures(rows: list[Json]) -> list[Json]:
     intervals = [
         each["inside"] for row in rows for each in row["intervals"] if each["same_camera"] and each["inside"] is not None
     ]
-    closed = [
-        row["gap"]["closed"]
-        for row in (*of["one"], *of["two"])
-        if all(row["hits"]) and not row["empirical"] and row["gap"].get("closed") is not None
-    ]
-    pooled = _pooled(row["gap"] for row in (*of["one"], *of["two"]) if all(row["hits"]) and not row["empirical"])
+    right = [row for row in (*of["one"], *of["two"]) if all(row["hits"]) and not row["empirical"]]
+    closed = [row["gap"]["closed"] for row in right if row["gap"].get("closed") is not None]
+    pooled = _pooled(row["gap"] for row in right)
     control = [row["control"] for row in rows if row["control"] is not None]
     return [
         _share("false alarms on no-effect cases", of["none"], lambda row: row["verdict"] in _NAMING, "at most 1 %", (0.0, 0.01)),
@@ -175,6 +172,10 @@ def _figures(rows: list[Json]) -> list[Json]:
         ),
         _number("gap closed by the best wrong effect outside the class (median)", control, median, "at most 5 %", (0.0, 0.05)),
         _share("two effects at once, both classes right", clear_two, lambda row: all(row["hits"]), "85 %", (0.85, 1.0)),
+        _share(
+            "rightly named, but the gap is within its uncertainty", right, lambda row: row["gap"].get("closed") is None, "", None
+        ),
+        _share("cases without an answer", rows, lambda row: row["verdict"] == "error", "none", (0.0, 0.0)),
     ]
 
 
@@ -190,16 +191,17 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
         return 0.0, 1.0
     z, p = 1.96, successes / count
     middle, half = p + z * z / (2 * count), z * float(np.sqrt(p * (1 - p) / count + z * z / (4 * count * count)))
-    return (middle - half) / (1 + z * z / count), (middle + half) / (1 + z * z / count)
+    return max(middle - half, 0.0) / (1 + z * z / count), (middle + half) / (1 + z * z / count)
 
 
-def _share(what: str, of: list[Any], hit: Any, goal: str, limits: tuple[float, float]) -> Json:
+def _share(what: str, of: list[Any], hit: Any, goal: str, limits: tuple[float, float] | None) -> Json:
+    """A row of the table. Above a band with two ends a share still counts as reached where its interval meets the band."""
     count, successes = len(of), sum(bool(hit(item)) for item in of)
     value = successes / count if count else None
     low, high = wilson(successes, count)
     return {
         "what": what, "goal": goal, "value": value, "successes": successes, "count": count, "interval": [low, high],
-        "reached": None if value is None else bool(limits[0] <= value <= limits[1]),
+        "reached": None if value is None or limits is None else bool(limits[0] <= value and (value <= limits[1] or limits[0] > 0 and low <= limits[1])),
     }  # fmt: skip
 
 
