@@ -6,11 +6,19 @@ Everything that uses Mitsuba imports `mi` and `dr` from here, so that a variant 
 from __future__ import annotations
 
 import os
+import sys
+
+from scene.errors import InputError
+
+if "tensorflow" in sys.modules and "drjit" not in sys.modules:
+    raise InputError(
+        "TensorFlow is loaded already, and the names of LLVM in it would crash the ray tracer",
+        where="scarpsim",
+        remedy="import scarpsim's scene, sensors or pipeline before tensorflow, or use two processes",
+    )
 
 import drjit as dr
 import mitsuba as mi
-
-from scene.errors import InputError
 
 CUDA, LLVM = "cuda_ad_mono", "llvm_ad_mono"
 _VARIANT_VARIABLE = "SCARPSIM_VARIANT"

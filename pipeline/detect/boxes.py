@@ -45,7 +45,7 @@ def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
 
 
 def encode(boxes: Tensor, reference: Tensor) -> Tensor:
-    """(..., 4) where boxes lie as seen from reference boxes: shift of the centre by their size, logarithm of the ratio of sizes."""
+    """(..., 4) boxes as seen from reference boxes: shift of the centre by their size, logarithm of the ratio of sizes."""
     centre, size = _centre_size(boxes)
     at, scale = _centre_size(reference)
     code = ops.concatenate([(centre - at) / scale, ops.log(size / scale)], axis=-1)
@@ -67,7 +67,7 @@ def clip(boxes: Tensor, height: int, width: int) -> Tensor:
 
 
 def suppressed(boxes: Tensor, scores: Tensor, threshold: float, count: int) -> tuple[Tensor, Tensor]:
-    """Greedy non-maximum suppression: the best `count` boxes (b, count, 4) and scores (b, count), -1 where there are fewer.
+    """Greedy non-maximum suppression: the best `count` boxes (b, count, 4) and scores (b, count), -1 where fewer.
 
     boxes: (b, n, 4); scores: (b, n), 0...1, falling along n. A box stays unless a better one that stays overlaps it by more than
     `threshold`. That rule has one solution; it is reached by applying it to all boxes at once until nothing changes, which

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -177,3 +180,21 @@ def test_training_stops_where_the_mean_slope_is_flat():
     assert not has_settled(falling, config)
     assert has_settled(falling + [falling[-1]] * 10, config)
     assert not has_settled([1.0] * 10, config)  # fewer than the window
+
+
+def test_the_detector_does_without_the_ray_tracer_and_that_refuses_to_come_second():
+    """Dr.Jit would take LLVM's symbols from TensorFlow and crash; the other way round both work."""
+    modules = "pipeline.detect.run, pipeline.detect.training, pipeline.detect.score_files"
+    script = f"""
+import sys, {modules}
+assert "drjit" not in sys.modules and "tensorflow" in sys.modules
+from scene.errors import InputError
+try:
+    import scene.backend
+except InputError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2]
+    )
+    assert "two processes" in done.stdout
