@@ -201,8 +201,13 @@ def _share(what: str, of: list[Any], hit: Any, goal: str, limits: tuple[float, f
     low, high = wilson(successes, count)
     return {
         "what": what, "goal": goal, "value": value, "successes": successes, "count": count, "interval": [low, high],
-        "reached": None if value is None or limits is None else bool(limits[0] <= value and (value <= limits[1] or limits[0] > 0 and low <= limits[1])),
+        "reached": None if value is None or limits is None else _within(value, low, limits),
     }  # fmt: skip
+
+
+def _within(value: float, lower_end: float, limits: tuple[float, float]) -> bool:
+    above = value > limits[1] and not (limits[0] > 0 and lower_end <= limits[1])
+    return value >= limits[0] and not above
 
 
 def _number(what: str, values: list[float], statistic: Any, goal: str, limits: tuple[float, float] | None) -> Json:

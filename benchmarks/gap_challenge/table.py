@@ -17,11 +17,11 @@ _ANSWERS = (
     "error",
 )
 
-_ALWAYS = """Always on: a pose off by millimetres and some 10 microradians; an error of the reference of 0.2-0.8 mm (stereo 1-4 mm),
-correlated over 1.5-6 m; albedo that varies smoothly and from point to point; 1-2 % of the returns missing, in a third of the cases
-shrubs (round patches without returns); fallen blocks and debris in all strata but `none`; optional fields absent in a quarter of the
-cases each; in one of eight laser cases an effect that the model has right already. Magnitudes: S/N, or S/N x sin(angle), from 2 to
-120, even in its logarithm, where no more than three times the catalogue's largest typical size gives it."""
+_ALWAYS = """Always on: a pose off by millimetres and some 10 microradians; an error of the reference of 0.2-0.8 mm (stereo 1-4
+mm), correlated over 1.5-6 m; albedo that varies smoothly and from point to point; 1-2 % of the returns missing, in a third of the
+cases shrubs (round patches without returns); fallen blocks and debris in all strata but `none`; optional fields absent in a
+quarter of the cases each; in one of eight laser cases an effect that the model has right already. Magnitudes: S/N, or S/N x
+sin(angle), from 2 to 120, even in its logarithm, where no more than three times the catalogue's largest typical size gives it."""
 
 
 def markdown(found: Json) -> str:
