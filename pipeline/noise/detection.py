@@ -40,10 +40,11 @@ LEAST_SHARE = 0.5
 """Of a block's footprint that has to have data."""
 LEAST_CELL_PIXELS = 40
 """Stable differences that a cell of the level of detection needs."""
-_RESAMPLES = 100
+_RESAMPLES = 200
 _PLACES = 10
 """Where on the stable ground each footprint is laid."""
 _WIDTHS, _LAPSES = (0.02, 1.5), (0.0, 0.9)
+_LAPSE_GRID = (0.0, 0.005, 0.01, 0.02, 0.03, 0.04, 0.0499, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)
 
 
 def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np.float32]:
@@ -225,9 +226,7 @@ def detection_curve(size_m: FloatArray, seen: BoolArray, random: KeyedRandom, sh
         return None
     log_size = np.log(size_m)
     fitted = _likeliest(log_size, seen)
-    generator = random.generator()
-    draws = generator.integers(len(seen), size=(_RESAMPLES, len(seen)))
-    resampled = [_size_at(share, *_likeliest(log_size[draw], seen[draw], start=fitted)) for draw in draws]
+    resampled = _resampled_sizes(log_size, seen, fitted[0], share, random)
     low, high = np.quantile(resampled, [0.025, 0.975], method="nearest")  # infinite where a resample's curve stays below
     middle, width, lapse = fitted
     return DetectionCurve(
@@ -242,20 +241,45 @@ def detection_curve(size_m: FloatArray, seen: BoolArray, random: KeyedRandom, sh
     )
 
 
-def _likeliest(
-    log_size: FloatArray, seen: BoolArray, start: tuple[float, float, float] | None = None
-) -> tuple[float, float, float]:
+def _resampled_sizes(log_size: FloatArray, seen: BoolArray, middle: float, share: float, random: KeyedRandom) -> FloatArray:
+    """(r,) the size at which the likeliest curve of each bootstrap sample of the blocks reaches a share, m.
+
+    The curves are those of a grid of parameters about `middle` (2.5 % apart), whose likelihoods of all resamples are products of
+    matrices.
+    """
+    number = len(seen)
+    draws = random.generator().integers(number, size=(_RESAMPLES, number))
+    counts = np.stack([np.bincount(draw, minlength=number) for draw in draws], axis=1).astype(np.float64)
+    width, lapse = (axis.ravel() for axis in np.meshgrid(np.geomspace(*_WIDTHS, 14), _LAPSE_GRID))
+    best, size = np.full(_RESAMPLES, -np.inf), np.full(_RESAMPLES, np.inf)
+    for tried in middle + np.linspace(-1, 1, 81):
+        chance = (1 - lapse)[:, None] * special.ndtr((log_size - tried) / width[:, None])
+        likelihood = _log_likelihood(chance, seen) @ counts
+        place = likelihood.argmax(axis=0)
+        better = likelihood.max(axis=0) > best
+        with np.errstate(invalid="ignore"):
+            reached = np.exp(tried + width * special.ndtri(np.minimum(share / (1 - lapse), 1.0)))
+        best, size = np.where(better, likelihood.max(axis=0), best), np.where(better, reached[place], size)
+    return size
+
+
+def _log_likelihood(chance: FloatArray, seen: BoolArray) -> FloatArray:
+    """Of each block (the last axis), for the chance that it is seen."""
+    chance = np.clip(chance, 1e-9, 1 - 1e-9)
+    return np.where(seen, np.log(chance), np.log1p(-chance))
+
+
+def _likeliest(log_size: FloatArray, seen: BoolArray) -> tuple[float, float, float]:
     """Middle (of the logarithms), width and lapse of the greatest likelihood, within wide bounds."""
     low, high = float(log_size.min()), float(log_size.max())
     bounds = [(low - 1.0, high + 1.0), _WIDTHS, _LAPSES]
 
     def cost(parameters: FloatArray) -> float:
         middle, width, lapse = parameters
-        share = np.clip((1 - lapse) * special.ndtr((log_size - middle) / width), 1e-9, 1 - 1e-9)
-        return -float(np.sum(np.where(seen, np.log(share), np.log1p(-share))))
+        return -float(np.sum(_log_likelihood((1 - lapse) * special.ndtr((log_size - middle) / width), seen)))
 
     crossing = low if seen.all() else float(np.mean([log_size[~seen].mean(), log_size[seen].mean() if seen.any() else high]))
-    starts = [start] if start else [(middle, width, 0.02) for middle in (low, crossing, high) for width in (0.1, 0.4)]
+    starts = [(middle, width, 0.02) for middle in (low, crossing, high) for width in (0.1, 0.4)]
     found = [optimize.minimize(cost, at, method="L-BFGS-B", bounds=bounds) for at in starts]
     middle, width, lapse = min(found, key=lambda each: each.fun).x.tolist()
     return middle, width, lapse
