@@ -108,7 +108,9 @@ def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
         return
     marks.append(("scan", time.time()))
     cloud = recorded_points([seen])
-    write_laz(wall.with_suffix(".las"), cloud.points, intensity=cloud.intensity, gps_time=cloud.gps_time, extra=cloud.extra)
+    extra = dict(cloud.extra)
+    channels = {"gps_time": cloud.gps_time, "scan_angle_rad": extra.pop("scan_angle_rad"), "extra": extra}
+    write_laz(wall.with_suffix(".las"), cloud.points, intensity=cloud.intensity, **channels)
     marks.append(("write", time.time()))
     took = {name: after - before for (_, before), (name, after) in pairwise(marks)}
     sizes = {

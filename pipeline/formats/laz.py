@@ -163,9 +163,10 @@ def _quantisation(points: FloatArray, scale_m: float) -> tuple[FloatArray, Float
 
 
 def _fill(record: NDArray[np.void], header: laspy.LasHeader, points: FloatArray) -> None:
-    counts = np.rint((points - header.offsets) / header.scales)
-    for axis, name in enumerate("XYZ"):
-        record[name] = counts[:, axis]
+    for name, coordinate, offset, scale in zip("XYZ", points.T, header.offsets, header.scales, strict=True):
+        counts = coordinate - offset
+        counts /= scale
+        record[name] = np.rint(counts, out=counts)
 
 
 def _return_bits(number: NDArray[np.integer] | None, count: NDArray[np.integer] | None) -> NDArray[np.uint8]:
