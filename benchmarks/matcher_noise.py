@@ -1,117 +1,171 @@
-"""The errors of semi-global matching against those of the simulated matching noise: one table (docs/matching.md explains it).
+"""The simulated matching noise fitted to the errors of semi-global matching, and both in one table (docs/matching.md).
 
-On the Middlebury motorcycle (measured ground truth) and on rendered pairs of Glendale and Bulga (ray-traced truth). Pixels are
-those of the matched pictures, so the simulated noise, given in px of the full frame, counts by the reduction.
+Fitted by differential evolution and a simplex search on two rendered walls, once for SGBM and once for SGBM with refinement; validated on walls and on
+real pictures (the Middlebury motorcycle) that the fit has not seen. Pixels are those of the matched pictures, so the model's
+lengths, given in px of the full frame, count by the reduction (4 at medium quality).
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from matcher_cases import MATCHERS, Case, Raster, motorcycle, rendered
 
-from scene.frame import WallFrame
-from scene.illumination import IlluminationConfig
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from scene.texture import TextureConfig
-from sensors.exposure import ExposureConfig
-from sensors.matching import MatchingConfig, SearchRange, match, without_speckles
 from sensors.model import StereoModel
-from sensors.observation import Observation
-from sensors.placement import RigConfig, Target
-from sensors.rectify import rectify
-from sensors.refinement import refine
-from sensors.stereo import REDUCTION, StereoPair
-from sensors.stereo_matched import MatchedStereoPair
 
-Raster = NDArray[np.float64]
-FITTED = StereoModel(
-    noise={"parallax_sigma_px": 0.35, "regularization_sigma_px": 1.2, "regularization_step_px": 16.0},
-    effects=[{"name": "edge_fattening", "radius_px": 10.0}],
-)
-"""Simulated noise like the refined matcher's on rendered rock, px of the full frame at medium quality."""
-QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}
+FITTED_ON = (("glendale", 7), ("bulga", 7))
+VALIDATED_ON = (("glendale", 11), ("bismantova", 3))
+LAGS = (1, 2, 4, 8)
+QUANTILES = (50, 68, 90, 95, 99)
+RIM_PX = 3
+"""How far beside a depth step fattening is looked for, cells."""
+BOUNDS = ((0.0, 0.3), (0.0, 0.6), (1.0, 8.0), (0.0, 1.2), (0.0, 3.0), (0.0, 3.0), (-0.15, 0.15))
+"""Of the parameters of `model`, px of the matched pictures."""
+INTEGER = (False, False, False, False, False, True, False)
+POLISHING = 250
+"""Evaluations of the simplex search that follows the evolution."""
+SEED = 5
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--motorcycle", type=Path, default=Path("/work/shared/data/stereo_motorcycle"))
-    folder = parser.parse_args().motorcycle
-    print("| pair | matcher | matched % | bias px | MAD-sigma px | > 1 px % | excess kurtosis | r(1) | r(8) | locking px |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
-    if folder.exists():
-        report("motorcycle", motorcycle(folder))
-    for style in ("glendale", "bulga"):
-        report(style, rendered(style))
+    parser.add_argument("--generations", type=int, default=10, help="of the differential evolution")
+    chosen = parser.parse_args()
+    fitted_on = [rendered(*wall) for wall in FITTED_ON]
+    models = {matcher: fit([case.middle() for case in fitted_on], matcher, chosen.generations) for matcher in MATCHERS}
+    for matcher, values in models.items():
+        print(f"{matcher}, px of the frame at medium quality: {describe(model(values, 4))}\n")
+    print(
+        "| pair | errors of | matched % | bias | MAD-sigma | 95 % of abs | > 1 px % | kurtosis | r(1) | r(8) | locking | fattened % |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    for case in fitted_on:
+        report(case, models, "fitted on")
+    for wall in VALIDATED_ON:
+        report(rendered(*wall), models, "not seen")
+    if chosen.motorcycle.exists():
+        report(motorcycle(chosen.motorcycle), models, "not seen")
 
 
-def report(pair: str, cases: Iterator[tuple[str, Raster, Raster]]) -> None:
-    for matcher, found, true in cases:
-        print(f"| {pair} | {matcher} | " + " | ".join(statistics(found, true)) + " |", flush=True)
+def model(values: Sequence[float], reduction: int) -> StereoModel:
+    """The sensor model, px of the frame, of parameters in px of the matched pictures: white noise, heavy-tailed noise (sigma,
+    step, tail), smoothing, fattening, locking."""
+    white, sigma, step, tail, smoothing, radius, locking = (float(value) for value in values)
+    return StereoModel(
+        noise={"parallax_sigma_px": white * reduction, "regularization_sigma_px": 0.0},
+        effects=[
+            {"name": "edge_fattening", "radius_px": radius * reduction},
+            {"name": "smoothing", "sigma_px": smoothing * reduction},
+            {"name": "heavy_tailed_noise", "sigma_px": sigma * reduction, "step_px": step * reduction, "tail": tail},
+            {"name": "pixel_locking", "amplitude_px": locking * reduction},
+        ],
+    )
 
 
-def motorcycle(folder: Path) -> Iterator[tuple[str, Raster, Raster]]:
-    """Found and true disparities of SGBM and of its refinement, px."""
-    left, right = (cv2.imread(str(folder / f"motorcycle_{side}.png"), cv2.IMREAD_GRAYSCALE) for side in ("left", "right"))
-    true = np.load(folder / "motorcycle_disp.npz")["arr_0"].astype(float)
-    true[~np.isfinite(true)] = np.nan
-    config = MatchingConfig()
-    pictures = left.astype(np.float32), right.astype(np.float32)
-    coarse = match(*pictures, SearchRange.between(float(np.nanmin(true)), float(np.nanmax(true))), config)
-    yield "sgbm", without_speckles(coarse, config.speckle_px), true
-    assert config.refinement
-    yield "sgbm, refined", without_speckles(refine(*pictures, coarse, config.refinement), config.speckle_px), true
+def describe(fitted: StereoModel) -> str:
+    effects = (effect.model_dump() for effect in fitted.effects)
+    named = ({key: value if isinstance(value, str) else round(value, 3) for key, value in effect.items()} for effect in effects)
+    return f"parallax_sigma_px {fitted.noise.parallax_sigma_px:.3f}; " + "; ".join(str(effect) for effect in named)
 
 
-def rendered(style: str) -> Iterator[tuple[str, Raster, Raster]]:
-    """Found and true disparities on a rendered wall 24 x 15 m seen from 50 m at medium quality, px of the depth map."""
-    random = KeyedRandom(1)
-    world = ProceduralWall(style=style, width_m=24.0, height_m=15.0, resolution_m=0.03, seed=7).mesh(random)
-    cameras = RigConfig(distance_m=50.0, base_m=13.0).place(Target(world))
-    frame = WallFrame.fit(world.vertices, cameras.left.position)
-    caster = RayCaster(world.with_vertices(frame.to_wall(world.vertices)))
-    quiet, texture = StereoPair(cameras, frame, StereoModel(noise=QUIET)), TextureConfig().texture(random)
-    true = disparity(quiet.observe(caster, random), quiet)
-    for name, config in (("sgbm", MatchingConfig(refinement=None)), ("sgbm, refined", MatchingConfig())):
-        pair = MatchedStereoPair(quiet, texture, IlluminationConfig(), ExposureConfig(), config)
-        yield name, disparity(pair.observe(caster, random), quiet), true
-    for name, model in (("simulated, defaults", StereoModel()), ("simulated, fitted", FITTED)):
-        yield name, disparity(StereoPair(cameras, frame, model).observe(caster, random), quiet), true
+def fit(cases: Sequence[Case], matcher: str, generations: int) -> list[float]:
+    """The parameters of `model` whose errors are most like the matcher's in all of `cases`."""
+    from scipy.optimize import differential_evolution, minimize
+
+    wanted = [Errors.of(case.found[matcher], case.true, case.found[matcher]).features() for case in cases]
+
+    def distance(values: Sequence[float]) -> float:
+        total = 0.0
+        for case, target in zip(cases, wanted, strict=True):
+            found = case.simulated(model(values, case.reduction), SEED)
+            total += float(np.mean(np.square(Errors.of(found, case.true, case.found[matcher]).features() - target)))
+        return total
+
+    result = differential_evolution(
+        distance, BOUNDS, integrality=INTEGER, popsize=5, maxiter=generations, seed=SEED, tol=1e-3, polish=False, init="sobol"
+    )
+    free = ~np.array(INTEGER)
+
+    def completed(part: np.ndarray) -> np.ndarray:
+        values = result.x.copy()
+        values[free] = part
+        return values
+
+    steps = np.diag(np.ptp(np.array(BOUNDS)[free], axis=1) / 20)
+    options = {"maxfev": POLISHING, "initial_simplex": np.vstack([result.x[free], result.x[free] + steps])}
+    limits = np.array(BOUNDS)[free]
+    polished = minimize(
+        lambda part: distance(completed(part)), result.x[free], method="Nelder-Mead", bounds=limits, options=options
+    )
+    evaluations = result.nfev + polished.nfev
+    print(
+        f"{matcher}: mean square of the differences {polished.fun / len(cases):.2f} after {evaluations} evaluations", flush=True
+    )
+    return list(completed(polished.x))
 
 
-def disparity(seen: Observation, pair: StereoPair) -> Raster:
-    """(rows, columns) disparity of the recorded points in the rectified nominal pair, px of the depth map."""
-    nominal = pair.cameras.in_wall_frame(pair.frame)
-    geometry = rectify(nominal)
-    depth = (seen.points - nominal.left.position) @ nominal.left.rotation @ geometry.left.T[:, 2]
-    return (geometry.f * geometry.base_m / depth + geometry.offset) / REDUCTION[pair.quality]
+@dataclass(frozen=True)
+class Errors:
+    """Found minus true disparity, (rows, columns), NaN where unknown; true: the true one; rim: the far side of a depth step."""
 
+    error: Raster
+    true: Raster
+    rim: np.ndarray
 
-def statistics(found: Raster, true: Raster) -> list[str]:
-    """The row of the table; kurtosis, correlation along the row and locking are those of errors below 1 px."""
-    error = np.asarray(found, dtype=float) - true
-    known = error[~np.isnan(error)]
-    inner = np.where(np.abs(error) < 1, error, np.nan)
-    values = inner[~np.isnan(inner)]
-    centred = values - values.mean()
-    kurtosis = np.mean(centred**4) / np.mean(centred**2) ** 2 - 3
-    figures = [
-        100 * known.size / np.count_nonzero(~np.isnan(true)),
-        np.median(known),
-        1.4826 * np.median(np.abs(known - np.median(known))),
-        100 * np.mean(np.abs(known) > 1),
-        kurtosis,
-        correlation(inner, 1),
-        correlation(inner, 8),
-        locking(inner, true),
-    ]
-    return [f"{value:.{digits}f}" for value, digits in zip(figures, (1, 3, 3, 2, 1, 2, 2, 3), strict=True)]
+    @classmethod
+    def of(cls, found: Raster, true: Raster, where: Raster) -> Errors:
+        """The errors of the cells where `where` is known too, so that matchers are compared on the same cells."""
+        error = np.where(np.isnan(where), np.nan, found - true)
+        window = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+        nearest = cv2.dilate(np.where(np.isnan(true), -np.inf, true), window)
+        slope = RIM_PX * 0.5  # px: rock as steep as this is no step
+        return cls(error, true, nearest - true > slope + 1)
+
+    def features(self) -> np.ndarray:
+        """What the fit compares, each divided by the difference that counts as one."""
+        error = self.error[~np.isnan(self.error)]
+        inner = np.where(np.abs(self.error) < 1, self.error, np.nan)
+        sizes = np.percentile(np.abs(error), QUANTILES)
+        return np.array(
+            [
+                *np.log(np.maximum(sizes, 1e-3)) / 0.1,
+                np.log(max(np.mean(np.abs(error) > 1), 1e-4)) / 0.1,
+                self.kurtosis / 0.3,
+                *(correlation(inner, lag) / 0.05 for lag in LAGS),
+                *self.locking / 0.01,
+                self.fattened / 0.02,
+            ]
+        )
+
+    @property
+    def inner(self) -> np.ndarray:
+        """(n,) errors below 1 px."""
+        return self.error[np.abs(self.error) < 1]
+
+    @property
+    def kurtosis(self) -> float:
+        """Excess kurtosis of the errors below 1 px."""
+        centred = self.inner - self.inner.mean()
+        return float(np.mean(centred**4) / np.mean(centred**2) ** 2 - 3)
+
+    @property
+    def locking(self) -> np.ndarray:
+        """Factors of sine and cosine of the true disparity's fraction in the errors below 1 px, by least squares; px."""
+        phase = 2 * np.pi * self.true[np.abs(self.error) < 1]
+        design = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=1)
+        return np.linalg.lstsq(design, self.inner)[0][1:]
+
+    @property
+    def fattened(self) -> float:
+        """Beside depth steps, the share of cells more than 1 px too near minus that of cells more than 1 px too far."""
+        rim = self.error[self.rim & ~np.isnan(self.error)]
+        return float(np.mean(rim > 1) - np.mean(rim < -1)) if rim.size else 0.0
 
 
 def correlation(error: Raster, lag: int) -> float:
@@ -121,13 +175,31 @@ def correlation(error: Raster, lag: int) -> float:
     return float(np.corrcoef(first[both], second[both])[0, 1])
 
 
-def locking(error: Raster, true: Raster) -> float:
-    """Amplitude of the sine of the true disparity's fraction in the errors, by least squares, px."""
-    known = ~np.isnan(error)
-    phase = 2 * np.pi * true[known]
-    design = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=1)
-    _, sine, cosine = np.linalg.lstsq(design, error[known])[0]
-    return float(np.hypot(sine, cosine))
+def report(case: Case, models: dict[str, list[float]], role: str) -> None:
+    """The rows of one pair: each matcher and its simulation; the model's defaults."""
+    for matcher, values in models.items():
+        found = case.found[matcher]
+        row(f"{case.name}, {role}", matcher, found, case, found)
+        row("", f"simulated as {matcher}", case.simulated(model(values, case.reduction), SEED + 1), case, found)
+    row("", "simulated, defaults", case.simulated(StereoModel(), SEED + 1), case, found)
+
+
+def row(pair: str, name: str, found: Raster, case: Case, where: Raster) -> None:
+    errors = Errors.of(found, case.true, where)
+    known, inner = errors.error[~np.isnan(errors.error)], np.where(np.abs(errors.error) < 1, errors.error, np.nan)
+    figures = [
+        (100 * np.count_nonzero(~np.isnan(found) & ~np.isnan(case.true)) / np.count_nonzero(~np.isnan(case.true)), 1),
+        (np.median(known), 3),
+        (1.4826 * np.median(np.abs(known - np.median(known))), 3),
+        (np.percentile(np.abs(known), 95), 2),
+        (100 * np.mean(np.abs(known) > 1), 2),
+        (errors.kurtosis, 1),
+        (correlation(inner, 1), 2),
+        (correlation(inner, 8), 2),
+        (np.hypot(*errors.locking), 3),
+        (100 * errors.fattened, 1),
+    ]
+    print(f"| {pair} | {name} | " + " | ".join(f"{value:.{digits}f}" for value, digits in figures) + " |", flush=True)
 
 
 if __name__ == "__main__":
