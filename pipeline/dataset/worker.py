@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -84,8 +85,10 @@ def use_threads(count: int) -> None:
 
 
 def fill(order: Order) -> dict[str, Any]:
-    """Make an epoch and store it. Returns what it took: wall time by stage, s, tiles, peak memory of the worker so far, GB."""
+    """Make an epoch and store it. Returns what it took: wall time by stage and processor time, s, peak memory of the worker
+    so far, GB, and the number of tiles."""
     with _one_at_a_time:
+        began = time.process_time()
         use_threads(order.threads)
         workshop = _workshop(order.folder, order.job, order.source)
         epoch, progress = workshop.plan[order.index], Progress()
@@ -95,10 +98,18 @@ def fill(order: Order) -> dict[str, Any]:
     return {
         "index": order.index,
         "tiles": len(made.tiles),
-        "seconds": {name.partition(": ")[2] or name: value for name, value in progress.timings.items()},
+        "seconds": {_stage_name(name): value for name, value in progress.timings.items()},
+        "cpu_seconds": time.process_time() - began,
         "peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
         "process": os.getpid(),
     }
+
+
+def _stage_name(name: str) -> str:
+    """A stage's name without the epoch's number; what is done for the reference epoch counts as setting up."""
+    if name.startswith("epoch 0: ") or name == "wall":
+        return f"set up: {name.removeprefix('epoch 0: ')}"
+    return name.partition(": ")[2] or name
 
 
 def _store(folder: Path, order: Order, prefix: str, epoch: PlannedEpoch, made: MadeEpoch) -> None:

@@ -1,0 +1,161 @@
+"""Tiles per minute, share of the stages, memory, and the time that the nine sets would take.
+
+    python benchmarks/dataset.py                      workers: a small set by one and by two workers, in turns
+    python benchmarks/dataset.py epochs [--epochs 6]  Glendale: epochs of rockfall_9 in this process, projection of the whole plan
+    python benchmarks/dataset.py memory [--epochs 100] [--sensor tls]   peak memory of one worker over many epochs
+
+Rates are of wall time and of processor time; on a machine that others use too only the latter tells of the program.
+The projection plays the plan through: a free worker takes the next epoch and pays for a stage (wall, frame, scene, reference) where
+it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.bundled import bundled_config
+from pipeline.dataset.config import DatasetConfig, load_dataset_config
+from pipeline.dataset.plan import PlannedEpoch, planned_epochs
+from pipeline.dataset.run import DatasetSummary, Workers, make_dataset
+
+WORKERS = (2, 16, 256)
+SIZES = ("small", "medium", "large")
+
+
+def timed(config: DatasetConfig, workers: int) -> tuple[float, DatasetSummary]:
+    """Wall time of a whole set by some workers, s, the start of their processes and the card included."""
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        summary = make_dataset(config, Path(folder) / "set", Workers(workers))
+        return time.perf_counter() - start, summary
+
+
+def stage_seconds(made: Sequence[dict[str, Any]]) -> dict[str, float]:
+    found: dict[str, float] = defaultdict(float)
+    for taken in made:
+        for name, seconds in taken["seconds"].items():
+            found[name] += seconds
+    return dict(found)
+
+
+def of_glendale(epochs: int, sensors: Sequence[str]) -> DatasetConfig:
+    """rockfall_9 cut down to `epochs` training epochs of each sensor and class of sizes, on Glendale at high noise."""
+    values = load_dataset_config(bundled_config("datasets", "rockfall_9")).model_dump(mode="json")
+    part = {"walls": ["glendale"], "noise": ["high"], "sizes": SIZES, "train": epochs}
+    return DatasetConfig.model_validate({**values, "sensors": sensors, "parts": [part]})
+
+
+def costs(config: DatasetConfig, made: Sequence[dict[str, Any]]) -> tuple[dict[str, float], dict[tuple[str, str], float]]:
+    """Processor time of a stage's set-up by sensor, and of an epoch by sensor and size, s.
+
+    The set-up's share of the processor time of the epoch that did it is that of its wall time.
+    """
+    plan = planned_epochs(config)
+    set_up: dict[str, list[float]] = defaultdict(list)
+    epoch: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for taken in made:
+        planned = plan[taken["index"]]
+        before = sum(value for name, value in taken["seconds"].items() if name.startswith("set up"))
+        share = before / sum(taken["seconds"].values())
+        if share:
+            set_up[planned.sensor].append(share * taken["cpu_seconds"])
+        epoch[planned.sensor, planned.size].append((1 - share) * taken["cpu_seconds"])
+    return {key: float(np.mean(each)) for key, each in set_up.items()}, {key: float(np.mean(each)) for key, each in epoch.items()}
+
+
+def makespan(plan: Sequence[PlannedEpoch], workers: int, set_up: dict[str, float], epoch: dict[tuple[str, str], float]) -> float:
+    """Time until the last epoch of the plan is done, s, by the rule above; costs by sensor, and by sensor and size."""
+    free: list[tuple[float, int]] = [(0.0, number) for number in range(workers)]
+    has: dict[int, object] = {}
+    for planned in plan:
+        now, worker = heapq.heappop(free)
+        now += epoch[planned.sensor, planned.size] + (0.0 if has.get(worker) == planned.stage else set_up[planned.sensor])
+        has[worker] = planned.stage
+        heapq.heappush(free, (now, worker))
+    return max(now for now, _ in free)
+
+
+def print_stages(made: Sequence[dict[str, Any]]) -> None:
+    seconds = stage_seconds(made)
+    print("| stage | share of the time |\n|---|---|")
+    for name, value in sorted(seconds.items(), key=lambda item: -item[1]):
+        print(f"| {name} | {value / sum(seconds.values()):.0%} |")
+
+
+def compare_workers(rounds: int) -> None:
+    """The small set by one and by two workers, in turns."""
+    config = load_dataset_config(bundled_config("datasets", "small"))
+    plan = planned_epochs(config)
+    print("| workers | wall, s | tiles a minute | processor s a tile | made by set-ups |\n|---|---|---|---|---|")
+    rates: dict[int, list[float]] = defaultdict(list)
+    cpu: dict[int, list[float]] = defaultdict(list)
+    for _ in range(rounds):
+        for workers in (1, 2):
+            wall, summary = timed(config, workers)
+            tiles = sum(taken["tiles"] for taken in summary.made)
+            rates[workers].append(60 * tiles / wall)
+            cpu[workers].append(sum(taken["cpu_seconds"] for taken in summary.made) / tiles)
+            set_ups = sum(any(name.startswith("set up") for name in taken["seconds"]) for taken in summary.made)
+            print(f"| {workers} | {wall:.0f} | {rates[workers][-1]:.0f} | {cpu[workers][-1]:.2f} | {set_ups} |", flush=True)
+    print(f"scaling efficiency by wall time {np.median(rates[2]) / np.median(rates[1]) / 2:.2f}, ", end="")
+    print(f"by processor time {np.median(cpu[1]) / np.median(cpu[2]):.2f}")
+    played = [makespan(plan, workers, *costs(config, summary.made)) for workers in (1, 2)]
+    print(f"the projection's efficiency for this set, from the last round's costs: {played[0] / played[1] / 2:.2f}")
+    print_stages(summary.made)
+
+
+def project(epochs: int) -> None:
+    """Time epochs of Glendale in this process, play the whole plan of rockfall_9 through."""
+    config = of_glendale(epochs, ("stereo", "tls"))
+    wall, summary = timed(config, 0)
+    set_up, epoch = costs(config, summary.made)
+    whole = planned_epochs(load_dataset_config(bundled_config("datasets", "rockfall_9")))
+    print_stages(summary.made)
+    print(f"set-up {set_up}\nepoch {epoch} processor s")
+    tiles = sum(taken["tiles"] for taken in summary.made)
+    cpu = sum(taken["cpu_seconds"] for taken in summary.made)
+    print(
+        f"{tiles} tiles in {wall:.0f} s of wall time, {cpu:.0f} s of processor time: {60 * tiles / cpu:.1f} tiles a core minute"
+    )
+    print(f"played through, the epochs just timed take one worker {makespan(planned_epochs(config), 1, set_up, epoch):.0f} s")
+    print("| cores | nine sets and tests, both sensors | of the ideal |\n|---|---|---|")
+    ideal = makespan(whole, 1, set_up, epoch)
+    for workers in WORKERS:
+        time_taken = makespan(whole, workers, set_up, epoch)
+        print(f"| {workers} | {time_taken / 3600:.1f} h | {ideal / workers / time_taken:.2f} |")
+
+
+def print_memory(epochs: int, sensor: str) -> None:
+    """The peak after each tenth of the epochs."""
+    _, summary = timed(of_glendale(-(-epochs // len(SIZES)), (sensor,)), 0)
+    for number in range(0, len(summary.made), max(1, len(summary.made) // 10)):
+        print(f"{sensor}, after {number + 1:3} epochs: {summary.made[number]['peak_memory_gb']:.2f} GB at the peak")
+    print(f"{sensor}, after {len(summary.made):3} epochs: {summary.made[-1]['peak_memory_gb']:.2f} GB at the peak (limit 2.5)")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", default="workers", choices=["workers", "epochs", "memory"])
+    parser.add_argument("--epochs", type=int, help="of each sensor and size (epochs: 2), or of all (memory: 100)")
+    parser.add_argument("--rounds", type=int, default=3, help="workers: of both numbers of workers")
+    parser.add_argument("--sensor", default="stereo", choices=["stereo", "tls"], help="memory")
+    asked = parser.parse_args()
+    if asked.what == "workers":
+        compare_workers(asked.rounds)
+    elif asked.what == "epochs":
+        project(asked.epochs or 2)
+    else:
+        print_memory(asked.epochs or 100, asked.sensor)
+
+
+if __name__ == "__main__":
+    main()
