@@ -72,6 +72,11 @@ class Candidate:
         assert self.wave is not None
         return self.wave.columns(self.period)
 
+    def part(self, rows: Rows) -> Candidate:
+        """The candidate on some of the points."""
+        matrix = None if self.matrix is None else self.matrix[rows]
+        return replace(self, matrix=matrix, wave=None if self.wave is None else self.wave.part(rows))
+
     @property
     def family(self) -> str:
         """Variants of one family differ in searched or chosen values only."""

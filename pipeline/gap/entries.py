@@ -11,9 +11,10 @@ from pipeline.gap.candidates import Candidate
 from pipeline.gap.missing import MissingFound
 from pipeline.gap.quantization import Comb
 from pipeline.gap.residuals import Residuals
-from pipeline.gap.selection import Chosen, MeanSearch, split
+from pipeline.gap.selection import Chosen
 from pipeline.gap.spread import SpreadFound
 from scene.config import parse
+from scene.errors import InputError
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
@@ -74,6 +75,15 @@ def with_effects(model: TlsModel | StereoModel, entries: list[dict[str, Any]]) -
     return parse(type(model), {**values, "effects": [*values["effects"], *entries]}, "model_after.yaml")
 
 
+def is_possible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
+    """Whether an entry's values lie within the bounds of its effect."""
+    try:
+        with_effects(model, [entry])
+    except InputError:
+        return False
+    return True
+
+
 def from_comb(comb: Comb, part: Residuals) -> Named:
     """Steps of the range. Gain: of the probability that all ranges lie on the comb, an e-fold each at the least."""
     entry = {"name": "range_quantization", "step_m": comb.step_m}
@@ -102,19 +112,21 @@ def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:
     return Named(f"tls.{found.name}", "physical", {"name": found.name, **parameters}, std, (), p_value, found.gain)
 
 
-def from_mean(search: MeanSearch, chosen: list[Chosen], part: Residuals) -> list[Named]:
-    """Effects on the mean, fitted together with pose and correlated error."""
-    if not chosen:
-        return []
-    candidates, fit = search.refined([item.candidate for item in chosen])
-    places = split(np.arange(len(fit.coefficients)), candidates)
-    named = []
-    for item, candidate, place in zip(chosen, candidates, places, strict=True):
-        values, spread = fit.coefficients[place], fit.covariance[np.ix_(place, place)]
-        named.append(
-            _empirical(candidate, values, item, part) if candidate.empirical else _physical(candidate, values, spread, item, part)
-        )
-    return named
+@dataclass(frozen=True)
+class Estimate:
+    """An explanation of the mean with the values of its coefficients (k,) and their covariance (k, k)."""
+
+    chosen: Chosen
+    candidate: Candidate
+    values: FloatArray
+    covariance: FloatArray
+
+
+def from_mean(found: Estimate, part: Residuals) -> Named:
+    """An effect on the mean; part: the residuals on whose rows its candidate stands."""
+    if found.candidate.empirical:
+        return _empirical(found.candidate, found.values, found.chosen, part)
+    return _physical(found.candidate, found.values, found.covariance, found.chosen, part)
 
 
 def _physical(candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals) -> Named:

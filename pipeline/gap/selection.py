@@ -7,7 +7,7 @@ best of each size, so that two effects are found too where neither, or a third t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ FREE_MARGIN = 5.0
 _LEAST_SCORE = 4.0
 _LEAST_FREE_SCORE = 12.0
 """Of a free form: the reference's error is not quite as its model says, and a flexible form takes that up first."""
+_WAVE_RATIO = 2.0
+"""A wave along a covariate must score so many times what waves in slanting directions do: the reference's error has some too."""
 _MOST_EFFECTS = 3
 _WIDTH = 5
 """Sets of one size that are grown further."""
@@ -37,7 +39,6 @@ _NULL_ROWS = 8_000
 _NEAR_NULL = 8
 _NOT_PLACES = ("intensity", "disparity_fraction")
 """Covariates that do not change along the wall."""
-POSE = tuple(range(6))
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,15 @@ class _Set:
     @property
     def free(self) -> Tried | None:
         """The best free form; of a covariate that changes along the wall only where it does better than mere places do."""
-        decoy = max((item.score for item in self.tried if item.name.startswith(PLACE)), default=-np.inf)
-        found = (item for item in self.tried if item.empirical and not item.name.startswith(PLACE))
-        return next((item for item in found if item.name in _NOT_PLACES or item.score > decoy + FREE_MARGIN), None)
+        decoys = [item.score for item in self.tried if item.name.startswith(PLACE)]
+        decoy = max([0.0, *decoys])
+        for item in self.tried:
+            if not item.empirical or item.name.startswith(PLACE):
+                continue
+            least = (_WAVE_RATIO if item.candidate.form == "wave" else 1.0) * decoy + FREE_MARGIN
+            if item.name in _NOT_PLACES or item.score > least:
+                return item
+        return None
 
 
 class MeanSearch:
@@ -104,11 +111,12 @@ class MeanSearch:
         rows, root = self.model.rows, self.model.root[:, None]
         self._full_grids = [family for family in families if isinstance(family, Grid)]
         self._grids = [grid.part(rows) for grid in self._full_grids]
-        self._pose = np.linalg.qr(residuals.pose[rows] * root)[0]
+        self._pose, self._turn = np.linalg.qr(residuals.pose[rows] * root)
+        self._base = list(range(residuals.pose.shape[1]))
         self.value = self.model.project(residuals.value[rows, None] * root)
         matrices = [candidate.columns[rows] * root for candidate in self._plain]
         self._place: dict[int, list[int]] = {}
-        start = len(POSE)
+        start = len(self._base)
         for candidate in self._plain:
             self._place[id(candidate)] = list(range(start, start + candidate.columns.shape[1]))
             start += candidate.columns.shape[1]
@@ -119,7 +127,7 @@ class MeanSearch:
 
     def _assemble(self) -> None:
         """Normal equations of the data, and the gains of every family where there is nothing."""
-        pose = list(POSE)
+        pose = self._base
         covariances, bases = self.model.narrowed([self._fixed.some(pose), self._fixed], self.value)
         self._fixed, self.value = self._fixed.kept(bases), self.value.kept(bases)
         thin = slice(None, None, max(len(self.model) // _NULL_ROWS, 1))
@@ -143,7 +151,7 @@ class MeanSearch:
             right.append(within + self._fixed.between[at.length].T @ weighted)
             waves.append(self._waves.noise + sines[at.length].T @ weighted)
         plain, fixed, searched = near.of_values(np.stack(right), np.stack(constant), np.stack(waves)).profile(
-            list(POSE), [self._place[id(candidate)] for candidate in self._plain]
+            self._base, [self._place[id(candidate)] for candidate in self._plain]
         )
         return {
             name: np.maximum(np.concatenate([fixed[rows], searched[sines]]).max(axis=0) - plain, 0.0)
@@ -187,19 +195,23 @@ class MeanSearch:
             self._promoted[id(candidate)] = candidate, list(range(start, start + added.within.shape[1]))
         return self._promoted[id(candidate)][1]
 
-    def _projected(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> Projected:
-        """The columns of some candidates, without pose; of a sine with its change by the frequency where `slopes` say so."""
+    def _projected(self, candidates: list[Candidate]) -> Projected:
+        """The columns of some candidates, without pose."""
+        return self.model.project(self._without_pose(self._matrix(candidates, None)))
+
+    def _matrix(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None) -> FloatArray:
+        """Columns of some candidates over sigma; of a sine with its change by the frequency where `slopes` say so."""
         rows, root = self.model.rows, self.model.root[:, None]
         matrices = []
         for candidate, slope in zip(candidates, slopes or [None] * len(candidates), strict=True):
             wave = candidate.wave
             columns = candidate.columns if wave is None or slope is None else wave.with_slope(candidate.period, slope)
             matrices.append(columns[rows] * root)
-        return self.model.project(self._without_pose(np.concatenate(matrices, axis=1)))
+        return np.concatenate(matrices, axis=1)
 
     def tried(self, members: tuple[Tried, ...]) -> tuple[Tried, ...]:
         """Every family's best variant beside some effects, best score first."""
-        base = [*POSE, *(column for member in members for column in self._columns(member.candidate))]
+        base = [*self._base, *(column for member in members for column in self._columns(member.candidate))]
         plain, fixed, searched = self.equations.profile(base, [self._place[id(candidate)] for candidate in self._plain])
         found = []
         for name, (rows, sines) in self._families().items():
@@ -277,9 +289,18 @@ class MeanSearch:
         return Chosen(item.candidate, alike, self.p_value(mine.score), mine.gain, mine.score, self.tried(others))
 
     def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> Fit:
-        """Pose and some candidates, at their most likely covariance."""
-        pose = self._fixed.some(list(POSE))
-        return fitted(self.model.fine, pose.beside(self._projected(candidates, slopes)) if candidates else pose, self.value)
+        """Pose (the columns of `Residuals.pose`) and some candidates, at their most likely covariance."""
+        pose, turned = self._fixed.some(self._base), np.linalg.inv(self._turn)
+        if not candidates:
+            found = fitted(self.model.fine, pose, self.value)
+            return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
+        matrix = self._matrix(candidates, slopes)
+        found = fitted(self.model.fine, pose.beside(self.model.project(self._without_pose(matrix))), self.value)
+        # the columns were fitted without what the pose explains of them, and the pose by orthonormal ones
+        back = np.block(
+            [[turned, -turned @ (self._pose.T @ matrix)], [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])]]
+        )
+        return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
     def reference_sigma(self, chosen: list[Chosen]) -> float:
         """Standard deviation of the reference's correlated error, in the observable's unit."""
@@ -287,16 +308,13 @@ class MeanSearch:
         return float(np.sqrt(at.ratio)) * self.model.typical_sigma
 
     def without(self, chosen: list[Chosen]) -> FloatArray:
-        """(n,) residuals less the chosen effects at their most likely values, and less a pose that fits the rest."""
+        """(n,) residuals less pose and the chosen effects at their most likely values."""
         found = self._residuals
-        value = found.value
-        if chosen:
-            candidates, fit = self.refined([item.candidate for item in chosen])
-            for candidate, coefficients in zip(candidates, split(fit.coefficients, candidates), strict=True):
-                value = value - candidate.columns @ coefficients[: candidate.columns.shape[1]]
-        weight = 1 / found.sigma
-        pose = np.linalg.lstsq(found.pose * weight[:, None], value * weight, rcond=None)[0]
-        return np.asarray(value - found.pose @ pose)
+        candidates, fit = self.refined([item.candidate for item in chosen])
+        value = found.value - found.pose @ fit.coefficients[: len(self._base)]
+        for candidate, coefficients in zip(candidates, self.split(fit.coefficients, candidates), strict=True):
+            value = value - candidate.columns @ coefficients[: candidate.columns.shape[1]]
+        return np.asarray(value)
 
     def refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], Fit]:
         """Candidates with their periods at the top of the likelihood (Gauss-Newton), and the fit of pose and all of them.
@@ -308,7 +326,7 @@ class MeanSearch:
         if any(candidate.wave is not None for candidate in found):
             for number in range(rounds):
                 fit = self.fit(found, slopes)
-                start = len(POSE)
+                start = len(self._base)
                 for index, candidate in enumerate(found):
                     width = candidate.columns.shape[1] + (slopes[index] is not None)
                     values, start = fit.coefficients[start : start + width], start + width
@@ -320,6 +338,11 @@ class MeanSearch:
                         found[index] = _moved(candidate, period)
                     slopes[index] = values[:2]
         return found, self.fit(found, slopes)
+
+    def split(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
+        """The part of a fit's coefficients that belongs to each candidate after the pose, a sine's with that of its frequency."""
+        widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
+        return np.split(values[len(self._base) :], np.cumsum(widths)[:-1]) if candidates else []
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of the families, cosines of their signatures after the pose fit, and the share that survives the pose fit."""
@@ -338,20 +361,15 @@ class MeanSearch:
             projected = self.model.project(columns)
             between = projected.between[self.null.length]
             grams.append(projected.within.T @ projected.within + (between * weight).T @ between)
-        matrix, pose = grams[1], self.equations.fixed[row][: len(POSE), : len(POSE)]
+        count = len(self._base)
+        matrix, pose = grams[1], self.equations.fixed[row][:count, :count]
         between, base = self.model.project(left), self._fixed
-        cross = base.within[:, : len(POSE)].T @ between.within
-        cross += base.between[self.null.length][:, : len(POSE)].T @ (weight * between.between[self.null.length])
+        cross = base.within[:, :count].T @ between.within
+        cross += base.between[self.null.length][:, :count].T @ (weight * between.between[self.null.length])
         matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
         size, full = np.sqrt(np.maximum(np.diag(matrix), 0)), np.sqrt(np.maximum(np.diag(grams[0]), 1e-300))
         scale = np.maximum(size, 1e-12 * full)
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
-
-
-def split(values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
-    """The part of a fit's last axis that belongs to each candidate after the pose, a sine's with that of its frequency."""
-    widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
-    return np.split(values[len(POSE) :], np.cumsum(widths)[:-1])
 
 
 def _moved(candidate: Candidate, period: float) -> Candidate:

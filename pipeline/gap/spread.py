@@ -20,6 +20,8 @@ _LEAST_GAIN = 6.0
 _LEAST_EXCESS = 0.03
 """Added variance, as a share of the model's, below which the reference's own small errors may be meant."""
 _CLIP = 4.5
+_LEAST_LEFT = 0.3
+"""Share of a point's variance that its cell's plane must leave."""
 _CLASS_MARGIN = 3.0
 _FREE_MARGIN = 6.0
 _BINS = 8
@@ -60,15 +62,27 @@ class SpreadFound:
 
 
 def standardised(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
-    """(n,) deviations from the cells' means over the predicted spread, of unit variance if the model is right; NaN outside."""
+    """(n,) deviations from the cells' planes over the predicted spread, of unit variance if the model is right; NaN outside.
+
+    A plane in each cell takes away what the reference's error, correlated over metres, does within it.
+    """
     inside = cells.cell >= 0
-    weight = 1 / residuals.sigma[inside] ** 2
     cell = cells.cell[inside]
-    total = np.bincount(cell, weight, len(cells))
-    mean = np.bincount(cell, weight * value[inside], len(cells)) / total
-    left = np.maximum(1 - weight / total[cell], 0.2)
+    offset = (residuals.at[inside] - cells.centre[cell]) / cells.side_m
+    weight = 1 / residuals.sigma[inside]
+    basis = np.stack([np.ones(len(cell)), offset[:, 0], offset[:, 1]], axis=1) * weight[:, None]
+    y = value[inside] * weight
+
+    def total(column: FloatArray) -> FloatArray:
+        return np.bincount(cell, column, len(cells)).astype(np.float64)
+
+    matrix = np.stack([np.stack([total(basis[:, i] * basis[:, j]) for j in range(3)], axis=-1) for i in range(3)], axis=-2)
+    right = np.stack([total(basis[:, i] * y) for i in range(3)], axis=-1)
+    inverse = np.linalg.pinv(matrix, rcond=1e-8, hermitian=True)
+    fitted = np.einsum("ni,nij,nj->n", basis, inverse[cell], right[cell])
+    left = 1 - np.einsum("ni,nij,nj->n", basis, inverse[cell], basis)
     z = np.full(len(residuals), np.nan)
-    z[inside] = (value[inside] - mean[cell]) / residuals.sigma[inside] / np.sqrt(left)
+    z[inside] = np.where(left > _LEAST_LEFT, (y - fitted) / np.sqrt(np.maximum(left, _LEAST_LEFT)), np.nan)
     return z
 
 

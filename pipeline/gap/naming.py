@@ -1,0 +1,153 @@
+"""Naming: effects on the mean and on the spread, from the points that selection may look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap import stereo_signatures, tls_signatures
+from pipeline.gap.candidates import PLACE, Candidate, Grid, free_forms, places
+from pipeline.gap.cells import Cells
+from pipeline.gap.entries import Estimate, Named, from_comb, from_mean, from_spread, with_effects
+from pipeline.gap.measurement import Measurement
+from pipeline.gap.quantization import find_comb
+from pipeline.gap.registration import registered
+from pipeline.gap.residuals import Residuals
+from pipeline.gap.selection import Chosen, MeanSearch, Tried
+from pipeline.gap.spread import SpreadFound, find_spread
+from pipeline.gap.stereo_residuals import stereo_residuals
+from pipeline.gap.tls_residuals import tls_residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.model import StereoModel, TlsModel
+
+_NOT_FREE = ("edge_step", "line")
+
+
+@dataclass(frozen=True)
+class Naming:
+    """What the selection leaves beside the effects: what was tried, what remains, and the standard deviation of the reference."""
+
+    tried: tuple[Tried, ...]
+    remaining: dict[str, Any]
+    identifiability: dict[str, Any]
+    reference_sigma: float
+
+
+def residuals_of(measurement: Measurement) -> Residuals:
+    """The raw residuals of either sensor."""
+    return tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
+
+
+def residuals_against(measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals) -> FloatArray:
+    """(n,) residuals of the same points against another model; NaN where that one misses the reference."""
+    found = residuals_of(measurement.changed(model=model))
+    value = np.full(len(measurement.cloud.points), np.nan)
+    value[found.index] = found.value
+    return np.asarray(value[residuals.index])
+
+
+def believes(measurement: Measurement, name: str) -> bool:
+    """Whether the model holds an effect already."""
+    return any(effect.name == name for effect in measurement.model.effects)
+
+
+def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | Grid]:
+    """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
+    named = tls_signatures.mean_families(part) if part.sensor == "tls" else stereo_signatures.mean_families(part, measurement)
+    free = [
+        form
+        for name, values in part.covariates.items()
+        if name not in _NOT_FREE and np.ptp(values) > 0
+        for form in free_forms(name, values)
+    ]
+    return [*named, *free, *places(part.at)]
+
+
+def name_effects(measurement: Measurement, part: Residuals, scale: float, random: KeyedRandom) -> tuple[list[Named], Naming]:
+    """Effects on the mean and on the spread.
+
+    What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
+    slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread.
+    """
+    named: list[Named] = []
+    tls = part.sensor == "tls"
+    comb = find_comb(part.geometry.measured_m) if tls and not believes(measurement, "range_quantization") else None
+    if comb is not None:
+        named.append(from_comb(comb, part))
+        part = replace(part, sigma=np.sqrt(part.sigma**2 + comb.step_m**2 / 12))
+        scale = 1.0
+    families = families_of(measurement, part)
+    spread = find_spread(part, Cells.over(part.at), registered(part)[0], random)
+    first = MeanSearch(_weighed(part, spread, scale), families, random)
+    chosen, tried = first.select()
+    estimates, last, at = _estimates(first, chosen), first, part
+    physical = [each for each in estimates if not each.candidate.empirical]
+    if physical:
+        last, at, estimates, tried = _again(measurement, part, families, physical, spread, scale, random)
+    if chosen:
+        spread = find_spread(at, last.cells, last.without([each.chosen for each in estimates[len(physical) :]]), random)
+    named += [from_mean(each, at) for each in estimates]
+    if spread is not None:
+        named.append(from_spread(spread))
+    names, cosines, survival = first.identifiability()
+    remaining = {"p_value": last.p_value(tried[0].score) if tried else 1.0, "note": "; ".join(part.notes)}
+    table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
+    shown = tuple(item for item in (chosen[0].tried if chosen else tried) if not item.name.startswith(PLACE))
+    return named, Naming(shown, remaining, table, last.reference_sigma([each.chosen for each in estimates[len(physical) :]]))
+
+
+def _weighed(part: Residuals, spread: SpreadFound | None, scale: float) -> Residuals:
+    """With the spread that the points really have."""
+    sigma = part.sigma * scale if spread is None else np.sqrt(part.sigma**2 + spread.variance)
+    return replace(part, sigma=sigma)
+
+
+def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
+    candidates, fit = search.refined([item.candidate for item in chosen])
+    places = search.split(np.arange(len(fit.coefficients)), candidates)
+    return [
+        Estimate(item, candidate, fit.coefficients[place], fit.covariance[np.ix_(place, place)])
+        for item, candidate, place in zip(chosen, candidates, places, strict=True)
+    ]
+
+
+def _again(
+    measurement: Measurement,
+    part: Residuals,
+    families: list[Candidate | Grid],
+    had: list[Estimate],
+    spread: SpreadFound | None,
+    scale: float,
+    random: KeyedRandom,
+) -> tuple[MeanSearch, Residuals, list[Estimate], tuple[Tried, ...]]:
+    """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
+
+    Returns the search, its residuals, the effects with what was found beside them, and what was tried last.
+    """
+    model = with_effects(measurement.model, [from_mean(each, part).entry for each in had])
+    value = residuals_against(measurement, model, part)
+    rows = np.flatnonzero(np.isfinite(value))
+    at = replace(part, value=value).part(rows)
+    columns = [_columns(each)[rows] for each in had]
+    names = {each.candidate.name for each in had}
+    others = [family.part(rows) for family in families if family.name not in names or family.empirical]
+    weighed = _weighed(part, spread, scale).part(rows)
+    beside = replace(weighed, value=at.value, pose=np.concatenate([at.pose, *columns], axis=1))
+    search = MeanSearch(beside, others, random.child("again"))
+    chosen, tried = search.select()
+    fit = search.refined([item.candidate for item in chosen])[1]
+    kept, start = [], at.pose.shape[1]
+    for each, matrix in zip(had, columns, strict=True):
+        place = slice(start, start := start + matrix.shape[1])
+        moved = replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place])
+        kept.append(replace(moved, candidate=each.candidate.part(rows)))
+    return search, at, [*kept, *_estimates(search, chosen)], tried
+
+
+def _columns(found: Estimate) -> FloatArray:
+    """(n, k) of its coefficients, a sine's with that of its frequency."""
+    wave = found.candidate.wave
+    return found.candidate.columns if wave is None else wave.with_slope(found.candidate.period, found.values[:2])

@@ -1,0 +1,69 @@
+"""The rigid-body nuisance: where the sensor really stood against the survey."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.gap.measurement import Measurement
+from pipeline.gap.residuals import Residuals
+from pipeline.rigid import rotation_matrix
+from scene.mesh import FloatArray
+from sensors.camera import Camera, CameraPair
+
+_ROUNDS = 6
+_OUTLIER = 3.5
+_FEWEST = 100
+
+
+def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
+    """(n,) residuals after a robust registration, the pose (6,), and how many predicted sigmas their spread is (at least 1)."""
+    kept, scale = residuals.smooth.copy(), 1.0
+    value, pose = residuals.value, np.zeros(6)
+    for _ in range(_ROUNDS):
+        pose = pose_of(residuals.part(kept))
+        value = residuals.value - residuals.pose @ pose
+        z = np.abs(value / residuals.sigma)
+        scale = max(1.0, 1.4826 * float(np.median(z[residuals.smooth])))
+        kept = residuals.smooth & (z < _OUTLIER * scale)
+        if kept.sum() < _FEWEST:
+            kept = residuals.smooth
+    return value, pose, scale
+
+
+def pose_of(residuals: Residuals) -> FloatArray:
+    """(6,) shift (m) and turn (rad) by weighted least squares."""
+    weighted = residuals.pose / residuals.sigma[:, None]
+    return np.asarray(np.linalg.lstsq(weighted, residuals.value / residuals.sigma, rcond=None)[0])
+
+
+def moved(measurement: Measurement, pose: FloatArray) -> Measurement:
+    """The measurement with its sensor shifted (m) and turned (rad) in the wall frame, and what it measured with it.
+
+    What the sensor recorded stays as it is. A pair of cameras turns about the left one.
+    """
+    turn = rotation_matrix(pose[3:])
+    centre = _centre(measurement)
+    points = (measurement.cloud.points - centre) @ turn.T + centre + pose[:3]
+    cloud = replace(measurement.cloud, points=points)
+    if measurement.station is not None:
+        position, rotation = measurement.station
+        return measurement.changed(cloud=cloud, station=(position + pose[:3], turn @ rotation))
+    assert measurement.cameras is not None
+    axes = measurement.frame.rotation
+    world, shift = axes.T @ turn @ axes, axes.T @ pose[:3]
+    left = measurement.cameras.left.position
+
+    def each(camera: Camera) -> Camera:
+        return replace(camera, rotation=world @ camera.rotation, position=left + world @ (camera.position - left) + shift)
+
+    cameras = CameraPair(each(measurement.cameras.left), each(measurement.cameras.right))
+    return measurement.changed(cloud=cloud, cameras=cameras)
+
+
+def _centre(measurement: Measurement) -> FloatArray:
+    if measurement.station is not None:
+        return measurement.station[0]
+    assert measurement.cameras is not None
+    return measurement.cameras.in_wall_frame(measurement.frame).left.position
