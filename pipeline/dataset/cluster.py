@@ -45,7 +45,7 @@ def fill_on_cluster(orders: list[Order], count: int, scheduler: str) -> Iterator
 
 
 def _threads_each(count: int) -> int:
-    return max(1, (os.cpu_count() or 1) // count)
+    return max(1, len(os.sched_getaffinity(0)) // count)
 
 
 def _local(stack: ExitStack, count: int) -> Client:
