@@ -5,14 +5,15 @@
     python benchmarks/dataset.py memory [--epochs 100] [--sensor tls]   peak memory of one worker over many epochs
 
 Rates are of wall time and of processor time; on a machine that others use too only the latter tells of the program.
-The projection plays the plan through: a free worker takes the next epoch and pays for a stage (wall, frame, scene, reference) where
-it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two workers.
+The projection plays the plan through: a free worker takes the next epoch and pays for a stage (wall, frame, scene, reference)
+where it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two workers.
 """
 
 from __future__ import annotations
 
 import argparse
 import heapq
+import os
 import tempfile
 import time
 from collections import defaultdict
@@ -32,10 +33,14 @@ SIZES = ("small", "medium", "large")
 
 
 def timed(config: DatasetConfig, workers: int) -> tuple[float, DatasetSummary]:
-    """Wall time of a whole set by some workers, s, the start of their processes and the card included."""
+    """Wall time of a whole set by some workers with a core each, s, the start of their processes and the card included."""
+    cores = os.sched_getaffinity(0)
+    if workers:
+        os.sched_setaffinity(0, sorted(cores)[:workers])
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         summary = make_dataset(config, Path(folder) / "set", Workers(workers))
+        os.sched_setaffinity(0, cores)
         return time.perf_counter() - start, summary
 
 
@@ -123,9 +128,7 @@ def project(epochs: int) -> None:
     print(f"set-up {set_up}\nepoch {epoch} processor s")
     tiles = sum(taken["tiles"] for taken in summary.made)
     cpu = sum(taken["cpu_seconds"] for taken in summary.made)
-    print(
-        f"{tiles} tiles in {wall:.0f} s of wall time, {cpu:.0f} s of processor time: {60 * tiles / cpu:.1f} tiles a core minute"
-    )
+    print(f"{tiles} tiles in {wall:.0f} s, {cpu:.0f} s of processor time: {60 * tiles / cpu:.1f} tiles a core minute")
     print(f"played through, the epochs just timed take one worker {makespan(planned_epochs(config), 1, set_up, epoch):.0f} s")
     print("| cores | nine sets and tests, both sensors | of the ideal |\n|---|---|---|")
     ideal = makespan(whole, 1, set_up, epoch)
