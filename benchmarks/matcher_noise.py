@@ -1,8 +1,8 @@
 """The simulated matching noise fitted to the errors of semi-global matching, and both in one table (docs/matching.md).
 
-Fitted by differential evolution and a simplex search on two rendered walls, once for SGBM and once for SGBM with refinement; validated on walls and on
-real pictures (the Middlebury motorcycle) that the fit has not seen. Pixels are those of the matched pictures, so the model's
-lengths, given in px of the full frame, count by the reduction (4 at medium quality).
+Fitted by differential evolution and a simplex search on two rendered walls, once for SGBM and once for SGBM with refinement;
+validated on walls and on real pictures (the Middlebury motorcycle) that the fit has not seen. Pixels are those of the matched
+pictures, so the model's lengths, given in px of the full frame, count by the reduction (4 at medium quality).
 """
 
 from __future__ import annotations
@@ -41,9 +41,7 @@ def main() -> None:
     models = {matcher: fit([case.middle() for case in fitted_on], matcher, chosen.generations) for matcher in MATCHERS}
     for matcher, values in models.items():
         print(f"{matcher}, px of the frame at medium quality: {describe(model(values, 4))}\n")
-    print(
-        "| pair | errors of | matched % | bias | MAD-sigma | 95 % of abs | > 1 px % | kurtosis | r(1) | r(8) | locking | fattened % |"
-    )
+    print("| pair | errors of | matched % | bias | MAD-sigma | 95 % | > 1 px % | kurtosis | r(1) | r(8) | locking | fattened % |")
     print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     for case in fitted_on:
         report(case, models, "fitted on")
