@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.gap import stereo_signatures, tls_signatures
 from pipeline.gap.candidates import PLACE, Candidate, Grid, free_forms, places
 from pipeline.gap.cells import Cells
-from pipeline.gap.entries import Estimate, Named, from_comb, from_mean, from_spread, with_effects
+from pipeline.gap.entries import Estimate, Named, from_comb, from_mean, from_spread, is_possible, with_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.quantization import find_comb
 from pipeline.gap.registration import registered
@@ -66,37 +66,60 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | G
     return [*named, *free, *places(part.at)]
 
 
-def name_effects(measurement: Measurement, part: Residuals, scale: float, random: KeyedRandom) -> tuple[list[Named], Naming]:
+def name_effects(
+    measurement: Measurement,
+    part: Residuals,
+    scale: float,
+    random: KeyedRandom,
+    left_out: frozenset[tuple[str, bool]] = frozenset(),
+) -> tuple[list[Named], Naming]:
     """Effects on the mean and on the spread.
 
     What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
-    slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread.
+    slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread; left_out:
+    families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word.
     """
     named: list[Named] = []
+    whole, whole_scale = part, scale
     tls = part.sensor == "tls"
     comb = find_comb(part.geometry.measured_m) if tls and not believes(measurement, "range_quantization") else None
     if comb is not None:
         named.append(from_comb(comb, part))
         part = replace(part, sigma=np.sqrt(part.sigma**2 + comb.step_m**2 / 12))
         scale = 1.0
-    families = families_of(measurement, part)
+    families = [each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out]
     spread = find_spread(part, Cells.over(part.at), registered(part)[0], random)
     first = MeanSearch(_weighed(part, spread, scale), families, random)
     chosen, tried = first.select()
     estimates, last, at = _estimates(first, chosen), first, part
     physical = [each for each in estimates if not each.candidate.empirical]
-    if physical:
+    beyond = _beyond(measurement, estimates, at)
+    if physical and not beyond:
         last, at, estimates, tried = _again(measurement, part, families, physical, spread, scale, random)
+        beyond = _beyond(measurement, estimates, at)
+    if beyond:
+        return name_effects(measurement, whole, whole_scale, random, left_out | beyond)
     if chosen:
         spread = find_spread(at, last.cells, last.without([each.chosen for each in estimates[len(physical) :]]), random)
     named += [from_mean(each, at) for each in estimates]
     if spread is not None:
         named.append(from_spread(spread))
     names, cosines, survival = first.identifiability()
-    remaining = {"p_value": last.p_value(tried[0].score) if tried else 1.0, "note": "; ".join(part.notes)}
+    remaining = {"p_value": last.p_value(tried[0].score) if tried else 1.0, "note": "; ".join([*part.notes, *_words(left_out)])}
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     shown = tuple(item for item in (chosen[0].tried if chosen else tried) if not item.name.startswith(PLACE))
     return named, Naming(shown, remaining, table, last.reference_sigma([each.chosen for each in estimates[len(physical) :]]))
+
+
+def _beyond(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
+    """Families whose estimate lies beyond the bounds of the effect."""
+    wrong = [each for each in estimates if not is_possible(measurement.model, from_mean(each, part).entry)]
+    return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
+
+
+def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
+    said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out))
+    return [f"{what} left out: the best value is beyond what a config may hold" for what in said]
 
 
 def _weighed(part: Residuals, spread: SpreadFound | None, scale: float) -> Residuals:
