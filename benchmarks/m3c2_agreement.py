@@ -20,7 +20,6 @@ from pipeline.formats.geotiff import read_geotiff
 from pipeline.m3c2 import core_grid
 from pipeline.run import simulate
 
-
 COLUMNS = (
     "sensor, direction",
     "stable: raster NMAD",

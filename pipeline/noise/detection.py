@@ -71,7 +71,8 @@ def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np
 class BlockSeen:
     """What a difference map shows of a block.
 
-    size_m: geometric mean of its three axes; depth_m: true mean depth over its footprint; footprint_px: pixels of the map on
+    size_m: (2 V)^(1/3) for the rock V that fell, the side of a cube that sat in the rock with half of its height, as
+    `scarpsim inspect` plans with; depth_m: true mean depth over its footprint; footprint_px: pixels of the map on
     which it changed the wall; data_share: of these, with data; mean_m: of the differences there, None with too little data;
     limit_m: level of detection of that mean; volume_m3, measured_volume_m3: true, and sum of the differences over the footprint;
     in_view: whether the sensor saw at least half of the footprint before the block fell.
@@ -156,7 +157,7 @@ def blocks_seen(
             BlockSeen(
                 epoch=epoch,
                 label=record["label"],
-                size_m=float(np.prod(record["size_m"]) ** (1 / 3)),
+                size_m=float((2 * max(record["volume_m3"], 0.0)) ** (1 / 3)),
                 depth_m=float(np.mean(true_change[window][footprint], dtype=np.float64)) if count else 0.0,
                 footprint_px=count,
                 data_share=float(np.mean(~np.isnan(differences))) if count else 0.0,
@@ -164,7 +165,7 @@ def blocks_seen(
                 limit_m=limit,
                 volume_m3=record["volume_m3"],
                 measured_volume_m3=float(np.nansum(differences, dtype=np.float64) * area),
-                in_view=bool(count) and float(np.mean(visible[window][footprint])) >= LEAST_SHARE,
+                in_view=bool(count) and record["volume_m3"] > 0 and float(np.mean(visible[window][footprint])) >= LEAST_SHARE,
                 seen=mean is not None and limit is not None and mean > limit,
             )
         )

@@ -133,13 +133,13 @@ def detection_figure(found: Sequence[Assessment]) -> bytes:
         error = [100 * (item.volume_error or 0.0) for item in shown]
         spread = [100 * (item.volume_spread or 0.0) for item in shown]
         volume.errorbar(middle, error, spread, fmt="o-", color=colour, markersize=3.5, linewidth=1.2, capsize=2)
-    for axes, label in ((by_size, "size of the block, m"), (by_depth, "mean depth of the niche, m")):
+    for axes, label in ((by_size, "size of the block, (2 V)$^{1/3}$, m"), (by_depth, "mean depth of the niche, m")):
         axes.axhline(95, color="0.3", linewidth=0.8, linestyle=":")
         axes.set_ylim(-3, 103)
         dress(axes, label, "blocks seen, %")
     volume.axhline(0, color="0.3", linewidth=0.8, linestyle=":")
     volume.set_ylim(-100, 100)
-    dress(volume, "size of the block, m", "error of the volume, %: median, NMAD")
+    dress(volume, "size of the block, (2 V)$^{1/3}$, m", "error of the volume, %: median, NMAD")
     for axes in (by_size, by_depth, volume):
         _metric(axes)
     _grid_and_legend(figure, [by_size, by_depth, volume])
@@ -158,7 +158,7 @@ def table_figure(found: Sequence[Assessment]) -> bytes:
         axes.set_yscale("log")
         _metric(axes, both=True)
         axes.set_title(each.name, fontsize=10, loc="left")
-        dress(axes, "size of the block, m", "mean depth of the niche, m")
+        dress(axes, "size of the block, (2 V)$^{1/3}$, m", "mean depth of the niche, m")
     bar = figure.colorbar(image, ax=row.tolist(), pad=0.01)
     bar.ax.tick_params(labelsize=8)
     bar.set_label("blocks seen, %", fontsize=9)

@@ -71,6 +71,7 @@ def test_blocks_that_must_and_must_not_be_seen() -> None:
     assert (deep.seen, shallow.seen, hidden.seen, absent.seen) == (True, False, False, False)
     assert (deep.in_view, hidden.in_view, absent.in_view) == (True, False, False)
     assert deep.footprint_px == 100
+    assert deep.size_m == pytest.approx(1.0)
     assert deep.depth_m == pytest.approx(0.1)
     assert deep.mean_m == pytest.approx(0.1, abs=4 * SIGMA / 10)
     assert deep.measured_volume_m3 == pytest.approx(0.1, abs=4 * SIGMA * 0.1)  # depth times 1 m2

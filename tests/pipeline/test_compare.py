@@ -1,0 +1,170 @@
+"""Comparisons end to end: who is compared, what all share, what the truth says, and the files that are left."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.cli.main import main
+from pipeline.formats.geotiff import write_geotiff
+from pipeline.noise.assess import assess
+from pipeline.noise.compare import Trial, compare, rockfalls
+from pipeline.noise.contestants import contestants
+from pipeline.noise.covariates import edge_distance
+from scene.blocks import RockfallConfig
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.keyed_random import KeyedRandom
+from scene.mesh import WALL
+
+SMALL: dict[str, Any] = {
+    "seed": 3,
+    "wall": {"style": "glendale", "width_m": 5.0, "height_m": 4.0, "resolution_m": 0.06, "seed": 1},
+    "rockfall": {"count": 8, "size_m": {"kind": "gaussian", "mean": 0.3, "sigma": 0.02}},
+    "cameras": {"distance_m": 20.0, "base_m": 5.0},
+    "depth_map": "low",
+    "station": {"distance_m": 20.0},
+    "scanner": {"azimuth_step_rad": 0.002, "zenith_step_rad": 0.002},
+    "difference": {"gsd_m": 0.04},
+    "sensor": [{"sensor": "stereo"}, {"sensor": "tls", "noise": {"range_sigma_m": 0.002, "angle_sigma_rad": 0.0}}],
+}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("compare") / "site.yaml"
+    path.write_text(yaml.safe_dump(SMALL))
+    return path
+
+
+@pytest.fixture(scope="module")
+def trial(site: Path) -> Trial:
+    """The scanner with its own noise, and with ten times as much."""
+    noisy = site.parent / "noisy.yaml"
+    noisy.write_text("sensor: tls\nnoise: {range_sigma_m: 0.02, angle_sigma_rad: 0.0}\n")
+    sensors = [each for each in contestants([str(site), str(noisy)]) if each.sensor == "tls"]
+    return compare(sensors, 2, (0.1, 0.4))
+
+
+def test_who_is_compared(site: Path) -> None:
+    found = contestants([str(site), "riegl_vz400i", "glendale_high", str(site)])
+    assert [(each.name, each.sensor) for each in found] == [
+        ("site_stereo", "stereo"),
+        ("site_tls", "tls"),
+        ("riegl_vz400i", "tls"),
+        ("glendale_high", "stereo"),
+        ("site_stereo_stereo", "stereo"),
+        ("site_tls_tls", "tls"),
+    ]
+    first = found[0].config
+    assert all(each.config.wall == first.wall and each.config.seed == 3 for each in found)
+    assert found[2].config.scanner != first.scanner
+    assert found[2].config.station == first.station
+    assert found[3].config.stereo_model() != first.stereo_model()
+
+
+def test_a_site_beside_another_gets_the_first_ones_wall(site: Path) -> None:
+    found = contestants([str(site), "bulga"], ["difference.gsd_m=0.05"])
+    assert found[-1].config.wall == found[0].config.wall
+    assert found[-1].config.cameras != found[0].config.cameras
+    assert {each.config.difference.gsd_m for each in found} == {0.05}
+
+
+def test_an_unknown_name_is_told_with_the_nearest() -> None:
+    with pytest.raises(InputError, match="riegl_vz400i"):
+        contestants(["riegl_vz40i"])
+
+
+def test_sizes_grow_and_leave_room() -> None:
+    bounds = np.array([[0.0, 0.0, 0.0], [10.0, 5.0, 1.0]])
+    plans = rockfalls(RockfallConfig(count=100), bounds, 3, (0.1, 0.9))
+    sides = [plan.size_m.mean for plan in plans]  # type: ignore[union-attr]
+    assert sides == pytest.approx([0.1, 0.3, 0.9])
+    assert [plan.count for plan in plans] == [100, 24, 3]  # 15 % of 50 m2 over (1.5 s + 0.1)^2
+    assert rockfalls(RockfallConfig(), bounds, 2, None) == [RockfallConfig()] * 2
+    with pytest.raises(InputError, match="smallest <= largest"):
+        rockfalls(RockfallConfig(), bounds, 2, (0.5, 0.1))
+
+
+def test_all_see_the_same_wall_and_blocks(trial: Trial) -> None:
+    quiet, noisy = trial.seen
+    assert quiet.changes.shape == noisy.changes.shape == (2, *trial.grid.shape)
+    for number, epoch in enumerate(trial.epochs):
+        assert not (epoch.stable & (epoch.change != 0)).any()
+        assert not (epoch.stable & (epoch.block != WALL)).any()
+        niche = epoch.change > (0.0, 0.03)[number]
+        assert np.count_nonzero(niche & ~np.isnan(quiet.changes[number])) > 10
+        assert np.nanmedian((quiet.changes[number] - epoch.change)[niche]) == pytest.approx(0, abs=0.02)
+
+
+def test_planted_noise_is_measured(trial: Trial) -> None:
+    """Ranges with 2 and 20 mm, in two epochs, interpolated by triangles: the NMAD of z on stable ground lies between sqrt(2 / 3)
+    (middle of a triangle) and sqrt(2) (vertex) times sigma over the cosine between ray and wall's normal (0.9 and more); the
+    tenfold noise gives the tenfold NMAD, to a fifth, as steps along slopes and ICP add to both.
+    """
+    found = [assess(trial, seen, KeyedRandom(1)) for seen in trial.seen]
+    quiet, noisy = found
+    for each, sigma in ((quiet, 0.002), (noisy, 0.02)):
+        assert np.sqrt(2 / 3) * sigma < each.noise.stable.nmad < 1.15 * np.sqrt(2) * sigma
+        assert each.noise.stable.count > 5000
+        assert each.noise.model.sill_m2 == pytest.approx(each.noise.stable.nmad**2, rel=0.5)
+        assert 0.5 < each.complete_of_visible <= 1
+    assert noisy.noise.stable.nmad / quiet.noise.stable.nmad == pytest.approx(10, rel=0.2)
+    assert sum(block.seen for block in quiet.detection.blocks) >= sum(block.seen for block in noisy.detection.blocks)
+    limits = [np.median([block.limit_m for block in each.detection.blocks if block.limit_m]) for each in found]
+    assert limits[1] / limits[0] == pytest.approx(10, rel=0.35)
+    assert quiet.noise.median_level_m is not None
+    assert quiet.noise.median_level_m == pytest.approx(1.96 * quiet.noise.stable.nmad, rel=0.35)
+    assert quiet.detection.alarms / quiet.detection.trials < 0.12
+
+
+def test_edges_are_steps() -> None:
+    heights = np.zeros((5, 8))
+    heights[:, 4:] = 1.0
+    distance = edge_distance(heights, 0.1)
+    assert distance[2] == pytest.approx(0.1 * np.array([3, 2, 1, 0, 0, 1, 2, 3]))
+    assert np.isinf(edge_distance(np.zeros((3, 3)), 0.1)).all()
+
+
+def test_the_command_and_its_folder(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    maps, out = tmp_path / "real", tmp_path / "out"
+    grid = Grid(0.0, 2.0, 0.05, 50, 40)
+    for number in (1, 2):
+        values = KeyedRandom(number).generator().normal(0, 0.005, grid.shape)
+        write_geotiff(maps / f"difference_{number:03d}.tif", values, grid)
+    words = [
+        "compare",
+        str(site),
+        "--measured",
+        str(maps),
+        "--epochs",
+        "2",
+        "--sizes-m",
+        "0.1",
+        "0.4",
+        "--out",
+        str(out),
+        "--quiet",
+    ]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "site_tls" in printed
+    assert str(out / "report.html") in printed
+    record = json.loads((out / "comparison.json").read_text())
+    assert [each["name"] for each in record["sensors"]] == ["site_stereo", "site_tls"]
+    assert record["measured"][0]["noise"]["stable"]["nmad_m"] == pytest.approx(0.005, rel=0.05)
+    names = {"maps", "level_of_detection", "noise", "by_covariate", "detection", "size_and_depth"}
+    assert {path.stem for path in out.glob("*.png")} == names
+    assert (out / "report.html").read_text().count("<img") == len(names)
+    with (out / "blocks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == sum(each["detection"]["blocks"] for each in record["sensors"])
+    assert (out / "site_tls/difference_002.tif").exists()
+    assert main(words) == 2
+    assert "not an empty folder" in capsys.readouterr().err
