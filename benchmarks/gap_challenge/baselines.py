@@ -13,7 +13,7 @@ from benchmarks.gap_challenge.casting import Array
 from benchmarks.gap_challenge.strength import Families, basis
 
 Z_LIMIT, BIC_LIMIT = 3.0, 10.0
-_CLIP, _MOST_POINTS, _BLOCKS = 4.0, 20_000, 12
+_CLIP, _ROUNDS, _MOST_POINTS, _BLOCKS = 5.0, 2, 20_000, 12
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def rivals(data: Data, families: Families, forms: Mapping[str, Sequence[Array]],
 def _sound(data: Data) -> Array:
     """Rows within some sigmas of a robust registration."""
     kept = np.arange(len(data.value))
-    for _ in range(5):
+    for _ in range(_ROUNDS):
         pose = np.linalg.lstsq(data.pose[kept] / data.sigma[kept, None], data.value[kept] / data.sigma[kept], rcond=None)[0]
         z = np.abs(data.value - data.pose @ pose) / data.sigma
         kept = np.flatnonzero(z < _CLIP * max(1.0, 1.4826 * float(np.median(z))))

@@ -254,7 +254,9 @@ def _drawn(
         if kind in _LINEAR:
             start, most = _LINEAR[kind]
             unit = effects.shape(kind, part, random)
-            alone = mean_strength(kind, _shown(scene, kind, unit, part), base, families, _whitener(scene, white, part, where))
+            alone = mean_strength(
+                kind, _shown(scene, kind, unit, part), base, families, _whitener(scene, white, part, where, unit)
+            )
             found.append((kind, effects.times(unit, min(target.value / max(target.of(alone), 1e-9), most / start)), None))
         elif kind == "regularization_noise":
             found.append((kind, *_regularization(scene, part, effects.shape(kind, part, random), target.value)))
@@ -269,11 +271,11 @@ def _drawn(
     added = {kind: effects.variance(kind, p, part) for kind, p, _ in found}
     shown = {kind: _shown(scene, kind, p, part)[:, None] for kind, p, _ in found if kind in _LINEAR}
     whole = sum(added.values(), white)
-    whiten, strong = _whitener(scene, whole, part, where), []
+    strong = []
     for kind, p, strength in found:
         if kind in _LINEAR:
             beside = np.concatenate([base, *(column for other, column in shown.items() if other != kind)], axis=1)
-            strength = mean_strength(kind, shown[kind][:, 0], beside, families, whiten)
+            strength = mean_strength(kind, shown[kind][:, 0], beside, families, _whitener(scene, whole, part, where, p))
         elif strength is None:
             strength = spread_strength(kind, added[kind], whole - added[kind], {"parallax_noise": [np.ones_like(white)]})
         strong.append((kind, p, strength))
@@ -286,14 +288,16 @@ def _shown(scene: Set, kind: str, p: Parameters, part: Image) -> Array:
     return damping * _signature(scene, kind, p, part)
 
 
-def _whitener(scene: Set, variance: Array, part: Image, where: Array) -> Whitener:
-    """Correlated: the reference's error, by its change of the disparity, and the regularization, one per node of its grid."""
+def _whitener(scene: Set, variance: Array, part: Image, where: Array, p: Parameters) -> Whitener:
+    """Correlated: the reference's error, by its change of the disparity. The regularization counts as white noise of its power at
+    the effect's wavelength: N sigma^2 for N points per node of its grid, less for a short row jitter (sinc^4)."""
     at = where[:, [0, 2]]
     waved = wave_numbers(scene.reference[1], 200, np.random.default_rng(0))
     angle = at @ waved.T
     per_metre = part.disparity**2 / (scene.nominal.f * scene.nominal.base)
     error = np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * (scene.reference[0] / np.sqrt(200) * per_metre)[:, None]
-    return Whitener(np.sqrt(variance), at, error, (scene.noise[1] ** 2, (_STEP_PX / scene.step) ** 2))
+    power = (_STEP_PX / scene.step) ** 2 * np.sinc(_STEP_PX / p.get("rows_per_cycle", np.inf)) ** 4
+    return Whitener(np.sqrt(variance + max(power - 4 / 9, 0.0) * scene.noise[1] ** 2), at, error)
 
 
 def _regularization(scene: Set, part: Image, unit: Parameters, target: float) -> tuple[Parameters, Strength]:

@@ -56,11 +56,10 @@ class Strength:
 class Whitener:
     """Columns over points to columns of independent unit errors.
 
-    sigma: (n,) white; at: (n, 2) m; features: (n, f) shapes whose sum with independent normal weights is the correlated error;
-    patch: variance and number of points of an error that is one per patch of points, smaller than a cell.
+    sigma: (n,) white; at: (n, 2) m; features: (n, f) shapes whose sum with independent normal weights is the correlated error.
     """
 
-    def __init__(self, sigma: Array, at: Array, features: Array, patch: tuple[float, float] = (0.0, 1.0)) -> None:
+    def __init__(self, sigma: Array, at: Array, features: Array) -> None:
         stride = max(len(sigma) // _MOST_POINTS, 1)
         self.rows = slice(None, None, stride)
         self._scale = np.sqrt(len(sigma) / len(sigma[self.rows]))
@@ -70,8 +69,7 @@ class Whitener:
         self._cell = np.unique(corner[:, 0] * 100_000 + corner[:, 1], return_inverse=True)[1].ravel()
         self._weight = np.bincount(self._cell, 1 / self._sigma**2)
         mean = self._means(features[self.rows])
-        count = np.bincount(self._cell) * self._scale**2
-        white = np.diag(1 / self._weight / self._scale**2 + patch[0] * np.minimum(patch[1] / count, 1.0))
+        white = np.diag(1 / self._weight) / self._scale**2
         self._root = np.linalg.cholesky(white + mean @ mean.T)
 
     def _means(self, columns: Array) -> Array:
