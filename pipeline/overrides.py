@@ -58,7 +58,8 @@ def _place(container: Any, part: str, name: str, where: str) -> str | int:
     if isinstance(container, dict):
         return part
     if not isinstance(container, list):
-        raise InputError(f"'{name}' is {container!r} and has no '{part}' in it", where=where)
+        remedy = f"name the preset by scanner.preset={container}, so that keys can stand beside it" if name == "scanner" else ""
+        raise InputError(f"'{name}' is {container!r} and has no '{part}' in it", where=where, remedy=remedy)
     if not (part.isdecimal() and int(part) < len(container)):
         allowed = f"0 to {len(container) - 1}" if container else f"none, the list is empty; set it as a whole: {name}=[...]"
         raise InputError(f"'{part}' is no index of the list '{name}'", where=where, allowed=allowed)

@@ -124,6 +124,13 @@ def test_keys_beside_the_preset_go_before_it(bare: Path) -> None:
     assert scanner.zenith_step_rad == ScannerConfig().zenith_step_rad
 
 
+def test_a_key_beside_a_bare_name_is_refused_with_the_way_to_write_it(bare: Path) -> None:
+    with pytest.raises(InputError, match=r"scanner\.preset=leica_p40"):
+        load_config(bare, ["scanner=leica_p40", "scanner.azimuth_step_rad=0.001"], "tls", None)
+    config = load_config(bare, ["scanner.preset=leica_p40", "scanner.azimuth_step_rad=0.001"], "tls", None)
+    assert config.scanner.azimuth_step_rad == 0.001
+
+
 def test_a_model_of_ones_own_stays(bare: Path) -> None:
     bare.write_text("scanner: leica_p40\nsensor: {sensor: tls, noise: {range_sigma_m: 0.007}}\n")
     assert load_config(bare, [], "tls", None).tls_model().noise.range_sigma_m == 0.007
