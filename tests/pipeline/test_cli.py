@@ -77,7 +77,10 @@ def test_results_go_to_a_new_folder_each_time(pipeline: Pipeline, tmp_path: Path
 
 MISTAKES = [
     (["simulat"], "did you mean 'simulate'?"),
-    (["frobnicate"], "allowed: simulate, inspect, dataset, gap, init, doctor"),
+    (
+        ["frobnicate"],
+        "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, gap, train, detect, evaluate, init, doctor",
+    ),
     (["--versio"], "did you mean '--version'?"),
     (["simulate"], "required: --sensor"),
     (["simulate", "--senser", "tls"], "unknown option '--senser'; did you mean '--sensor'?"),
