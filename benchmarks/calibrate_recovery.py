@@ -30,22 +30,23 @@ from pipeline.noise.maps import noise_map
 from pipeline.noise.parameters import parameters
 from pipeline.progress import Progress
 from pipeline.site import prepare_site
+from scene.backend import dr
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "calibrate.md"
 EPOCHS = 2
 SETTINGS = [
-    "wall.width_m=12",
-    "wall.height_m=8",
-    "wall.resolution_m=0.05",
+    "wall.width_m=9",
+    "wall.height_m=6",
+    "wall.resolution_m=0.06",
     "depth_map=low",
     "difference.gsd_m=0.04",
-    "scanner.azimuth_step_rad=0.0008",
-    "scanner.zenith_step_rad=0.0008",
-    "calibration.windows=12",
+    "scanner.azimuth_step_rad=0.001",
+    "scanner.zenith_step_rad=0.001",
+    "calibration.windows=10",
     "calibration.window_px=24",
-    "calibration.simulations=100",
+    "calibration.simulations=80",
 ]
 TRUTH = {
     "parallax_sigma_px": (0.2, 0.8),
@@ -101,6 +102,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=50)
     parser.add_argument("--out", type=Path, default=Path("runs/calibrate_recovery"))
     arguments = parser.parse_args()
+    dr.set_thread_count(1)  # kernels are small; run both sensors side by side
     arguments.out.mkdir(parents=True, exist_ok=True)
     found = []
     for number in range(arguments.trials):

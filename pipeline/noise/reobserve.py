@@ -40,7 +40,7 @@ from sensors.pulses import Pulses
 from sensors.stereo import StereoPair
 from sensors.tls import LaserScanner
 
-_LATTICE_POINTS = 6000
+_LATTICE_POINTS = 4000
 """Points by which an observation is registered: more of them would not bring it nearer to a registration by all."""
 _MARGIN_CELLS = 3
 _MARGIN_M = 0.05
@@ -104,6 +104,7 @@ class Reobserver:
         self._patches, patch_cells = self._surround(whole)
         lattice = _lattice(whole)
         self._lattice_start = len(patch_cells)
+        self._lattice_points = whole.points.reshape(-1, 3)[lattice]
         self.cells = np.concatenate([patch_cells, lattice]).astype(np.uint32)
 
     @cached_property
@@ -149,10 +150,14 @@ class Reobserver:
         return _asked(self.sensor, model, self.cells).observe(self.caster, random).points.reshape(-1, 3)
 
     def _registration(self, points: FloatArray, random: KeyedRandom) -> RigidTransform:
+        """ICP to the wall as it is, from where the lattice's own points, which are known without noise, bring it."""
         lattice = points[self._lattice_start :]
+        known = ~np.isnan(lattice[:, 0])
+        first = _best_rigid(lattice[known], self._lattice_points[known])
         assert self.config.icp is not None
-        config = self.config.icp.model_copy(update={"subsample_points": False})
-        return register_to(self.target, lattice[~np.isnan(lattice[:, 0])], config, random, threads=1).transform
+        config = self.config.icp.model_copy(update={"subsample_points": False, "outlier_threshold_decay_iteration": 1})
+        then = register_to(self.target, first.apply(lattice[known]), config, random, threads=1).transform
+        return RigidTransform(then.rotation @ first.rotation, then.rotation @ first.translation + then.translation)
 
     def _surface(self, points: FloatArray) -> TriangleMesh:
         """The patches as one mesh."""
@@ -198,6 +203,15 @@ class Reobserver:
             numbers.append(block.ravel())
             start += block.size
         return patches, np.concatenate(numbers)
+
+
+def _best_rigid(points: FloatArray, goals: FloatArray) -> RigidTransform:
+    """The rotation and shift of (n, 3) points that bring them nearest to their (n, 3) goals (Kabsch 1976)."""
+    middle, goal = points.mean(axis=0), goals.mean(axis=0)
+    u, _, v = np.linalg.svd((points - middle).T @ (goals - goal))
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    rotation = (u @ turn @ v).T
+    return RigidTransform(rotation, goal - rotation @ middle)
 
 
 def _lattice(whole: Observation) -> NDArray[np.int64]:

@@ -41,8 +41,11 @@ _APPROACHES = 3
 _MORE_ROUNDS = 2
 _WIDEN = 2.0
 _LEAST_SPREAD = 0.03
-_SHRINK = 0.05
-"""Share of the diagonal in the covariance of the statistics."""
+_SHRINK, _SHRINK_LIMITS = 0.5, (0.05, 0.9)
+"""Share of the diagonal in the covariance of the statistics, times their number over the degrees of freedom: few simulations know
+their variances, but not which combinations of them hardly vary."""
+_LEAST_SETS = 30
+"""In a round of the approach."""
 
 Simulate = Callable[[FloatArray, int, KeyedRandom], FloatArray]
 """Statistics (m,) of one set of epochs simulated with k parameter values."""
@@ -82,8 +85,10 @@ class Surface:
         design = _design((sample.x - centre) / scale)
         coefficients = np.asarray(np.linalg.lstsq(design, sample.s, rcond=None)[0], dtype=np.float64)
         left = sample.s - design @ coefficients
-        covariance = left.T @ left / max(len(left) - design.shape[1], 1)
-        covariance = (1 - _SHRINK) * covariance + np.diag(_SHRINK * np.diag(covariance) + MODEL_SIGMA**2)
+        freedom = max(len(left) - design.shape[1], 1)
+        covariance = left.T @ left / freedom
+        share = float(np.clip(_SHRINK * len(covariance) / freedom, *_SHRINK_LIMITS))
+        covariance = (1 - share) * covariance + np.diag(share * np.diag(covariance) + MODEL_SIGMA**2)
         factor = np.linalg.cholesky(covariance)
         return cls(centre, scale, coefficients, covariance, linalg.solve_triangular(factor, np.eye(len(factor)), lower=True))
 
@@ -118,7 +123,8 @@ class Found:
 
     x: (k,) the estimate, bias removed; low, high: (k,) of its interval; errors: (n, k) of the estimates of simulated sets;
     correlation: (k, k) of these; surface: of the last round; cost: J at the minimum; misfit_p: see the module; misfit: (m,)
-    measured minus expected statistics in standard deviations; history: maps simulated and minimum, after each round.
+    measured minus expected statistics in standard deviations; history: maps simulated and minimum, after each round;
+    settled: whether the minimum lies among the simulations of the last round.
     """
 
     x: FloatArray
@@ -131,6 +137,7 @@ class Found:
     misfit: FloatArray
     history: tuple[tuple[int, FloatArray], ...]
     maps: int
+    settled: bool
 
     @property
     def correlation(self) -> FloatArray:
@@ -162,15 +169,15 @@ class Search:
             surface = Surface.fit(sample)
             minimum = surface.minimum(observed, _nearest(surface, sample, observed), self.low, self.high)
             history.append((self.maps, minimum))
-            inside = np.abs((minimum - sample.x.mean(axis=0)) / sample.x.std(axis=0)).max() < _WIDEN
+            inside = bool(np.abs((minimum - sample.x.mean(axis=0)) / sample.x.std(axis=0)).max() < _WIDEN)
             x, spread = minimum, surface.spread(minimum)
             if inside:
                 break
-        return self._judged(observed, sample, surface, minimum, confidence, tuple(history))
+        return self._judged(observed, sample, surface, minimum, confidence, tuple(history), inside)
 
     def _approach(self, observed: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, FloatArray]]]:
         """Rounds with one later epoch, which is enough for the mean of the statistics."""
-        size = 3 * self.terms
+        size = max(3 * self.terms, _LEAST_SETS)
         sobol = stats.qmc.Sobol(len(self.low), rng=np.random.default_rng(self.random.child("sobol").key)).random(
             int(2 ** np.ceil(np.log2(size)))
         )
@@ -226,6 +233,7 @@ class Search:
         minimum: FloatArray,
         confidence: float,
         history: tuple[tuple[int, FloatArray], ...],
+        settled: bool,
     ) -> Found:
         """The estimate with its interval from the errors of simulated sets, and how well the model fits at all."""
         errors, costs = np.empty_like(sample.x), np.empty(len(sample.x))
@@ -244,7 +252,7 @@ class Search:
         x = np.clip(minimum - bias, self.low, self.high)
         scaled = (observed - surface.mean(minimum)) / np.sqrt(np.diag(surface.covariance))
         low, high = np.clip(x - half, self.low, self.high), np.clip(x + half, self.low, self.high)
-        return Found(x, low, high, errors, surface, cost, float(np.mean(costs >= cost)), scaled, history, self.maps)
+        return Found(x, low, high, errors, surface, cost, float(np.mean(costs >= cost)), scaled, history, self.maps, settled)
 
 
 def fresh_cost(search: Search, surface: Surface, observed: FloatArray, x: FloatArray, sets: int = 4) -> float:

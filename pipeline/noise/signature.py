@@ -6,8 +6,8 @@ e, m_ek is the median of a window and r = d - m_ek what is left:
     size         StD, NMAD and half the width between the quantiles 2.5 and 97.5 % of r: the marginal distribution
     variogram    sqrt(gamma(h)) of r at distances h along rows and columns, by Cressie and Hawkins (1980), which steps disturb
                  little: gamma = (mean |r - r'|^(1/2))^4 / (2 (0.457 + 0.494/N))
-    deformation  RMS of m_ek in polynomials of degree 0 and 1 (what registration leaves), 2 (bending), 3 (twisting) over the wall,
-                 orthonormal on the windows' middles, and the RMS of the rest
+    deformation  RMS of m_ek in polynomials of degree 2 (bending) and 3 (twisting) over the wall, orthonormal on the windows'
+                 middles, and the RMS of the rest; a plane, which is registration's business, is left out
     edges        StD and NMAD of r where the surface is steep (the steepest tenth of the pixels), StD elsewhere
     incidence    NMAD of r in thirds of the pixels by slope against the sensor's line of sight, of the pixels that are not steep
 
@@ -48,7 +48,7 @@ class Signature:
         return (
             "size.std", "size.nmad", "size.quantiles",
             *(f"variogram.{lag}px" for lag in self.lags),
-            *(f"deformation.{name}" for name, _ in self._modes), "deformation.rest",
+            *(f"deformation.{name}" for name, _ in self._modes[1:]), "deformation.rest",
             *("edges.std", "edges.nmad", "edges.std_elsewhere"),
             *("incidence.facing", "incidence.between", "incidence.oblique"),
         )  # fmt: skip
@@ -80,14 +80,14 @@ class Signature:
         return [_root_semivariance(rest, lag) for lag in self.lags]
 
     def _deformation(self, middle: FloatArray) -> list[float]:
-        """RMS of each mode over windows and epochs, and of the rest. middle: (e, k)."""
+        """RMS of each mode over windows and epochs but the plane's, and of the rest. middle: (e, k)."""
         known = np.where(np.isnan(middle), np.nanmedian(middle, axis=1, keepdims=True), middle)
         found, left = [], known
         for _, basis in self._modes:
             part = known @ basis @ basis.T
             found.append(float(np.sqrt(np.mean(part**2))))
             left = left - part
-        return [*found, float(np.sqrt(np.mean(left**2)))]
+        return [*found[1:], float(np.sqrt(np.mean(left**2)))]
 
     @cached_property
     def _modes(self) -> tuple[tuple[str, FloatArray], ...]:

@@ -56,14 +56,17 @@ def unchanged(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
     """(h, w) where no map shows a change: what the program takes as stable where nobody drew it.
 
     Medians over cells of 5 x 5 pixels, less their median over 15 x 15 cells, are compared with four of their NMADs; three or more
-    cells side by side that exceed it are a change, with a cell's margin around them. Single gross errors are not: they are noise.
+    cells side by side that exceed it are a change, with a cell's margin around them; so are compact places of single pixels that
+    exceed four NMADs of all pixels. Single gross errors are not, nor thin strips along edges: they are noise.
     """
     stable = np.ones(maps[0].shape, dtype=bool)
     for values in maps:
         cells = _cell_medians(values)
         known = ~np.isnan(cells)
         filled = np.where(known, cells, np.nanmedian(cells) if known.any() else 0.0)
-        departure = np.where(known, cells - ndimage.median_filter(filled, _BACKGROUND_CELLS), 0.0)
+        background = ndimage.median_filter(filled, _BACKGROUND_CELLS)
+        stable &= ~_compact(values, background)
+        departure = np.where(known, cells - background, 0.0)
         large = np.abs(departure) > _CHANGE_NMADS * statistics(departure[known]).nmad
         label, _ = ndimage.label(large)
         size = np.bincount(label.ravel())
@@ -72,6 +75,17 @@ def unchanged(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
         pixels = np.repeat(np.repeat(changed, _CHANGE_CELL_PX, axis=0), _CHANGE_CELL_PX, axis=1)
         stable &= ~pixels[: values.shape[0], : values.shape[1]]
     return stable
+
+
+def _compact(values: NDArray[np.floating], background: FloatArray) -> BoolArray:
+    """(h, w) places of 3 x 3 or more pixels of one sign that all exceed the limit, with a margin of two pixels."""
+    behind = np.repeat(np.repeat(background, _CHANGE_CELL_PX, axis=0), _CHANGE_CELL_PX, axis=1)
+    departure = values - behind[: values.shape[0], : values.shape[1]]
+    limit = _CHANGE_NMADS * statistics(departure).nmad
+    changed = np.zeros(values.shape, dtype=bool)
+    for sign in (1, -1):
+        changed |= ndimage.binary_opening(sign * departure > limit, np.ones((3, 3), dtype=bool))
+    return ndimage.binary_dilation(changed, np.ones((5, 5), dtype=bool))
 
 
 def _cell_medians(values: NDArray[np.floating]) -> FloatArray:

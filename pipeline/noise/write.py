@@ -95,7 +95,7 @@ def to_dict(result: Calibration) -> dict[str, Any]:
         "correlation": {"names": names, "matrix": found.correlation},
         "inseparable": [{"names": [first, second], "correlation": value} for first, second, value in result.inseparable()],
         "orientation_patterns": None if result.patterns is None else result.patterns.to_dict(),
-        "cost": {"value": found.cost, "statistics": len(result.statistics), "p_value": found.misfit_p},
+        "cost": {"value": found.cost, "statistics": len(result.statistics), "p_value": found.misfit_p, "settled": found.settled},
         "statistics": [
             {"name": name, "measured": measured, "expected": mean, "log_sigma": sigma, "standardised": misfit}
             for name, measured, mean, sigma, misfit in zip(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from scipy import stats
 
 from pipeline.difference import statistics
@@ -56,6 +57,8 @@ def warnings(result: Calibration) -> list[str]:
         texts.append(
             f"The model cannot make such maps (p = {found.misfit_p:.3f}); farthest off: {names}. `scarpsim gap` may say why."
         )
+    if not found.settled:
+        texts.append("The search did not settle: the values lie beyond the last simulations. Raise calibration.simulations.")
     low, high = np.log(result.parameters.low), np.log(result.parameters.high)
     for place, name in enumerate(result.parameters.names):
         if found.low[place] <= low[place] + 1e-6 or found.high[place] >= high[place] - 1e-6:
@@ -242,6 +245,9 @@ def _size_and_variogram(result: Calibration) -> bytes:
     right.plot(distance, 1e3 * np.exp(expected[place]), color=_SIMULATED, label="simulated, with two standard deviations")
     right.plot(distance, 1e3 * np.exp(result.observed[place]), "o", color=_MEASURED, markersize=4, label="measured")
     right.set_xscale("log")
+    right.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    right.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    right.xaxis.set_minor_formatter(NullFormatter())
     right.set_ylim(0)
     right.set_xlabel("distance, m")
     right.set_ylabel("root of the semivariance, mm")
