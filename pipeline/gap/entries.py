@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.gap.candidates import Candidate
+from pipeline.gap.locking import Locking
 from pipeline.gap.missing import MissingFound
 from pipeline.gap.quantization import Comb
 from pipeline.gap.residuals import Residuals
@@ -18,8 +19,6 @@ from scene.errors import InputError
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
-_ONLY_OURS = ("reduction",)
-"""Searched values that tell variants apart and are no parameter of the effect."""
 _DEGREES = 5
 _SPLITS = {
     frozenset({"range_offset", "range_scale"}): "a second station at another range",
@@ -92,9 +91,19 @@ def from_comb(comb: Comb, part: Residuals) -> Named:
     )
 
 
-def from_spread(found: SpreadFound) -> Named:
+def from_locking(found: Locking) -> Named:
+    """Locking that the measured disparities show."""
+    entry = {
+        "name": "pixel_locking",
+        "amplitude_px": found.amplitude_px,
+        "period_px": found.period_px,
+        "phase_rad": found.phase_rad,
+    }
+    return Named("stereo.pixel_locking", "physical", entry, {"amplitude_px": found.std_px}, (), found.p_value, found.gain)
+
+
+def from_spread(found: SpreadFound, sensor: str) -> Named:
     """An effect on the spread of laser ranges or disparities."""
-    sensor = "stereo" if found.name == "parallax_noise" else "tls"
     alike = tuple(f"{sensor}.{name}" for name in found.alike)
     kind = "empirical" if found.empirical else "physical"
     entry = {"name": found.effect, **found.parameters}
@@ -130,8 +139,7 @@ def from_mean(found: Estimate, part: Residuals) -> Named:
 
 
 def _physical(candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals) -> Named:
-    fixed = {key: value for key, value in candidate.fixed.items() if key not in _ONLY_OURS}
-    entry = {"name": candidate.name, **fixed, **candidate.parameters(values)}
+    entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(values)}
     std = _uncertainty(candidate, values, covariance)
     alike = tuple(f"{part.sensor}.{name}" for name in item.alike)
     return Named(f"{part.sensor}.{candidate.name}", "physical", _plain(entry), std, alike, item.p_value, item.gain)

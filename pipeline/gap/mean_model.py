@@ -3,9 +3,9 @@
 The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over
 metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process plus the
 noise of a mean; the deviations within cells are white. Both parts add their information on b. How the reference's error is
-correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy (isotropic waves of about one length, whose covariance is
-Bessel's J0) forms of several lengths are kept as far as the data allow. For each of them one eigendecomposition serves every
-amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised over the covariance too.
+correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms (isotropic waves of about one length, the covariance
+of each being Bessel's J0) of several lengths are kept as far as the data allow. For each of them one eigendecomposition serves
+every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised over the covariance too.
 """
 
 from __future__ import annotations
@@ -22,14 +22,18 @@ from pipeline.gap.cells import Cells
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
-_ROUGH, _SMOOTH, _WAVY = (1.0, 2.0, 4.0, 8.0), (1.5, 3.0, 6.0), (2.5, 3.5, 5.0, 7.0)
-"""Lengths in cells of the three forms of correlation."""
+_ROUGH, _SMOOTH, _WAVY = (0.7, 1.5, 3.0), (1.0, 2.0), (1.7, 2.5, 3.5, 5.0)
+"""Lengths in cells of the three forms of correlation; of some 30 x 25 cells, so that the longest are still local."""
+_BAND = 0.7, 1.9, 6
+"""Wavelengths of a wavy error, from and to, of its length, and how many stand for the band."""
 _RATIOS = np.geomspace(0.003, 300.0, 25)
 """Variance of the reference's error over the median variance of a cell's mean."""
 _MOST_RATIOS = 6
 _WORSE = 12.0
 """A length of correlation whose likelihood falls short of the best by more, whatever is fitted, is not carried along."""
 _RIDGE = 1e-12
+_BILINEAR = 4 / 9
+"""Mean variance of a bilinearly interpolated grid of independent values of variance 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +59,16 @@ class Fit:
 class MeanModel:
     """The linear algebra of one set of points. Rows of whatever it takes are those of `rows`: points in cells, cell by cell."""
 
-    def __init__(self, cells: Cells, sigma: FloatArray) -> None:
+    def __init__(self, cells: Cells, sigma: FloatArray, shared_noise: tuple[float, float] = (0.0, 1.0)) -> None:
         inside = np.flatnonzero(cells.cell >= 0)
         self.rows = inside[np.argsort(cells.cell[inside], kind="stable")]
         self._cell = cells.cell[self.rows]
         self._starts = np.flatnonzero(np.diff(self._cell, prepend=-1))
         self.root = 1 / sigma[self.rows]
         self._total = np.add.reduceat(self.root**2, self._starts)
-        scale = 1 / np.sqrt(self._total)
+        variance = 1 / self._total + _of_means(*shared_noise, cells.side_m)
+        scale = np.sqrt(variance)
+        self._share = 1 / np.sqrt(self._total * variance)
         self.typical_sigma = typical = float(np.median(scale))
         distance = cdist(cells.centre, cells.centre) / cells.side_m
         self._bases: list[tuple[FloatArray, FloatArray]] = []
@@ -120,7 +126,7 @@ class MeanModel:
 
     def between(self, means: FloatArray) -> list[FloatArray]:
         """Cell means (m, k) in each basis."""
-        return [vectors.T @ means for _, vectors in self._bases]
+        return [vectors.T @ (means * self._share[:, None]) for _, vectors in self._bases]
 
     def project(self, weighted: FloatArray) -> Projected:
         """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
@@ -134,6 +140,11 @@ class MeanModel:
         return [draws if index == at.length else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
 
 
+def _of_means(variance: float, width_m: float, side_m: float) -> float:
+    """Variance of a cell's mean by noise on a grid of independent nodes, interpolated bilinearly."""
+    return variance * min(_BILINEAR, (width_m / side_m) ** 2)
+
+
 def _correlations(distance: FloatArray) -> Iterator[FloatArray]:
     """Correlation matrices for cells at these distances, in cells."""
     for length in _ROUGH:
@@ -142,7 +153,8 @@ def _correlations(distance: FloatArray) -> Iterator[FloatArray]:
     for length in _SMOOTH:
         yield np.exp(-0.5 * (distance / length) ** 2)
     for length in _WAVY:
-        yield j0(2 * np.pi * distance / length) * np.exp(-0.5 * (distance / (1.5 * length)) ** 2)
+        waves = length * np.geomspace(*_BAND)
+        yield np.mean([j0(2 * np.pi * distance / wave) for wave in waves], axis=0)
 
 
 @dataclass(frozen=True)

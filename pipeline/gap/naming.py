@@ -10,7 +10,8 @@ import numpy as np
 from pipeline.gap import stereo_signatures, tls_signatures
 from pipeline.gap.candidates import PLACE, Candidate, Grid, free_forms, places
 from pipeline.gap.cells import Cells
-from pipeline.gap.entries import Estimate, Named, from_comb, from_mean, from_spread, is_possible, with_effects
+from pipeline.gap.entries import Estimate, Named, from_comb, from_locking, from_mean, from_spread, is_possible, with_effects
+from pipeline.gap.locking import find_locking
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.quantization import find_comb
 from pipeline.gap.registration import registered
@@ -23,7 +24,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
-_NOT_FREE = ("edge_step", "line")
+_NOT_FREE = ("edge_step", "line", "disparity_fraction")
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,13 @@ def name_effects(
         named.append(from_comb(comb, part))
         part = replace(part, sigma=np.sqrt(part.sigma**2 + comb.step_m**2 / 12))
         scale = 1.0
+    locking = (
+        None if tls or believes(measurement, "pixel_locking") else find_locking(part.geometry.found, part.geometry.disparity)
+    )
+    if locking is not None:
+        named.append(from_locking(locking))
+        part = replace(part, sigma=np.sqrt(part.sigma**2 + locking.amplitude_px**2 / 2))
+        left_out |= {("pixel_locking", False)}
     families = [each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out]
     spread = find_spread(part, Cells.over(part.at), registered(part)[0], random)
     first = MeanSearch(_weighed(part, spread, scale), families, random)
@@ -103,7 +111,7 @@ def name_effects(
         spread = find_spread(at, last.cells, last.without([each.chosen for each in estimates[len(physical) :]]), random)
     named += [from_mean(each, at) for each in estimates]
     if spread is not None:
-        named.append(from_spread(spread))
+        named.append(from_spread(spread, part.sensor))
     names, cosines, survival = first.identifiability()
     remaining = {"p_value": last.p_value(tried[0].score) if tried else 1.0, "note": "; ".join([*part.notes, *_words(left_out)])}
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}

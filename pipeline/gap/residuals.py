@@ -22,7 +22,7 @@ class Residuals:
     sense; pose: (n, 6) derivatives by translation (m) and rotation (rad) of the sensor in the wall frame; at: (n, 2) wall frame
     x, y of the reference's point, which unlike the measured one does not move with the noise, m; covariates: named (n,) arrays;
     index: (n,) rows of the measurement's points; missing: of the pulses that were sent and should have met the wall, None where
-    the pattern is not known.
+    the pattern is not known; shared_noise: variance, and width on the wall (m), of predicted noise that neighbours share.
     """
 
     sensor: str
@@ -37,6 +37,7 @@ class Residuals:
     geometry: Any = None
     notes: tuple[str, ...] = ()
     missing: Missing | None = None
+    shared_noise: tuple[float, float] = (0.0, 1.0)
 
     def __len__(self) -> int:
         return len(self.value)

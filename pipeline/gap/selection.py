@@ -106,7 +106,7 @@ class MeanSearch:
         self._random = random
         self._plain = [family for family in families if isinstance(family, Candidate)]
         self.cells = Cells.over(residuals.at)
-        self.model = MeanModel(self.cells, residuals.sigma)
+        self.model = MeanModel(self.cells, residuals.sigma, residuals.shared_noise)
         self._residuals = residuals
         rows, root = self.model.rows, self.model.root[:, None]
         self._full_grids = [family for family in families if isinstance(family, Grid)]

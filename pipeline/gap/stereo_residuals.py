@@ -158,6 +158,7 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
         covariates=covariates,
         index=np.arange(len(u)),
         geometry=geometry,
+        shared_noise=(model.noise.regularization_sigma_px**2, _width(nominal, model, depth)),
         notes=() if given else ("no pixel_x, pixel_y: pixels were found by projecting the points",),
     )
     return whole.part(hit)
@@ -263,6 +264,11 @@ def predicted_variance(model: StereoModel) -> float:
         elif effect.name == "regularization_noise":
             total += _REGULARIZATION_SHARE * values.sigma_px**2
     return float(max(total, 1e-8))
+
+
+def _width(nominal: NominalPair, model: StereoModel, depth: FloatArray) -> float:
+    """Distance on the wall of the nodes of the regularization's grid, m."""
+    return float(model.noise.regularization_step_px * np.nanmedian(depth) / nominal.geometry.f)
 
 
 def _covariates(

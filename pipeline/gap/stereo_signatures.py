@@ -41,6 +41,7 @@ _CAMERA: tuple[tuple[type[Effect], tuple[tuple[str, ...], ...], float], ...] = (
 )
 """Effect, the sets of its parameters that are tried, and the step of the finite differences."""
 _FEWEST_ROWS = 20.0
+_SCALE_UNKNOWN = 0.03
 
 
 def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
@@ -101,22 +102,19 @@ def _row_jitter(geometry: StereoGeometry) -> list[Grid]:
     ]
 
 
-def _locking(geometry: StereoGeometry) -> list[Candidate]:
-    """Locking on the full frame's pixels and on those of a reduced image; of the true disparity, which the residual is not in."""
-    found = []
-    for reduction in (1, 2, 4, 8):
-        column = np.sin(2 * np.pi * geometry.disparity / reduction)
-        fixed = {"reduction": float(reduction)}
-        found.append(
-            Candidate(
-                "pixel_locking",
-                column[:, None],
-                lambda values: {"amplitude_px": float(values[0])},
-                ("amplitude_px",),
-                fixed,
-            )
-        )
-    return found
+def _locking(geometry: StereoGeometry) -> list[Grid]:
+    """A sine of the disparity with the pixels of the matched image, full or reduced, at any phase.
+
+    The rectification in which the disparities were found is not part of a measurement: its principal distance (the period) is
+    known to some percent, its offset (the phase) not at all. Locking that acts on the noise too leaves little of its mean.
+    """
+    reach = max(float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99]))), 1.0)
+    one = np.ones_like(geometry.disparity)
+    return [
+        Grid("pixel_locking", "amplitude_px", Wave("period_px", one, geometry.disparity), tried)
+        for reduction in (1.0, 2.0, 4.0, 8.0)
+        if (tried := frequencies((1 - _SCALE_UNKNOWN) / reduction, (1 + _SCALE_UNKNOWN) / reduction, 0.3 / reach, 80)).size
+    ]
 
 
 def exposure_and_locking(effects: tuple[Effect, ...], geometry: StereoGeometry) -> FloatArray:
@@ -130,5 +128,5 @@ def exposure_and_locking(effects: tuple[Effect, ...], geometry: StereoGeometry) 
                     angle = 2 * np.pi * rows / values.rows_per_cycle + values.phase_rad
                     total += sign * values.amplitude_px * np.sin(angle)
         elif effect.name == "pixel_locking":
-            total += values.amplitude_px * np.sin(2 * np.pi * geometry.found)
+            total += values.amplitude_px * np.sin(2 * np.pi * geometry.found / (values.period_px or 1.0) + values.phase_rad)
     return total

@@ -142,7 +142,7 @@ def _missing(measurement: Measurement, residuals: Residuals, rough: FloatArray, 
     if residuals.missing is None or believes(measurement, "precipitation") or believes(measurement, "detection_limit"):
         return []
     early = residuals.smooth & ~changed & (rough < -np.maximum(_EARLY_SIGMAS * residuals.sigma, _EARLY_M))
-    found = find_missing(residuals.missing, int(early.sum()), len(residuals))
+    found = find_missing(residuals.missing, int(early.sum()), len(residuals), measurement.cloud.intensity)
     return [] if found is None else [from_missing(found, measurement.cloud.intensity)]
 
 

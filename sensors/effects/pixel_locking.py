@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from scene.backend import dr
 from scene.keyed_random import KeyedRandom
@@ -15,7 +16,7 @@ from sensors.matches import Matches
 
 
 class PixelLocking(Effect):
-    """dd = A sin(2 pi frac(d / n)), d the disparity that the matcher finds, n the reduction of the image that it matches.
+    """dd = A sin(2 pi d / n + phase), d the disparity that the matcher finds, n the reduction of the image that it matches.
 
     n (2, 4, 8 for high, medium, low) makes d / n count the matched image's pixels. Semi-global matching has A of about 0.2 to
     0.25 px of the matched image, thus n times that here (Shimizu & Okutomi 2005). Acts last, on noise and all.
@@ -29,8 +30,13 @@ class PixelLocking(Effect):
         "largest change of the disparity", unit="px", source="Shimizu & Okutomi 2005", typical=0.8, ge=-100, le=100
     )
 
+    period_px: float | None = Field(
+        None, gt=0, description="n, where another rectification's pixels are not those of this one [px]; null: the reduction"
+    )
+    phase_rad: float = Field(0.0, description="where another rectification's columns count from elsewhere [rad]")
+
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        amplitude, reduction = opaque(self.amplitude_px, state.reduction)
-        matched = state.disparity / reduction
-        wave = dr.sin(2 * np.pi * (matched - dr.floor(matched)))
+        amplitude, period, phase = opaque(self.amplitude_px, self.period_px or state.reduction, self.phase_rad)
+        matched = state.disparity / period
+        wave = dr.sin(2 * np.pi * (matched - dr.floor(matched)) + phase)
         return replace(state, disparity=state.disparity + amplitude * wave)
