@@ -201,7 +201,10 @@ def test_greedy_meets_the_standard_deviation_and_not_the_pattern() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_known_noise_of_another_wall_and_seed_comes_back(seed: int) -> None:
-    """Of six intervals of 95 % at least one of a trial's two holds: false failure below 1 % in all three trials."""
+    """Within twice the interval of 95 %, four standard deviations: false failure below 0.1 %, with 60 sets for the scatter below 1 %.
+
+    How often the intervals themselves hold is for benchmarks/calibrate_recovery.py.
+    """
     config, site = small("tls", f"wall.seed={20 + seed}", "calibration.simulations=60", f"seed={seed}")
     truth = np.array([[0.004, 8e-5], [0.0015, 2e-4], [0.008, 5e-5]][seed - 1])
     whole: Any = site.sensor
@@ -209,5 +212,4 @@ def test_known_noise_of_another_wall_and_seed_comes_back(seed: int) -> None:
     material = replace(seen_by(config, real, 2, 100 + seed), site=site)
     found = calibrate_material(config, "tls", material, Progress(), with_greedy=False).found
     off = (found.x - np.log(truth)) / ((found.high - found.low) / 2)
-    assert np.abs(off).min() < 1
     assert np.abs(off).max() < 2
