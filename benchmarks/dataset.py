@@ -2,7 +2,7 @@
 
     python benchmarks/dataset.py                      workers: a small set by one and by two workers, in turns
     python benchmarks/dataset.py epochs [--epochs 6]  Glendale: epochs of rockfall_9 in this process, projection of the whole plan
-    python benchmarks/dataset.py memory [--epochs 100] [--sensor tls]   peak memory of one worker over many epochs
+    python benchmarks/dataset.py memory [--epochs 100] [--sensor tls] [--small]    peak memory of one worker over many epochs
 
 Rates are of wall time and of processor time; on a machine that others use too only the latter tells of the program.
 The projection plays the plan through: a free worker takes the next epoch and pays for a stage (wall, frame, scene, reference)
@@ -137,9 +137,17 @@ def project(epochs: int) -> None:
         print(f"| {workers} | {time_taken / 3600:.1f} h | {ideal / workers / time_taken:.2f} |")
 
 
-def print_memory(epochs: int, sensor: str) -> None:
+def of_the_small_wall(epochs: int, sensor: str) -> DatasetConfig:
+    """The small set's wall, `epochs` times."""
+    values = load_dataset_config(bundled_config("datasets", "small")).model_dump(mode="json")
+    part = {"walls": ["glendale"], "noise": ["high"], "sizes": ["medium"], "train": epochs}
+    return DatasetConfig.model_validate({**values, "sensors": [sensor], "parts": [part]})
+
+
+def print_memory(epochs: int, sensor: str, small: bool) -> None:
     """The peak after each tenth of the epochs."""
-    _, summary = timed(of_glendale(-(-epochs // len(SIZES)), (sensor,)), 0)
+    config = of_the_small_wall(epochs, sensor) if small else of_glendale(-(-epochs // len(SIZES)), (sensor,))
+    _, summary = timed(config, 0)
     for number in range(0, len(summary.made), max(1, len(summary.made) // 10)):
         print(f"{sensor}, after {number + 1:3} epochs: {summary.made[number]['peak_memory_gb']:.2f} GB at the peak")
     print(f"{sensor}, after {len(summary.made):3} epochs: {summary.made[-1]['peak_memory_gb']:.2f} GB at the peak (limit 2.5)")
@@ -151,13 +159,14 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, help="of each sensor and size (epochs: 2), or of all (memory: 100)")
     parser.add_argument("--rounds", type=int, default=3, help="workers: of both numbers of workers")
     parser.add_argument("--sensor", default="stereo", choices=["stereo", "tls"], help="memory")
+    parser.add_argument("--small", action="store_true", help="memory: on the small set's wall instead of Glendale")
     asked = parser.parse_args()
     if asked.what == "workers":
         compare_workers(asked.rounds)
     elif asked.what == "epochs":
         project(asked.epochs or 2)
     else:
-        print_memory(asked.epochs or 100, asked.sensor)
+        print_memory(asked.epochs or 100, asked.sensor, asked.small)
 
 
 if __name__ == "__main__":
