@@ -201,7 +201,7 @@ def test_greedy_meets_the_standard_deviation_and_not_the_pattern() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_known_noise_of_another_wall_and_seed_comes_back(seed: int) -> None:
-    """Within twice the interval of 95 %, four standard deviations: false failure below 0.1 %, with 60 sets for the scatter below 1 %.
+    """Within twice the interval of 95 %, four standard deviations: false failure below 1 %, as 60 sets give the scatter.
 
     How often the intervals themselves hold is for benchmarks/calibrate_recovery.py.
     """
