@@ -216,12 +216,12 @@ def _patterns(simulator: Reobserver, pair: StereoPair) -> Patterns | None:
     moving = {name: sigma for name, sigma in spreads.items() if sigma > 0}
     if not moving:
         return None
-    maps = []
+    still, maps = simulator.heights(simulator.silent, KeyedRandom(0)), []
     for name, sigma in moving.items():
         alone = OrientationNoise(**{name: Spread(mean=sigma)}).draw("left", KeyedRandom(0))
         effects: tuple[Effect, ...] = tuple(effect for effect in alone if not effect.is_null)
         model = simulator.silent.model_copy(update={"effects": (*pair.model.effects, *effects)})
-        maps.append(simulator.silent_heights - simulator.heights(model, KeyedRandom(0)))
+        maps.append(still - simulator.heights(model, KeyedRandom(0)))
     known = np.isfinite(maps).all(axis=0) & simulator.windows.stable
     flat = np.stack([values[known] for values in maps])
     flat = np.clip(flat, *np.quantile(flat, [0.005, 0.995], axis=1, keepdims=True))  # a step that moved would outweigh the rest

@@ -1,6 +1,6 @@
 """The thesis's calibration (4.1.5), kept as a baseline: one parameter at a time, by the standard deviation alone.
 
-From a tentative set that is too noisy, each parameter in turn is lowered by a tenth of its first value as long as that brings the
+From a tentative set with four times the measured noise, each parameter in turn is lowered by a tenth of its first value as long as that brings the
 standard deviation of simulated maps nearer to the measured one, and then all again until nothing helps; each test simulates one
 map.
 """
@@ -33,16 +33,16 @@ class Greedy:
 
 
 def greedy(simulate: Simulate, parameters: Parameters, start: FloatArray, std: int, target: float, random: KeyedRandom) -> Greedy:
-    """Run it. start: (k,) values, raised here; std: place of log StD among the statistics; target: its measured value."""
-    first = np.minimum(_START_FACTOR * start, parameters.high)
-    lengths = np.array(["step" in name for name in parameters.names])
-    first[lengths] = start[lengths]  # a length on the image has no size that could be too large
+    """Run it. start: (k,) values, scaled here; std: place of log StD among the statistics; target: its measured value."""
 
     def error(values: FloatArray, test: int) -> float:
         return float(simulate(values, 1, random.child("greedy", test))[std] - target)
 
-    values, tests = first.copy(), 1
-    best = error(values, 0)
+    first = np.clip(_START_FACTOR * np.exp(-error(start, 0)) * start, parameters.low, parameters.high)
+    lengths = np.array(["step" in name for name in parameters.names])
+    first[lengths] = start[lengths]  # a length on the image has no size that could be too large
+    values, tests = first.copy(), 2
+    best = error(values, 1)
     improved = True
     while improved and abs(best) > _CLOSE:
         improved = False

@@ -1,0 +1,53 @@
+"""Observations per second of a Glendale calibration, against the bare casting of as many rays and against whole maps.
+
+    python benchmarks/calibrate_speed.py [--site glendale]
+
+Windows as a calibration lays them on a map of the whole wall; glendale_high noise; medium depth maps.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+from measure import bare_cast, medians
+
+from pipeline.bundled import bundled_config
+from pipeline.config import load_config
+from pipeline.difference import raster_grid
+from pipeline.noise.maps import noise_map
+from pipeline.noise.reobserve import Reobserver
+from pipeline.noise.windows import choose_windows
+from pipeline.site import prepare_site
+from scene.backend import mi
+from scene.keyed_random import KeyedRandom
+from scene.upload import on_device, vectors_on_device
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--site", default="glendale")
+    arguments = parser.parse_args()
+    config = load_config(bundled_config("sites", arguments.site), ["sensor=glendale_high"], "stereo", None)
+    site = prepare_site(config, "stereo", KeyedRandom(config.seed))
+    grid = raster_grid(site.mesh.bounds, config.difference)
+    model = config.stereo_model()
+    border = np.ones(grid.shape, dtype=bool)
+    border[:100], border[-100:], border[:, :100], border[:, -100:] = False, False, False, False
+    windows = choose_windows(border, grid, config.calibration)
+    simulator = Reobserver(config, site, windows)
+    simulator.heights(model, KeyedRandom(0))
+    eye = next(iter(site.viewpoints.values()))
+    targets = site.mesh.vertices[KeyedRandom(1).generator().integers(0, len(site.mesh.vertices), len(simulator.cells))]
+    targets = targets[np.lexsort((targets[:, 0], np.round(targets[:, 1], 1)))]
+    origin = mi.Array3f64(*(on_device(mi.Float64, np.full(len(targets), value)) for value in eye))
+    cast = bare_cast(simulator.caster, origin, vectors_on_device(targets - eye))
+    one, bare = medians(lambda: simulator.heights(model, KeyedRandom(0)), cast)
+    whole = medians(lambda: noise_map(config, site, site, simulator.caster, KeyedRandom(0)), rounds=1)[0]
+    print(f"{len(simulator.cells):,} cells, {windows.stable.sum():,} pixels: {1 / one:.1f} observations/s")
+    print(f"bare cast of as many rays {1e3 * bare:.1f} ms: {bare / one:.1%} of an observation")
+    print(f"a whole map takes {whole:.1f} s, {whole / (2 * one):.0f} times two observations in windows")
+
+
+if __name__ == "__main__":
+    main()
