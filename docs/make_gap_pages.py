@@ -30,8 +30,8 @@ from pipeline.gap.figures import gap_figure, maps_figure
 from pipeline.gap.identifiability import ALIKE, Identifiability, identifiability
 from pipeline.gap.in_words import VERDICTS, paragraph
 from pipeline.gap.measurement import Measurement, read_measurement
-from pipeline.gap.naming import residuals_of
 from pipeline.gap.planned import planned_survey
+from pipeline.gap.registration import residuals_of
 from pipeline.gap.report import summary
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.where import bins, where

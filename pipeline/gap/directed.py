@@ -61,23 +61,36 @@ class DirectedScanner(LaserScanner):
         return super()._measured(pulses, recorded, random)
 
 
+def _scanner(measurement: Measurement, model: TlsModel, geometry: Any) -> DirectedScanner:
+    assert measurement.station is not None
+    position, rotation = measurement.station
+    pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
+    config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
+    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry)
+
+
 def simulate_ranges(
     measurement: Measurement, model: TlsModel, geometry: Any, random: KeyedRandom, scene: RayCaster | None = None
 ) -> FloatArray:
     """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
-    assert measurement.station is not None
-    position, rotation = measurement.station
-    count = len(geometry.azimuth)
-    pattern = Pattern(0.0, 1.0, count, 0.0, 1.0, 1)
-    config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
-    scanner = DirectedScanner(position, rotation, pattern, config, model, geometry=geometry)
-    return scanner.observe(scene or measurement.scene, random).depth.reshape(-1)
+    return _scanner(measurement, model, geometry).observe(scene or measurement.scene, random).depth.reshape(-1)
+
+
+def mean_model(model: TlsModel) -> TlsModel:
+    """The model's effects on the mean alone, without noise."""
+    kept = tuple(effect for effect in model.effects if effect.name not in _SPREAD and effect.stage != Stage.RETURN)
+    return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
+
+
+def aimed(measurement: Measurement, geometry: Any) -> tuple[FloatArray, FloatArray]:
+    """(n,) azimuth and zenith in which the pulses leave on average, by the measurement's model, scanner frame, rad."""
+    assert isinstance(measurement.model, TlsModel)
+    scanner = _scanner(measurement, mean_model(measurement.model), geometry)
+    pulses = scanner._aimed(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
+    return np.array(pulses.aim_azimuth), np.array(pulses.aim_zenith)
 
 
 def simulated_ranges(measurement: Measurement, geometry: Any) -> FloatArray:
     """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise."""
-    model = measurement.model
-    assert isinstance(model, TlsModel)
-    kept = tuple(effect for effect in model.effects if effect.name not in _SPREAD and effect.stage != Stage.RETURN)
-    mean = model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
-    return simulate_ranges(measurement, mean, geometry, KeyedRandom(0, ("gap", "mean")))
+    assert isinstance(measurement.model, TlsModel)
+    return simulate_ranges(measurement, mean_model(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

@@ -20,6 +20,8 @@ from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
 _DEGREES = 5
+_BEYOND = 100.0
+"""Times its typical size, an effect explains nothing: no instrument is so far out."""
 _SPLITS = {
     frozenset({"range_offset", "range_scale"}): "a second station at another range",
     frozenset({"collimation", "trunnion_tilt"}): "a scan with steeper lines of sight, or in two faces",
@@ -75,11 +77,16 @@ def with_effects(model: TlsModel | StereoModel, entries: list[dict[str, Any]]) -
 
 
 def is_possible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Whether an entry's values lie within the bounds of its effect."""
+    """Whether an entry's values lie within the bounds of its effect and are not far beyond what is typical of it."""
     try:
-        with_effects(model, [entry])
+        effect = with_effects(model, [entry]).effects[-1]
     except InputError:
         return False
+    for key, info in type(effect).model_fields.items():
+        known = info.json_schema_extra
+        typical = known.get("typical") if isinstance(known, dict) and known.get("null") == 0.0 else None
+        if isinstance(typical, float) and abs(getattr(effect, key)) > _BEYOND * abs(typical):
+            return False
     return True
 
 

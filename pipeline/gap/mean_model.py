@@ -32,6 +32,8 @@ _MOST_RATIOS = 6
 _WORSE = 12.0
 """A length of correlation whose likelihood falls short of the best by more, whatever is fitted, is not carried along."""
 _RIDGE = 1e-12
+_NOTHING = 1e-14
+"""Columns so much smaller than the largest are rounding, and count as absent."""
 _BILINEAR = 4 / 9
 """Mean variance of a bilinearly interpolated grid of independent values of variance 1."""
 
@@ -208,7 +210,8 @@ def fitted(covariances: list[Covariance], columns: Projected, value: Projected) 
 
 
 def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> Fit:
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    size = np.sqrt(np.diag(matrix))
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max())
     inverse = np.linalg.inv(matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(right))) * np.outer(scale, scale)
     coefficients = inverse @ right
     return Fit(coefficients, inverse, constant + 0.5 * float(right @ coefficients), at)

@@ -14,15 +14,12 @@ from pipeline.gap.entries import Estimate, Named, from_comb, from_locking, from_
 from pipeline.gap.locking import find_locking
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.quantization import find_comb
-from pipeline.gap.registration import registered
-from pipeline.gap.residuals import Residuals
+from pipeline.gap.registration import registered, settled
+from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Chosen, MeanSearch, Tried
 from pipeline.gap.spread import SpreadFound, find_spread
-from pipeline.gap.stereo_residuals import stereo_residuals
-from pipeline.gap.tls_residuals import tls_residuals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from sensors.model import StereoModel, TlsModel
 
 _NOT_FREE = ("edge_step", "line", "disparity_fraction")
 
@@ -35,19 +32,6 @@ class Naming:
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
     reference_sigma: float
-
-
-def residuals_of(measurement: Measurement) -> Residuals:
-    """The raw residuals of either sensor."""
-    return tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
-
-
-def residuals_against(measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals) -> FloatArray:
-    """(n,) residuals of the same points against another model; NaN where that one misses the reference."""
-    found = residuals_of(measurement.changed(model=model))
-    value = np.full(len(measurement.cloud.points), np.nan)
-    value[found.index] = found.value
-    return np.asarray(value[residuals.index])
 
 
 def believes(measurement: Measurement, name: str) -> bool:
@@ -81,20 +65,20 @@ def name_effects(
     families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word.
     """
     named: list[Named] = []
-    whole, whole_scale = part, scale
+    whole, whole_scale, added = part, scale, 0.0
     tls = part.sensor == "tls"
     comb = find_comb(part.geometry.measured_m) if tls and not believes(measurement, "range_quantization") else None
     if comb is not None:
         named.append(from_comb(comb, part))
-        part = replace(part, sigma=np.sqrt(part.sigma**2 + comb.step_m**2 / 12))
-        scale = 1.0
+        added, scale = comb.step_m**2 / 12, 1.0
     locking = (
         None if tls or believes(measurement, "pixel_locking") else find_locking(part.geometry.found, part.geometry.disparity)
     )
     if locking is not None:
         named.append(from_locking(locking))
-        part = replace(part, sigma=np.sqrt(part.sigma**2 + locking.amplitude_px**2 / 2))
+        added = locking.amplitude_px**2 / 2
         left_out |= {("pixel_locking", False)}
+    part = _noisier(part, added)
     families = [each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out]
     spread = find_spread(part, Cells.over(part.at), registered(part)[0], random)
     first = MeanSearch(_weighed(part, spread, scale), families, random)
@@ -103,7 +87,7 @@ def name_effects(
     physical = [each for each in estimates if not each.candidate.empirical]
     beyond = _beyond(measurement, estimates, at)
     if physical and not beyond:
-        last, at, estimates, tried = _again(measurement, part, families, physical, spread, scale, random)
+        last, at, estimates, tried = _again(measurement, part, families, physical, spread, (scale, added), random)
         beyond = _beyond(measurement, estimates, at)
     if beyond:
         return name_effects(measurement, whole, whole_scale, random, left_out | beyond)
@@ -130,6 +114,10 @@ def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
     return [f"{what} left out: the best value is beyond what a config may hold" for what in said]
 
 
+def _noisier(part: Residuals, variance: float) -> Residuals:
+    return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
+
+
 def _weighed(part: Residuals, spread: SpreadFound | None, scale: float) -> Residuals:
     """With the spread that the points really have."""
     sigma = part.sigma * scale if spread is None else np.sqrt(part.sigma**2 + spread.variance)
@@ -151,31 +139,58 @@ def _again(
     families: list[Candidate | Grid],
     had: list[Estimate],
     spread: SpreadFound | None,
-    scale: float,
+    noise: tuple[float, float],
     random: KeyedRandom,
 ) -> tuple[MeanSearch, Residuals, list[Estimate], tuple[Tried, ...]]:
     """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
 
-    Returns the search, its residuals, the effects with what was found beside them, and what was tried last.
+    noise: how many predicted sigmas the residuals spread, and variance to add to the predicted one. Returns the search,
+    its residuals, the effects with what was found beside them, and what was tried last.
     """
     model = with_effects(measurement.model, [from_mean(each, part).entry for each in had])
-    value = residuals_against(measurement, model, part)
-    rows = np.flatnonzero(np.isfinite(value))
-    at = replace(part, value=value).part(rows)
-    columns = [_columns(each)[rows] for each in had]
+    there, found, _ = settled(measurement.changed(model=model), part.index)
+    at = _noisier(_at_points(found, part), noise[1])
+    renewed = families_of(there, at)
+    allowed = {(family.name, family.empirical) for family in families}
     names = {each.candidate.name for each in had}
-    others = [family.part(rows) for family in families if family.name not in names or family.empirical]
-    weighed = _weighed(part, spread, scale).part(rows)
-    beside = replace(weighed, value=at.value, pose=np.concatenate([at.pose, *columns], axis=1))
-    search = MeanSearch(beside, others, random.child("again"))
+    others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
+    known = [replace(each, candidate=_renewed(each.candidate, renewed)) for each in had]
+    columns = [_columns(each) for each in known]
+    weighed = _weighed(at, None if spread is None else replace(spread, variance=spread.variance[_kept(at, part)]), noise[0])
+    search = MeanSearch(replace(weighed, pose=np.concatenate([at.pose, *columns], axis=1)), others, random.child("again"))
     chosen, tried = search.select()
     fit = search.refined([item.candidate for item in chosen])[1]
     kept, start = [], at.pose.shape[1]
-    for each, matrix in zip(had, columns, strict=True):
+    for each, matrix in zip(known, columns, strict=True):
         place = slice(start, start := start + matrix.shape[1])
-        moved = replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place])
-        kept.append(replace(moved, candidate=each.candidate.part(rows)))
+        kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
     return search, at, [*kept, *_estimates(search, chosen)], tried
+
+
+def _at_points(found: Residuals, part: Residuals) -> Residuals:
+    """What was found at the points of a part, where the surface is smooth there too."""
+    place = np.full(int(max(found.index.max(), part.index.max())) + 1, -1)
+    place[found.index[found.smooth]] = np.flatnonzero(found.smooth)
+    rows = place[part.index]
+    return found.part(rows[rows >= 0])
+
+
+def _kept(at: Residuals, part: Residuals) -> BoolArray:
+    """Which points of the part are left."""
+    return np.isin(part.index, at.index)
+
+
+def _renewed(candidate: Candidate, families: list[Candidate | Grid]) -> Candidate:
+    """The same candidate for other rays."""
+    key = "" if candidate.wave is None else candidate.wave.key
+    chosen = {name: value for name, value in candidate.fixed.items() if name != key}
+    for family in families:
+        if family.name == candidate.name and not family.empirical and dict(family.fixed) == chosen:
+            if isinstance(family, Grid):
+                return family.at(candidate.period)
+            if family.names == candidate.names:
+                return family
+    raise KeyError(candidate.name)
 
 
 def _columns(found: Estimate) -> FloatArray:

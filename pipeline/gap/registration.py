@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import Residuals
+from pipeline.gap.stereo_residuals import stereo_residuals
+from pipeline.gap.tls_residuals import tls_residuals
 from pipeline.rigid import rotation_matrix
 from scene.mesh import FloatArray
 from sensors.camera import Camera, CameraPair
@@ -15,6 +18,7 @@ from sensors.camera import Camera, CameraPair
 _ROUNDS = 6
 _OUTLIER = 3.5
 _FEWEST = 100
+_FAR_M = 0.002
 
 
 def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
@@ -36,6 +40,34 @@ def pose_of(residuals: Residuals) -> FloatArray:
     """(6,) shift (m) and turn (rad) by weighted least squares."""
     weighted = residuals.pose / residuals.sigma[:, None]
     return np.asarray(np.linalg.lstsq(weighted, residuals.value / residuals.sigma, rcond=None)[0])
+
+
+def residuals_of(measurement: Measurement) -> Residuals:
+    """The raw residuals of either sensor."""
+    return tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
+
+
+def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None) -> tuple[Measurement, Residuals, FloatArray]:
+    """The measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there.
+
+    trusted: rows of the measurement's points by which to register; all where None. A pose that moves the rays by more than some
+    millimetres on the wall is gone along with once, since slopes at the first place no longer serve.
+    """
+    found = residuals_of(measurement)
+    pose = registered(_only(found, trusted))[1]
+    if not _is_far(pose, found):
+        return measurement, found, np.zeros(6)
+    there = moved(measurement, pose)
+    return there, residuals_of(there), pose
+
+
+def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
+    return residuals if trusted is None else replace(residuals, smooth=residuals.smooth & np.isin(residuals.index, trusted))
+
+
+def _is_far(pose: FloatArray, residuals: Residuals) -> bool:
+    turn, shift = (float(np.linalg.norm(residuals.pose[:, columns], axis=1).mean()) for columns in (slice(3, 6), slice(3)))
+    return float(np.linalg.norm(pose[:3]) + turn / shift * np.linalg.norm(pose[3:])) > _FAR_M
 
 
 def moved(measurement: Measurement, pose: FloatArray) -> Measurement:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.directed import simulated_ranges
+from pipeline.gap.directed import aimed, simulated_ranges
 from pipeline.gap.measurement import Measurement, ScanPattern
 from pipeline.gap.residuals import Missing, Residuals, plane_slopes
 from pipeline.gap.tls_signatures import log_over_median
@@ -15,6 +15,7 @@ from pipeline.gap.tls_spread import model_variance
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
+from sensors.effects.base import Stage
 from sensors.model import TlsModel
 
 _PROBE_RAD = 6e-4
@@ -26,8 +27,20 @@ _SHORTEST_STEP_RAD = 1e-6
 
 
 @dataclass(frozen=True)
+class Directions:
+    """What emits pulses: recorded angles (rad), scan line, share of the scan's duration and power, as TlsGeometry has them."""
+
+    azimuth: FloatArray
+    zenith: FloatArray
+    line: FloatArray | None
+    share: FloatArray | None
+    power: FloatArray | None
+
+
+@dataclass(frozen=True)
 class TlsGeometry:
-    """Per point: recorded angles (rad), predicted and measured range (m), the range's slopes by azimuth and zenith (m/rad).
+    """Per point: recorded angles (rad), and where the beam goes on average by the model, range on the reference, measured range
+    (m), and the range's slopes by azimuth and zenith (m/rad).
 
     line: scan line, share: of the scan's duration, power: received, relative; None where not known.
     """
@@ -58,10 +71,13 @@ def tls_residuals(measurement: Measurement) -> Residuals:
     measured = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
     azimuth, zenith = np.arctan2(local[:, 1], local[:, 0]), np.arccos(np.clip(local[:, 2] / measured, -1, 1))
     azimuth = azimuth.mean() + np.angle(np.exp(1j * (azimuth - azimuth.mean())))
-    axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in _axes(azimuth, zenith)]
-    distance, normal, curvature = _surface(measurement.scene, position, axes)
     line, share = _order(measurement, azimuth)
     intensity = measurement.cloud.intensity
+    real = azimuth, zenith
+    if any(effect.stage == Stage.AIM for effect in model.effects):
+        real = aimed(measurement, Directions(azimuth, zenith, line, share, intensity))
+    axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in _axes(*real)]
+    distance, normal, curvature = _surface(measurement.scene, position, axes)
     geometry = TlsGeometry(
         azimuth=azimuth,
         zenith=zenith,
@@ -77,7 +93,7 @@ def tls_residuals(measurement: Measurement) -> Residuals:
     predicted = simulated_ranges(measurement, geometry) if model.effects else distance
     sigma = np.sqrt(model_variance(model, geometry))
     slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
-    hit = np.isfinite(predicted)
+    hit = np.isfinite(predicted) & np.isfinite(distance)
     flat = (curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
     whole = Residuals(
         sensor="tls",

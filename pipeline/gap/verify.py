@@ -3,7 +3,7 @@
 Measure: the continuous ranked probability score of measured patches of the wall against an ensemble of simulated ones, in metres;
 a proper score, which neither a wrong mean nor an inflated spread can lower (Gneiting & Raftery 2007, eq. 21, fair ensemble form).
 A patch is scored twice, by the mean and by the standard deviation of its residuals: in single points either drowns in noise.
-Floor: the same score of draws of the model itself.
+Floor: the same score of draws of the model itself; no higher than the score after, below which one draw may chance to fall.
 """
 
 from __future__ import annotations
@@ -56,8 +56,9 @@ class Gap:
 
     @property
     def uncertain(self) -> bool:
-        """Whether before - floor is within its own uncertainty."""
-        return self.before - self.floor <= _MOST_SIGMAS * self.floor_error
+        """Whether before - floor is within its own uncertainty, and before - after, scored on the same patches, within its."""
+        small = self.before - self.floor <= _MOST_SIGMAS * self.floor_error
+        return small and self.before - self.after <= _MOST_SIGMAS * self.error
 
     def to_dict(self) -> dict[str, Any]:
         """As gap.json holds it."""
@@ -154,6 +155,7 @@ def measure_gap(
     old, new = (np.sum([_scores(e, v) for e, v in zip(found, value, strict=True)], axis=0) * unit for found in ensembles)
     floors = [np.sum([_scores(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_DRAWS)]
     floor, count = np.mean(floors, axis=0) * unit, len(unit)
+    floor = floor + min(float(new.mean() - floor.mean()), 0.0)
     return Gap(
         before=float(old.mean()),
         after=float(new.mean()),

@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.gap.cells import Cells, held_out_blocks
 from pipeline.gap.changes import SceneChange, find_changes
 from pipeline.gap.entries import Named, from_missing, with_effects
+from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.missing import find_missing
-from pipeline.gap.naming import believes, name_effects, residuals_against, residuals_of
-from pipeline.gap.registration import moved, pose_of, registered
+from pipeline.gap.naming import believes, name_effects
+from pipeline.gap.registration import pose_of, registered, residuals_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Tried
 from pipeline.gap.verify import Gap, Version, measure_gap, thinned
@@ -27,7 +29,6 @@ _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
 _CLIP = 5.0
 _EARLY_SIGMAS, _EARLY_M = 8.0, 0.5
-_FAR_M = 0.002
 _NOT_FREE = {"tls": ("edge_step", "line"), "stereo": ("edge_step", "incidence")}
 """Covariates by sensor that an empirical term cannot be a function of."""
 
@@ -64,14 +65,10 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     clock.lap("residuals")
     if residuals.smooth.sum() < FEWEST_POINTS:
         return _insufficient(measurement, residuals, clock)
-    rough, pose, scale = registered(residuals)
-    there, surveyed = measurement, np.zeros(6)
-    if _is_far(pose, residuals):
-        there, surveyed = moved(measurement, pose), pose
-        residuals = residuals_of(there)
-        rough, pose, scale = registered(residuals)
+    there, residuals, surveyed = settled(measurement)
+    rough, _, scale = registered(residuals)
     changes, changed = find_changes(replace(residuals, value=rough), there.cloud.points[residuals.index], residuals.smooth)
-    rough, pose, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
+    rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
     clock.lap("changes")
     cells = Cells.over(residuals.at)
     held_out = held_out_blocks(residuals.at, cells.side_m)
@@ -81,13 +78,14 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     named, naming = name_effects(there, residuals.part(chosen), scale, random)
     named = sorted([*named, *_missing(there, residuals, rough, changed)], key=lambda item: -item.gain)
     clock.lap("naming")
+    scored = score_effects(there, named, residuals, chosen, residuals.smooth & ~changed & held_out, naming.reference_sigma)
+    named = scored.named
     after = with_effects(measurement.model, [item.entry for item in named])
-    corrected = residuals_against(there, after, residuals) if named else residuals.value
-    sound = chosen[np.isfinite(corrected[chosen])]
-    versions = tuple(
-        Version(model, pose_of(replace(residuals, value=value).part(sound)))
-        for model, value in ((measurement.model, residuals.value), (after, corrected))
+    before = pose_of(residuals.part(chosen))
+    corrected, turned = (
+        _corrected(there, after, residuals, chosen) if named else (residuals.value - residuals.pose @ before, before)
     )
+    versions = Version(measurement.model, before), Version(after, turned)
     gap = _gap(there, versions, residuals, residuals.smooth & ~changed & held_out, naming.reference_sigma, scale, random)
     clock.lap("verification")
     return Diagnosis(
@@ -96,23 +94,35 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
         changes=tuple(changes),
         residuals=residuals,
         held_out=held_out,
-        before=residuals.value - residuals.pose @ versions[0].pose,
-        after=np.where(np.isfinite(corrected), corrected, residuals.value) - residuals.pose @ versions[1].pose,
-        pose=surveyed + versions[1].pose,
+        before=residuals.value - residuals.pose @ before,
+        after=np.where(np.isfinite(corrected), corrected, residuals.value - residuals.pose @ before),
+        pose=surveyed + turned,
         model_after=after,
         gap=gap,
         tried=naming.tried,
-        remaining=naming.remaining,
+        remaining=_remaining(naming.remaining, scored.failed),
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,
     )
 
 
-def _is_far(pose: FloatArray, residuals: Residuals) -> bool:
-    """Whether a registration moves the rays by so much on the wall that its slopes at the first place no longer serve."""
-    reach = float(np.linalg.norm(residuals.pose[:, 3:], axis=1).mean() / np.linalg.norm(residuals.pose[:, :3], axis=1).mean())
-    return float(np.linalg.norm(pose[:3]) + reach * np.linalg.norm(pose[3:])) > _FAR_M
+def _corrected(
+    measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, chosen: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """(n,) residuals of the same points against another model, registered by the points `chosen`; NaN where that one misses the
+    reference. The pose (6,) against the measurement's."""
+    _, found, there = settled(measurement.changed(model=model), residuals.index[chosen])
+    trusted = found.smooth & np.isin(found.index, residuals.index[chosen])
+    rest = pose_of(found.part(np.flatnonzero(trusted)))
+    value = np.full(len(measurement.cloud.points), np.nan)
+    value[found.index] = found.value - found.pose @ rest
+    return np.asarray(value[residuals.index]), there + rest
+
+
+def _remaining(remaining: dict[str, Any], failed: list[Named]) -> dict[str, Any]:
+    words = [f"{item.name} dropped: it does not hold on blocks that were held out" for item in failed]
+    return {**remaining, "note": "; ".join(each for each in (remaining["note"], *words) if each)}
 
 
 class _Clock:

@@ -1,0 +1,84 @@
+"""What each effect is worth on blocks that no step of naming has used: the Gaussian log score with it less that without it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.gap.cells import patches
+from pipeline.gap.entries import Named, with_effects
+from pipeline.gap.measurement import Measurement
+from pipeline.gap.registration import pose_of, settled
+from pipeline.gap.residuals import BoolArray, Residuals
+from scene.mesh import FloatArray
+
+NOT_SCORED = ("range_quantization", "pixel_locking", "detection_limit", "precipitation", "occlusion_fill", "edge_fattening")
+"""Effects that show in other things than mean and spread of residuals."""
+_POINTS_PER_PATCH = 30.0
+_LARGEST = 5.0
+"""Deviations are cut off at so many sigmas: an outlier has no more to say."""
+_LOST = -2.0
+"""A score that falls by more speaks against an effect."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Effects with their held-out gains, and those that failed."""
+
+    named: list[Named]
+    failed: list[Named]
+
+
+def score_effects(
+    measurement: Measurement,
+    named: list[Named],
+    residuals: Residuals,
+    train: NDArray[np.int64],
+    test: BoolArray,
+    reference_sigma: float,
+) -> Scored:
+    """Score each effect with all others in the model. train: rows by which to register; test: (n,) where to score."""
+    scored = [item for item in named if item.name.partition(".")[2] not in NOT_SCORED]
+    if not scored or test.sum() < 100:
+        return Scored(named, [])
+    whole = _value(measurement, named, residuals, train)
+    gains = {}
+    for item in scored:
+        others = [each for each in named if each is not item]
+        without = _value(measurement, others, residuals, train)
+        rows = test & np.isfinite(whole[0]) & np.isfinite(without[0])
+        patch = patches(residuals.at[rows], _POINTS_PER_PATCH)
+        scores = [_log_score(value[rows], sigma[rows], patch, reference_sigma) for value, sigma in (whole, without)]
+        gains[item.name] = scores[0] - scores[1]
+    kept = [replace(item, gain=gains.get(item.name, item.gain)) for item in named if gains.get(item.name, 0.0) >= _LOST]
+    return Scored(kept, [item for item in named if gains.get(item.name, 0.0) < _LOST])
+
+
+def _value(
+    measurement: Measurement, named: list[Named], residuals: Residuals, train: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """(n,) residuals, registered by the rows `train`, and predicted sigma against the model with some effects."""
+    model = with_effects(measurement.model, [item.entry for item in named])
+    found = settled(measurement.changed(model=model), residuals.index[train])[1]
+    count = len(measurement.cloud.points)
+    place = np.full(count, -1)
+    place[found.index[found.smooth]] = np.flatnonzero(found.smooth)  # an edge where the beam goes by this model says nothing
+    rows = place[residuals.index]
+    known = rows >= 0
+    value, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    pose = pose_of(found.part(rows[train][known[train]]))
+    value[known], sigma[known] = (found.value - found.pose @ pose)[rows[known]], found.sigma[rows[known]]
+    return value, sigma
+
+
+def _log_score(value: FloatArray, sigma: FloatArray, patch: NDArray[np.int64], reference_sigma: float) -> float:
+    """Of the patches' means, with the reference's error in their variance, and of the deviations from them."""
+    weight = 1 / sigma**2
+    total = np.bincount(patch, weight)
+    mean = np.bincount(patch, weight * value) / total
+    variance = 1 / total + reference_sigma**2
+    left = np.clip((value - mean[patch]) / sigma, -_LARGEST, _LARGEST)
+    among = -0.5 * np.sum(left**2) - np.sum(np.log(sigma)) + 0.5 * np.sum(np.log(1 / total))
+    return float(among - 0.5 * np.sum(mean**2 / variance + np.log(variance)))
