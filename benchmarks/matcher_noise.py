@@ -14,7 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matcher_cases import MATCHERS, Case, Raster, motorcycle, rendered
+from matcher_cases import MATCHERS, SGBM, Case, Raster, motorcycle, rendered
 
 from sensors.model import StereoModel
 
@@ -25,7 +25,7 @@ QUANTILES = (50, 68, 90, 95, 99)
 RIM_PX = 3
 """How far beside a depth step fattening is looked for, cells."""
 BOUNDS = ((0.0, 0.3), (0.0, 0.6), (1.0, 8.0), (0.0, 1.2), (0.0, 3.0), (0.0, 3.0), (-0.15, 0.15))
-"""Of the parameters of `model`, px of the matched pictures."""
+"""Of the parameters of `model`, px of the matched pictures; a refined match has no locking left to be fitted."""
 INTEGER = (False, False, False, False, False, True, False)
 POLISHING = 250
 """Evaluations of the simplex search that follows the evolution."""
@@ -53,8 +53,9 @@ def main() -> None:
 
 def model(values: Sequence[float], reduction: int) -> StereoModel:
     """The sensor model, px of the frame, of parameters in px of the matched pictures: white noise, heavy-tailed noise (sigma,
-    step, tail), smoothing, fattening, locking."""
-    white, sigma, step, tail, smoothing, radius, locking = (float(value) for value in values)
+    step, tail), smoothing, fattening and, where there is any, locking."""
+    white, sigma, step, tail, smoothing, radius, *rest = (float(value) for value in values)
+    locking = rest[0] if rest else 0.0
     return StereoModel(
         noise={"parallax_sigma_px": white * reduction, "regularization_sigma_px": 0.0},
         effects=[
@@ -67,7 +68,7 @@ def model(values: Sequence[float], reduction: int) -> StereoModel:
 
 
 def describe(fitted: StereoModel) -> str:
-    effects = (effect.model_dump() for effect in fitted.effects)
+    effects = (effect.model_dump(exclude_none=True) for effect in fitted.effects)
     named = ({key: value if isinstance(value, str) else round(value, 3) for key, value in effect.items()} for effect in effects)
     return f"parallax_sigma_px {fitted.noise.parallax_sigma_px:.3f}; " + "; ".join(str(effect) for effect in named)
 
@@ -76,6 +77,8 @@ def fit(cases: Sequence[Case], matcher: str, generations: int) -> list[float]:
     """The parameters of `model` whose errors are most like the matcher's in all of `cases`."""
     from scipy.optimize import differential_evolution, minimize
 
+    bounds = np.array(BOUNDS if matcher == SGBM else BOUNDS[:-1])
+    integer = np.array(INTEGER)[: len(bounds)]
     wanted = [Errors.of(case.found[matcher], case.true, case.found[matcher]).features() for case in cases]
 
     def distance(values: Sequence[float]) -> float:
@@ -86,20 +89,19 @@ def fit(cases: Sequence[Case], matcher: str, generations: int) -> list[float]:
         return total
 
     result = differential_evolution(
-        distance, BOUNDS, integrality=INTEGER, popsize=5, maxiter=generations, seed=SEED, tol=1e-3, polish=False, init="sobol"
+        distance, bounds, integrality=integer, popsize=5, maxiter=generations, seed=SEED, tol=1e-3, polish=False, init="sobol"
     )
-    free = ~np.array(INTEGER)
+    free = ~integer
 
     def completed(part: np.ndarray) -> np.ndarray:
         values = result.x.copy()
         values[free] = part
         return values
 
-    steps = np.diag(np.ptp(np.array(BOUNDS)[free], axis=1) / 20)
+    steps = np.diag(np.ptp(bounds[free], axis=1) / 20)
     options = {"maxfev": POLISHING, "initial_simplex": np.vstack([result.x[free], result.x[free] + steps])}
-    limits = np.array(BOUNDS)[free]
     polished = minimize(
-        lambda part: distance(completed(part)), result.x[free], method="Nelder-Mead", bounds=limits, options=options
+        lambda part: distance(completed(part)), result.x[free], method="Nelder-Mead", bounds=bounds[free], options=options
     )
     evaluations = result.nfev + polished.nfev
     print(

@@ -173,3 +173,10 @@ def test_mistakes_in_naming_a_scanner_are_one_line(override: str, message: str) 
     with pytest.raises(InputError, match=message) as caught:
         load_config(DEMO, [override], "tls", None)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "locks"), [("sgbm", True), ("sgbm_refined", False)])
+def test_the_fitted_matchers_are_sensor_models_with_heavy_tails(name: str, locks: bool) -> None:
+    model = load_config(configs_folder() / "demo.yaml", [f"sensor={name}"], "stereo", None).stereo_model()
+    effects = {effect.name for effect in model.effects if not effect.is_null}
+    assert effects == {"smoothing", "heavy_tailed_noise"} | ({"pixel_locking"} if locks else set())
