@@ -1,7 +1,7 @@
 """The thesis's calibration (4.1.5), kept as a baseline: one parameter at a time, by the standard deviation alone.
 
-From a tentative set with four times the measured noise, each parameter in turn is lowered by a tenth of its first value as long as
-that brings the standard deviation of simulated maps nearer to the measured one, and then all again until nothing helps; each test
+From a set with four times the measured noise, each parameter in turn is lowered by a tenth of its first value while that
+brings the standard deviation of simulated maps nearer to the measured one, and then all again until nothing helps; each test
 simulates one map.
 """
 
