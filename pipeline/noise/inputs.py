@@ -59,6 +59,8 @@ def config_of(paths: Sequence[Path]) -> Path | None:
 def sensor_of(paths: Sequence[Path], config: SimulationConfig) -> SensorName:
     """Which sensor measured. Raises InputError where neither the inputs nor the config say."""
     for path in paths:
+        if not path.exists():
+            raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
         if (path / FILE).is_file():
             return read_measurement(path).sensor
         if (path / "run.json").is_file():

@@ -30,7 +30,7 @@ _STEEP = 0.9
 _FLOOR_M = 1e-6
 """Added to every length, so that a silent model has a logarithm."""
 _NMAD = 1.4826
-_LEAST_IN_CLASS = 200
+_LEAST_IN_CLASS = 10
 
 
 @dataclass(frozen=True)
