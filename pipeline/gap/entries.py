@@ -19,6 +19,11 @@ from scene.errors import InputError
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
+SPREADS = (
+    *("range_noise", "range_noise_proportional", "range_noise_incidence", "range_noise_intensity", "angle_noise"),
+    "parallax_noise",
+)
+"""Effects that make the residuals spread more."""
 _DEGREES = 5
 _BEYOND = 100.0
 """Times its typical size, an effect explains nothing: no instrument is so far out."""
@@ -116,6 +121,12 @@ def from_spread(found: SpreadFound, sensor: str) -> Named:
     entry = {"name": found.effect, **found.parameters}
     name = f"{sensor}.{found.effect}"
     return Named(name, kind, entry, found.std, () if found.empirical else alike, found.p_value, found.gain)
+
+
+def from_tails(sensor: str, sigma: float, points: int) -> Named:
+    """Noise with heavy tails, which the catalogue does not have: its standard deviation as white noise, marked empirical."""
+    name, key = ("range_noise", "sigma_m") if sensor == "tls" else ("parallax_noise", "sigma_px")
+    return Named(f"{sensor}.{name}", "empirical", {"name": name, key: sigma}, {}, (), 1 / 2000, float(points))
 
 
 def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:

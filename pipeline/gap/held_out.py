@@ -19,8 +19,8 @@ NOT_SCORED = ("range_quantization", "pixel_locking", "detection_limit", "precipi
 _POINTS_PER_PATCH = 30.0
 _LARGEST = 5.0
 """Deviations are cut off at so many sigmas: an outlier has no more to say."""
-_LOST = -2.0
-"""A score that falls by more speaks against an effect."""
+_LOST = 0.0
+"""A score that does not rise speaks against an effect."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ def score_effects(
         patch = patches(residuals.at[rows], _POINTS_PER_PATCH)
         scores = [_log_score(value[rows], sigma[rows], patch, reference_sigma) for value, sigma in (whole, without)]
         gains[item.name] = scores[0] - scores[1]
-    kept = [replace(item, gain=gains.get(item.name, item.gain)) for item in named if gains.get(item.name, 0.0) >= _LOST]
-    return Scored(kept, [item for item in named if gains.get(item.name, 0.0) < _LOST])
+    kept = [replace(item, gain=gains.get(item.name, item.gain)) for item in named if gains.get(item.name, 1.0) > _LOST]
+    return Scored(kept, [item for item in named if gains.get(item.name, 1.0) <= _LOST])
 
 
 def _value(

@@ -94,8 +94,7 @@ def name_effects(
     if chosen:
         spread = find_spread(at, last.cells, last.without([each.chosen for each in estimates[len(physical) :]]), random)
     named += [from_mean(each, at) for each in estimates]
-    if spread is not None:
-        named.append(from_spread(spread, part.sensor))
+    named += [from_spread(each, part.sensor) for each in spread]
     names, cosines, survival = first.identifiability()
     remaining = {"p_value": last.p_value(tried[0].score) if tried else 1.0, "note": "; ".join([*part.notes, *_words(left_out)])}
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
@@ -118,9 +117,9 @@ def _noisier(part: Residuals, variance: float) -> Residuals:
     return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
 
 
-def _weighed(part: Residuals, spread: SpreadFound | None, scale: float) -> Residuals:
+def _weighed(part: Residuals, spread: list[SpreadFound], scale: float) -> Residuals:
     """With the spread that the points really have."""
-    sigma = part.sigma * scale if spread is None else np.sqrt(part.sigma**2 + spread.variance)
+    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in spread)) if spread else part.sigma * scale
     return replace(part, sigma=sigma)
 
 
@@ -138,7 +137,7 @@ def _again(
     part: Residuals,
     families: list[Candidate | Grid],
     had: list[Estimate],
-    spread: SpreadFound | None,
+    spread: list[SpreadFound],
     noise: tuple[float, float],
     random: KeyedRandom,
 ) -> tuple[MeanSearch, Residuals, list[Estimate], tuple[Tried, ...]]:
@@ -156,7 +155,7 @@ def _again(
     others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
     known = [replace(each, candidate=_renewed(each.candidate, renewed)) for each in had]
     columns = [_columns(each) for each in known]
-    weighed = _weighed(at, None if spread is None else replace(spread, variance=spread.variance[_kept(at, part)]), noise[0])
+    weighed = _weighed(at, [replace(each, variance=each.variance[_kept(at, part)]) for each in spread], noise[0])
     search = MeanSearch(replace(weighed, pose=np.concatenate([at.pose, *columns], axis=1)), others, random.child("again"))
     chosen, tried = search.select()
     fit = search.refined([item.candidate for item in chosen])[1]

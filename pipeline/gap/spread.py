@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,21 +25,37 @@ _LEAST_LEFT = 0.3
 """Share of a point's variance that its cell's plane must leave."""
 _CLASS_MARGIN = 3.0
 _FREE_MARGIN = 6.0
+_SECOND_GAIN = 3.0
 _BINS = 8
+_FAR, _MOST_FAR, _CUT = 4.0, 0.004, 12.0
+"""Share of residuals beyond so many sigmas: up to 0.0016 in development cases without an effect, 0.02 with 3 % of outliers."""
+_ONE_BLOCK = 0.2
+"""Of the far residuals, the share that one block of the wall may have: more is a change of the scene."""
 _EXPONENTS = (-0.5, -0.75, -1.0)
-_THETAS = np.concatenate([[0.0], np.geomspace(1e-3, 1e2, 60)])
+_ROUNDS, _BLOCK_SIGMAS = 25, 3.0
 
 
 @dataclass(frozen=True)
 class SpreadCandidate:
-    """variance: (n,) form that is scaled by theta; parameters: from theta to the effect's values; cost: free parameters."""
+    """variance: (n, k) forms that are scaled by theta (k,); parameters: their square roots times `scale`, by name; cost: free
+    parameters; fixed: values that tell variants apart."""
 
     name: str
     variance: FloatArray
-    parameters: Callable[[float], dict[str, float]]
+    scale: float
     names: tuple[str, ...]
     cost: float = 1.0
-    fixed: Mapping[str, float | str] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+    def parameters(self, theta: FloatArray) -> dict[str, float]:
+        """The effect's values."""
+        return dict(zip(self.names, map(float, np.sqrt(theta) * self.scale), strict=True)) | dict(self.fixed)
+
+    def errors(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
+        """Their standard deviations, from those of theta; of one that is 0, what it may be."""
+        root = np.sqrt(theta)
+        std = np.where(theta > error, error / np.maximum(2 * root, 1e-300), np.sqrt(error))
+        return dict(zip(self.names, map(float, std * self.scale), strict=True))
 
 
 @dataclass(frozen=True)
@@ -90,90 +107,133 @@ def tls_candidates(residuals: Residuals) -> list[SpreadCandidate]:
     """The catalogue's forms of a laser range's variance."""
     g = residuals.geometry
     one = np.ones(len(residuals))
-
-    def root(name: str, scale: float = 1.0, **fixed: float) -> Callable[[float], dict[str, float]]:
-        return lambda theta: {name: float(np.sqrt(theta)) * scale, **fixed}
-
-    across, along = g.by_azimuth**2, g.by_zenith**2
+    angles = np.stack([g.by_azimuth**2, g.by_zenith**2], axis=1)
     found = [
-        SpreadCandidate("range_noise", one, root("sigma_m"), ("sigma_m",)),
-        SpreadCandidate("range_noise_proportional", g.range_m**2, root("ppm", 1e6), ("ppm",)),
-        SpreadCandidate("range_noise_incidence", slant(g) ** 2, root("sigma_m"), ("sigma_m",)),
-        SpreadCandidate("angle_noise", across, root("azimuth_sigma_rad"), ("azimuth_sigma_rad",), 1.5),
-        SpreadCandidate("angle_noise", along, root("zenith_sigma_rad"), ("zenith_sigma_rad",), 1.5),
-        SpreadCandidate("angle_noise", across + along, _both_angles, ("azimuth_sigma_rad", "zenith_sigma_rad"), 1.5),
+        SpreadCandidate("range_noise", one[:, None], 1.0, ("sigma_m",)),
+        SpreadCandidate("range_noise_proportional", g.range_m[:, None] ** 2, 1e6, ("ppm",)),
+        SpreadCandidate("range_noise_incidence", slant(g)[:, None] ** 2, 1.0, ("sigma_m",)),
+        SpreadCandidate("angle_noise", angles, 1.0, ("azimuth_sigma_rad", "zenith_sigma_rad"), 2.0),
     ]
     if g.power is not None:
         power = np.maximum(g.power, 1e-9)
         for exponent in _EXPONENTS:
             form = np.minimum(power ** (2 * exponent), np.quantile(power ** (2 * exponent), 0.999))
-            found.append(SpreadCandidate("range_noise_intensity", form, root("a_m", exponent=exponent), ("a_m",), 1.5))
+            found.append(SpreadCandidate("range_noise_intensity", form[:, None], 1.0, ("a_m",), 1.5, {"exponent": exponent}))
     return found
-
-
-def _both_angles(theta: float) -> dict[str, float]:
-    return dict.fromkeys(("azimuth_sigma_rad", "zenith_sigma_rad"), float(np.sqrt(theta)))
 
 
 def stereo_candidates(residuals: Residuals) -> list[SpreadCandidate]:
     """The catalogue's forms of a disparity's variance that need no image."""
-    return [
-        SpreadCandidate(
-            "parallax_noise", np.ones(len(residuals)), lambda theta: {"sigma_px": float(np.sqrt(theta))}, ("sigma_px",)
-        )
-    ]
+    return [SpreadCandidate("parallax_noise", np.ones((len(residuals), 1)), 1.0, ("sigma_px",))]
 
 
-def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> SpreadFound | None:
-    """The effect that the spread asks for, if any. value: (n,) residuals without the mean effects found."""
+def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> list[SpreadFound]:
+    """The effects that the spread asks for, at most two. value: (n,) residuals without the mean effects found."""
     z = standardised(residuals, cells, value)
     kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, 1.4826 * float(np.nanmedian(np.abs(z)))))
     squared = z[kept] ** 2
     candidates = tls_candidates(residuals) if residuals.sensor == "tls" else stereo_candidates(residuals)
-    forms = [candidate.variance[kept] / residuals.sigma[kept] ** 2 for candidate in candidates]
-    fits = [_most_likely(squared, form) for form in forms]
-    scores = np.array([gain - candidate.cost for (_, gain, _), candidate in zip(fits, candidates, strict=True)])
-    best = int(np.argmax(scores))
-    theta, gain, error = fits[best]
-    excess = float(np.mean(theta * forms[best]))
-    p_value = _p_value(squared, forms, block_numbers(residuals.at[kept], cells.side_m), random)
-    if gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
-        return None
+    forms = [candidate.variance[kept] / residuals.sigma[kept, None] ** 2 for candidate in candidates]
+    singles = [_Joint.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
+    best = max(singles, key=lambda fit: fit.score)
+    excess = float(np.mean(best.added(forms)))
+    block = block_numbers(residuals.at[kept], cells.side_m)
+    p_value = _p_value(squared, [form.sum(axis=1) for form in forms], block, random)
+    if best.gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
+        return []
+    pairs = [
+        _Joint.fitted(squared, forms, [first, second], candidates)
+        for first, second in combinations(range(len(forms)), 2)
+        if candidates[first].name != candidates[second].name
+    ]
+    pair = max(pairs, key=lambda fit: fit.score, default=best)
     free_name, free_score = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()}, residuals.sensor)
-    alike = {c.name for c, s in zip(candidates, scores, strict=True) if s > scores[best] - _CLASS_MARGIN} - {
-        candidates[best].name
-    }
-    tried = tuple(sorted(((c.name, float(s)) for c, s in zip(candidates, scores, strict=True)), key=lambda item: -item[1]))
-    parameters = candidates[best].parameters(theta)
-    std = {key: abs(parameters[key]) * error / (2 * theta) for key in candidates[best].names}
-    empirical = free_score > scores[best] + _FREE_MARGIN
-    name = f"spread by {free_name}" if empirical else candidates[best].name
-    return SpreadFound(
-        name,
-        candidates[best].name,
-        tuple(sorted(alike)),
-        p_value,
-        gain,
-        parameters,
-        std,
-        empirical,
-        theta * candidates[best].variance,
-        tried,
-    )
+    # where one effect leaves something over, a second of the catalogue comes before a form of no effect
+    needed = _SECOND_GAIN if free_score > best.score + _FREE_MARGIN else _LEAST_GAIN
+    agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
+    chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
+    empirical = free_score > chosen.score + _FREE_MARGIN
+    if empirical:
+        chosen = best
+    tried = tuple(sorted(((c.name, fit.score) for c, fit in zip(candidates, singles, strict=True)), key=lambda item: -item[1]))
+    found = []
+    for place, number in enumerate(chosen.members):
+        candidate, theta = candidates[number], chosen.theta[place]
+        others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _differ_by(fit, chosen, number)]
+        near = {candidates[n].name for fit in others if fit.score > chosen.score - _CLASS_MARGIN for n in fit.members}
+        alike = near - {candidates[each].name for each in chosen.members}
+        parameters = candidate.parameters(theta)
+        std = candidate.errors(theta, chosen.error[place])
+        gain = chosen.gain - max(
+            (fit.gain for fit in singles if fit.members != (number,) and fit.members[0] in chosen.members), default=0.0
+        )
+        name = f"spread by {free_name}" if empirical else candidate.name
+        found.append(
+            SpreadFound(
+                name,
+                candidate.name,
+                tuple(sorted(alike)),
+                p_value,
+                gain,
+                parameters,
+                std,
+                empirical,
+                candidate.variance @ theta,
+                tried,
+            )
+        )
+    return found
 
 
-def _most_likely(squared: FloatArray, form: FloatArray) -> tuple[float, float, float]:
-    """theta >= 0, the gain in log-likelihood over theta = 0, and theta's standard error."""
-    scale = 1 / max(float(np.mean(form)), 1e-300)
-    gains = [_gain(squared, theta * scale * form) for theta in _THETAS]
-    index = int(np.argmax(gains))
-    low, high = _THETAS[max(index - 1, 0)] * scale, _THETAS[min(index + 1, len(_THETAS) - 1)] * scale
-    for _ in range(30):  # golden section
-        first, second = high - 0.618 * (high - low), low + 0.618 * (high - low)
-        low, high = (low, second) if _gain(squared, first * form) > _gain(squared, second * form) else (first, high)
-    theta = (low + high) / 2
-    information = 0.5 * float(np.sum((form / (1 + theta * form)) ** 2))
-    return theta, _gain(squared, theta * form), 1 / np.sqrt(max(information, 1e-300))
+@dataclass(frozen=True)
+class _Joint:
+    """Some candidates fitted together. theta, error: of each; gain in log-likelihood over the model; score: less cost."""
+
+    members: tuple[int, ...]
+    theta: tuple[FloatArray, ...]
+    error: tuple[FloatArray, ...]
+    gain: float
+    score: float
+
+    @classmethod
+    def fitted(
+        cls, squared: FloatArray, forms: list[FloatArray], members: list[int], candidates: list[SpreadCandidate]
+    ) -> _Joint:
+        """By Fisher scoring on 1 + sum theta f, theta at least 0."""
+        columns = np.concatenate([forms[number] for number in members], axis=1)
+        scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
+        columns = columns * scale
+        theta = np.full(len(scale), max(float(np.mean(squared)) - 1, 1e-3) / len(scale))
+        information = np.eye(len(scale))
+        for _ in range(_ROUNDS):
+            total = 1 + columns @ theta
+            slope = 0.5 * columns.T @ ((squared - total) / total**2)
+            information = 0.5 * (columns / total[:, None] ** 2).T @ columns
+            free = (theta > 0) | (slope > 0)
+            step = np.zeros(len(theta))
+            step[free] = np.linalg.lstsq(information[np.ix_(free, free)], slope[free], rcond=1e-10)[0]
+            theta = np.maximum(theta + step, 0.0)
+        gain = _gain(squared, columns @ theta)
+        error = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
+        ends = np.cumsum([forms[number].shape[1] for number in members])[:-1]
+        score = gain - sum(candidates[number].cost for number in members)
+        return cls(tuple(members), tuple(np.split(theta * scale, ends)), tuple(np.split(error * scale, ends)), gain, score)
+
+    def added(self, forms: list[FloatArray]) -> FloatArray:
+        """(n,) variance that it adds, over the predicted one."""
+        return np.asarray(sum(forms[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))
+
+
+def _differ_by(fit: _Joint, chosen: _Joint, number: int) -> bool:
+    """Whether a fit has another form in place of one of the chosen."""
+    return number not in fit.members and set(chosen.members) - {number} <= set(fit.members)
+
+
+def _blocks_agree(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
+    """Whether the gain of one variance over another is common to the blocks and not due to a few."""
+    terms = 0.5 * (squared * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
+    sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
+    return bool(sums.sum() > _BLOCK_SIGMAS * np.linalg.norm(sums))
 
 
 def _gain(squared: FloatArray, added: FloatArray) -> float:
@@ -188,6 +248,20 @@ def _p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np.int
     signs = random.child("spread").generator().choice([-1.0, 1.0], size=(scores.shape[1], DRAWS))
     largest = np.max(scores @ signs / size[:, None], axis=0)
     return float((1 + np.sum(largest >= np.max(scores.sum(axis=1) / size))) / (1 + DRAWS))
+
+
+def find_tails(z: FloatArray, block: NDArray[np.int64]) -> float | None:
+    """Standard deviation, in predicted ones, of noise with heavy tails that normal noise of the predicted spread leaves; or None.
+
+    z: (n,) residuals over the spread that all effects together predict; of normal ones 6e-5 lie beyond 4.
+    """
+    far = np.abs(z) > _FAR
+    if far.mean() < _MOST_FAR:
+        return None
+    sums = np.bincount(np.unique(block, return_inverse=True)[1], far)
+    spread_out = float(sums.max()) < _ONE_BLOCK * float(sums.sum())
+    excess = float(np.mean(np.minimum(z**2, _CUT**2))) - 1
+    return float(np.sqrt(max(excess, 0.0))) if spread_out else None
 
 
 def _free_form(squared: FloatArray, covariates: Mapping[str, FloatArray], sensor: str) -> tuple[str, float]:

@@ -60,12 +60,12 @@ def _spread(view: View) -> list[OtherEffect]:
     candidates = tls_candidates(residuals) if residuals.sensor == "tls" else stereo_candidates(residuals)
     found: dict[str, OtherEffect] = {}
     for candidate in candidates:
-        form = candidate.variance / residuals.sigma**2
+        form = candidate.variance.sum(axis=1) / residuals.sigma**2
         information = 0.5 * float(np.sum(form**2)) * view.whole / len(residuals)
         theta = SIGNAL_TO_NOISE / np.sqrt(max(information, 1e-300))
         least = _LEAST_EXCESS / max(float(np.mean(form)), 1e-300)
         note = "" if theta > least else f"below that it adds less than {_LEAST_EXCESS:.0%} to the variance, which is not named"
-        value = candidate.parameters(max(theta, least))[candidate.names[0]]
+        value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
         name = f"{residuals.sensor}.{candidate.name}"
         if name not in found or value < found[name].seen_from:
             found[name] = OtherEffect(name, candidate.names[0], float(value), note)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.cells import Cells, held_out_blocks
+from pipeline.gap.cells import Cells, block_numbers, held_out_blocks
 from pipeline.gap.changes import SceneChange, find_changes
-from pipeline.gap.entries import Named, from_missing, with_effects
+from pipeline.gap.entries import SPREADS, Named, from_missing, from_tails, with_effects
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.missing import find_missing
@@ -19,6 +19,7 @@ from pipeline.gap.naming import believes, name_effects
 from pipeline.gap.registration import pose_of, registered, residuals_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Tried
+from pipeline.gap.spread import find_tails
 from pipeline.gap.verify import Gap, Version, measure_gap, thinned
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -79,7 +80,7 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     named = sorted([*named, *_missing(there, residuals, rough, changed)], key=lambda item: -item.gain)
     clock.lap("naming")
     scored = score_effects(there, named, residuals, chosen, residuals.smooth & ~changed & held_out, naming.reference_sigma)
-    named = scored.named
+    named = _with_tails(there, scored.named, residuals, np.flatnonzero(residuals.smooth & ~changed & ~held_out), cells)
     after = with_effects(measurement.model, [item.entry for item in named])
     before = pose_of(residuals.part(chosen))
     corrected, turned = (
@@ -105,6 +106,22 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
         seconds=clock.total,
         timings=clock.laps,
     )
+
+
+def _with_tails(
+    measurement: Measurement, named: list[Named], residuals: Residuals, rows: NDArray[np.int64], cells: Cells
+) -> list[Named]:
+    """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes."""
+    model = with_effects(measurement.model, [item.entry for item in named])
+    _, found, _ = settled(measurement.changed(model=model), residuals.index[rows])
+    trusted = np.flatnonzero(found.smooth & np.isin(found.index, residuals.index[rows]))
+    part = found.part(trusted)
+    value, _, scale = registered(part)
+    tails = find_tails(value / part.sigma / scale, block_numbers(part.at, cells.side_m))
+    if tails is None:
+        return named
+    kept = [item for item in named if item.name.partition(".")[2] not in SPREADS]
+    return [*kept, from_tails(part.sensor, tails * float(np.median(part.sigma)), len(part))]
 
 
 def _corrected(
