@@ -14,6 +14,7 @@ from pipeline.gap.quantization import Comb
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.selection import Chosen
 from pipeline.gap.spread import SpreadFound
+from pipeline.gap.stereo_shapes import ShapeFound
 from scene.config import parse
 from scene.errors import InputError
 from scene.mesh import FloatArray
@@ -121,6 +122,12 @@ def from_spread(found: SpreadFound, sensor: str) -> Named:
     entry = {"name": found.effect, **found.parameters}
     name = f"{sensor}.{found.effect}"
     return Named(name, kind, entry, found.std, () if found.empirical else alike, found.p_value, found.gain)
+
+
+def from_shape(found: ShapeFound) -> Named:
+    """An effect at depth steps."""
+    entry = {"name": found.name, **found.parameters}
+    return Named(f"stereo.{found.name}", "physical", entry, found.std, (), found.p_value, found.gain)
 
 
 def from_tails(sensor: str, sigma: float, points: int) -> Named:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.gap.cells import Cells, block_numbers, held_out_blocks
 from pipeline.gap.changes import SceneChange, find_changes
-from pipeline.gap.entries import SPREADS, Named, from_missing, from_tails, with_effects
+from pipeline.gap.entries import SPREADS, Named, from_missing, from_shape, from_tails, with_effects
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.missing import find_missing
@@ -20,6 +20,7 @@ from pipeline.gap.registration import pose_of, registered, residuals_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Tried
 from pipeline.gap.spread import find_tails
+from pipeline.gap.stereo_shapes import find_shapes
 from pipeline.gap.verify import Gap, Version, measure_gap, thinned
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -68,6 +69,10 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
         return _insufficient(measurement, residuals, clock)
     there, residuals, surveyed = settled(measurement)
     rough, _, scale = registered(residuals)
+    shapes = find_shapes(there, residuals, rough, scale) if measurement.sensor == "stereo" else []
+    for shape in shapes:
+        residuals = replace(residuals, smooth=residuals.smooth & ~shape.touched)
+    rough, _, scale = registered(residuals)
     changes, changed = find_changes(replace(residuals, value=rough), there.cloud.points[residuals.index], residuals.smooth)
     rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
     clock.lap("changes")
@@ -77,7 +82,8 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     chosen = np.flatnonzero(usable & ~held_out)
     chosen = chosen[:: max(len(chosen) // _MOST_POINTS, 1)]
     named, naming = name_effects(there, residuals.part(chosen), scale, random)
-    named = sorted([*named, *_missing(there, residuals, rough, changed)], key=lambda item: -item.gain)
+    shaped = [from_shape(shape) for shape in shapes if not believes(measurement, shape.name)]
+    named = sorted([*named, *shaped, *_missing(there, residuals, rough, changed)], key=lambda item: -item.gain)
     clock.lap("naming")
     scored = score_effects(there, named, residuals, chosen, residuals.smooth & ~changed & held_out, naming.reference_sigma)
     named = _with_tails(there, scored.named, residuals, np.flatnonzero(residuals.smooth & ~changed & ~held_out), cells)
