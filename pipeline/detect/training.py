@@ -117,7 +117,7 @@ def _begun(out: Path, config: TrainConfig, model: MaskRCNN, *, resume: bool) -> 
         raise InputError("holds a training with another config", where=str(out), remedy="use its config, or choose another --out")
     model.load_weights(out / CHECKPOINT / state["weights"])
     with np.load(out / CHECKPOINT / state["optimizer"]) as values:
-        for number, variable in enumerate(model.optimizer.variables):
+        for number, variable in enumerate(_further_state(model)):
             variable.assign(values[str(number)])
     return History(state["training"], state["validation"])
 
@@ -128,7 +128,7 @@ def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> 
     names = {"weights": f"epoch_{epoch:04d}.weights.h5", "optimizer": f"epoch_{epoch:04d}.{_OPTIMIZER}"}
     weights.save_weights(model, folder / names["weights"])
     with writing(folder / names["optimizer"]) as temporary:
-        values: dict[str, Any] = {str(n): np.asarray(variable) for n, variable in enumerate(model.optimizer.variables)}
+        values: dict[str, Any] = {str(n): np.asarray(variable) for n, variable in enumerate(_further_state(model))}
         np.savez(temporary, **values)
     if history.total[-1] == min(history.total):
         weights.save(model, out / BEST)
@@ -137,6 +137,11 @@ def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> 
     for old in folder.glob("epoch_*"):
         if old.name not in names.values():
             old.unlink()
+
+
+def _further_state(model: MaskRCNN) -> list[Any]:
+    """What a training needs beside the weights to go on: the optimizer's variables and the place in the stream of samples."""
+    return [*model.optimizer.variables, model.samples.state]
 
 
 class _EventLog:

@@ -66,7 +66,7 @@ def test_batches_depend_on_seed_and_epoch_alone(tmp_path):
 
 
 def test_a_mirrored_map_has_its_blocks_mirrored(tmp_path):
-    labelled = CocoFolder(make_set(tmp_path, 1, 4, side=64, blocks=2)).labelled(0)
+    labelled = CocoFolder(make_set(tmp_path, 1, 4, blocks=2)).labelled(0)
     turned = mirrored(labelled)
     for number, (y0, x0, y1, x1) in enumerate(turned.boxes, start=1):
         rows, columns = np.nonzero(turned.labels == number)
@@ -130,7 +130,9 @@ def test_the_baseline_finds_niches_above_the_level_of_detection_and_no_noise(tmp
         truth = folder.labelled(index)
         found = [item for item in baseline.detect(truth.difference) if item.score > 0.9]
         assert len(found) == len(truth.boxes)
-        assert sum(item.area_px for item in found) == pytest.approx((truth.labels > 0).sum(), rel=0.1)
+        assert sum(item.area_px for item in found) == pytest.approx(
+            (truth.labels > 0).sum(), rel=0.15
+        )  # closing rounds small niches up
 
 
 def test_detect_writes_what_it_says(tmp_path):

@@ -34,7 +34,9 @@ def make_set(folder: Path, count: int, seed: int, side: int = SIDE, blocks: int 
         difference = random.normal(0, 0.01, (side, side)).astype(np.float32)
         taken = np.zeros((side, side), bool)
         y, x = np.mgrid[:side, :side] + 0.5
-        while sum(item["image_id"] == number for item in annotations) < blocks:
+        for _ in range(1000):
+            if sum(item["image_id"] == number for item in annotations) == blocks:
+                break
             height, width = random.uniform(10, 30, 2)
             row, column = random.uniform(16, side - 16, 2)
             mask = ((y - row) / height * 2) ** 2 + ((x - column) / width * 2) ** 2 < 1
@@ -52,6 +54,8 @@ def make_set(folder: Path, count: int, seed: int, side: int = SIDE, blocks: int 
                     "segmentation": run_length_encoding(crop, int(rows[0]), int(columns[0]), mask.shape),
                 }
             )  # fmt: skip
+        else:
+            raise AssertionError("the blocks do not fit the image")
         difference[:4] = np.nan
         write_geotiff(folder / f"{number}.tif", difference, Grid(0.0, side * 0.02, 0.02, side, side))
         images.append({"id": number, "file_name": f"{number}.tif", "width": side, "height": side})
