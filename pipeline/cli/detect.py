@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from datetime import datetime
 from pathlib import Path
 
 SUMMARY = "find rockfalls in difference maps: masks, events, pictures"
@@ -38,11 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from pipeline.cli.simulate import new_folder
     from pipeline.detect.run import BASELINE, CONFIDENCES, checked_confidences, detect
     from pipeline.progress import shown_progress
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
-    out = arguments.out or Path("runs") / f"detect_{datetime.now():%Y%m%d_%H%M%S}"
+    out = arguments.out or new_folder(Path("runs"), "detect")
     if arguments.model != BASELINE:
         from pipeline.detect.keras_backend import keras_ready
 

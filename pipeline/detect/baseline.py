@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from scene.config import Config
 class BaselineConfig(Config):
     """How the baseline finds blocks."""
 
-    median_px: int = Field(3, ge=1, le=5, description="side of the median filter before the threshold; odd, 1: none")
+    median_px: Literal[1, 3, 5] = Field(3, description="side of the median filter before the threshold; 1: none")
     levels: float = Field(
         1.0, gt=0, description="threshold, in multiples of the level of detection, 1.96 NMAD of the filtered map"
     )

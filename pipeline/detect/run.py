@@ -16,10 +16,9 @@ from pipeline.detect import baseline, events
 from pipeline.detect.data import CocoFolder
 from pipeline.detect.detections import Detection
 from pipeline.detect.figures import write_overlay
-from pipeline.formats.geotiff import read_geotiff, read_tiff, write_geotiff
+from pipeline.formats.geotiff import read_geotiff, write_geotiff
 from pipeline.progress import Progress
 from scene.errors import InputError
-from scene.grid import Grid
 
 BASELINE, DEFAULT = "baseline", "default"
 CONFIDENCES = (0.9, 0.95, 0.99)
@@ -83,7 +82,7 @@ def detect(
     pictures: bool = True,
     progress: Progress | None = None,
 ) -> list[events.Event]:
-    """Find the blocks in difference maps; returns the events at the lowest of the confidences.
+    """Find the blocks in difference maps (GeoTIFF, m); returns the events at the lowest of the confidences.
 
     Writes to `out`: detections.json, everything above a score of 0.05, for `scarpsim evaluate`; for each confidence c
     detections_c.json and events_c.csv; for the lowest also a raster of masks and an overlay picture per map.
@@ -96,7 +95,7 @@ def detect(
     with progress, progress.stage("detection"):
         progress.plan({"detection": 1.0})
         for number, item in enumerate(inputs):
-            difference, grid = _read(item.path)
+            difference, grid = read_geotiff(item.path)
             found = find(difference)
             images.append({**item.image, "height": difference.shape[0], "width": difference.shape[1]})
             annotations += [
@@ -116,13 +115,3 @@ def detect(
             events.write_coco(images, chosen, out / f"detections_{confidence:g}.json")
             events.write_events([each for each in found_events if each.score >= confidence], out / f"events_{confidence:g}.csv")
     return found_events
-
-
-def _read(path: Path) -> tuple[NDArray[np.float32], Grid]:
-    """A map and its place; one without a place lies at the origin with pixels of a metre."""
-    raster = read_tiff(path)
-    try:
-        return read_geotiff(path)
-    except InputError:
-        height, width = raster.shape
-        return raster, Grid(0.0, float(height), 1.0, width, height)

@@ -186,6 +186,18 @@ def test_the_shipped_configs_load():
         assert load_train_config(path).detector.backbone == path.stem
 
 
+def test_a_saved_detector_comes_back_with_every_weight(tmp_path):
+    saved = MaskRCNN(SMALL, seed=7)
+    weights.save(saved, tmp_path)
+    loaded = weights.load(tmp_path)
+    assert loaded.config == SMALL
+    for one, other in zip(saved.weights, loaded.weights, strict=True):
+        assert_array_equal(one, other)
+    assert any(
+        np.any(np.asarray(one) != np.asarray(other)) for one, other in zip(saved.weights, MaskRCNN(SMALL).weights, strict=True)
+    )
+
+
 def test_weights_of_another_network_are_refused(tmp_path):
     weights.save(MaskRCNN(SMALL), tmp_path)
     other = SMALL.model_copy(update={"pyramid_channels": 40})
