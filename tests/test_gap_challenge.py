@@ -256,8 +256,8 @@ def test_powers_and_slopes_are_part_of_a_ray() -> None:
 
 @pytest.mark.slow
 def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
-    """24 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names,
-    95 % right) each of them fails in less than 2 % of draws; the seed is fixed."""
+    """24 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names)
+    each fails in less than 2 % of draws; the seed is fixed. The rate of right names is short of GAP.md's 95 %, see below."""
     found = run(24, 20, 1, tmp_path, small=True)
     rows = found["rows"]
     assert {row["stratum"] for row in rows} == set(cases.STRATA)
