@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-from pipeline.dataset.worker import Order, fill
+from pipeline.dataset.worker import Order, fill_run
 from scene.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,6 +18,21 @@ if TYPE_CHECKING:
 
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _CONNECT_S = 20
+_LONGEST_RUN = 8
+"""Epochs that a worker makes before it reports; what a killed worker costs at most."""
+_RUNS_EACH = 2
+"""For each worker at least, so that the last to finish is not far behind."""
+
+
+def runs(orders: Sequence[Order], workers: int) -> list[list[Order]]:
+    """Orders in runs of neighbours that share a stage, which a worker then sets up once; of equal lengths within a stage."""
+    longest = min(max(len(orders) // (_RUNS_EACH * workers), 1), _LONGEST_RUN)
+    found = []
+    for _, same in groupby(orders, key=lambda order: (order.source, order.stage)):
+        shared = list(same)
+        length = -(-len(shared) // -(-len(shared) // longest))
+        found += [shared[start : start + length] for start in range(0, len(shared), length)]
+    return found
 
 
 def fill_on_cluster(orders: list[Order], count: int, scheduler: str) -> Iterator[dict[str, Any]]:
@@ -33,11 +49,13 @@ def fill_on_cluster(orders: list[Order], count: int, scheduler: str) -> Iterator
     with ExitStack() as stack:
         client = _remote(stack, scheduler) if scheduler else _local(stack, count)
         threads = 0 if scheduler else _threads_each(count)
-        keys = [f"epoch-{order.job}-{order.source}-{order.index:06d}" for order in orders]
-        futures = client.map(fill, [replace(order, threads=threads) for order in orders], key=keys)
+        given = runs([replace(order, threads=threads) for order in orders], count or max(len(client.nthreads()), 1))
+        keys = [f"epochs-{run[0].job}-{run[0].source}-{run[0].index:06d}" for run in given]
         try:
-            for _, taken in as_completed(futures, with_results=True):
-                yield taken
+            # nobody keeps the futures: Dask would make the epochs of a dead worker again for the sake of its results
+            for future, taken in as_completed(client.map(fill_run, given, key=keys), with_results=True):
+                future.release()
+                yield from taken
         except KilledWorker as error:
             raise InputError(
                 f"workers died while making {error.task}", where="dataset", remedy="see that each has 2.5 GB of memory or more"

@@ -29,6 +29,7 @@ from pipeline.dataset.plan import planned_epochs
 from pipeline.dataset.worker import Order, fill, makers, require_same_makers
 from pipeline.formats.atomic import write_json
 from pipeline.progress import Progress
+from scene.config import parse
 from scene.errors import InputError
 
 
@@ -134,7 +135,8 @@ def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSumm
     summary = DatasetSummary(folder, damage=damage + (assembled_damages(folder) if known["complete"] else []))
     write_dataset_file(folder, known["name"], known["sources"], known["epochs"])
     job = uuid.uuid4().hex
-    orders = [Order(str(folder.absolute()), job, source, index) for source, index in found]
+    stages = {source: _stages(known, source, folder) for source in {source for source, _ in found}}
+    orders = [Order(str(folder.absolute()), job, source, index, stages[source][index]) for source, index in found]
     try:
         with progress.stage("epochs") as stage:
             for taken in _fill_all(orders, workers):
@@ -149,6 +151,12 @@ def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSumm
     remove_leftovers(folder)
     summary.images, summary.annotations = assembled.images, assembled.annotations
     return summary
+
+
+def _stages(known: dict[str, Any], source: str, folder: Path) -> list[tuple[str, str, str, int]]:
+    """The stage of every epoch of a source."""
+    config = parse(DatasetConfig, known["sources"][source]["config"], str(folder / DATASET_FILE))
+    return [epoch.stage for epoch in planned_epochs(config)]
 
 
 def _fill_all(orders: list[Order], workers: Workers) -> Iterator[dict[str, Any]]:

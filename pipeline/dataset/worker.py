@@ -6,7 +6,7 @@ import os
 import resource
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -24,17 +24,19 @@ from scene.config import parse
 from scene.errors import InputError
 
 _one_at_a_time = threading.Lock()
-"""Dask may give a worker several threads; a stage is set up once and used by one epoch at a time."""
+"""Dask may give a worker several threads; a stage is set up once and used by one run of epochs at a time."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """An epoch to make. folder: of the data set; job: names its staging folder; source: whose epoch; threads: to use; 0: all."""
+    """An epoch to make. folder: of the data set; job: names its staging folder; source: whose epoch; stage: what it shares with
+    others (`PlannedEpoch.stage`), of that source; threads: to use; 0: all."""
 
     folder: str
     job: str
     source: str
     index: int
+    stage: tuple[str, str, str, int]
     threads: int = 0
 
 
@@ -84,20 +86,25 @@ def use_threads(count: int) -> None:
         cv2.setNumThreads(count)
 
 
+def fill_run(orders: Sequence[Order]) -> list[dict[str, Any]]:
+    """Make epochs one after the other, with nothing in between that needs another stage. Returns what each took, see `fill`."""
+    with _one_at_a_time:
+        return [fill(order) for order in orders]
+
+
 def fill(order: Order) -> dict[str, Any]:
     """Make an epoch and store it. Returns what it took: wall time by stage and processor time, s, peak memory of the worker
     so far, GB, and the number of tiles."""
-    with _one_at_a_time:
-        began = time.process_time()
-        use_threads(order.threads)
-        workshop = _workshop(order.folder, order.job, order.source)
-        epoch, progress = workshop.plan[order.index], Progress()
-        made = make_epoch(workshop.config, epoch, workshop.stages, progress)
-        with progress.stage("write"):
-            _store(Path(order.folder), order, workshop.prefix, epoch, made)
-        tiles = len(made.tiles)
-        del made
-        dr.flush_malloc_cache()  # carving, the peak of large walls, does without what the ray tracer took
+    began = time.process_time()
+    use_threads(order.threads)
+    workshop = _workshop(order.folder, order.job, order.source)
+    epoch, progress = workshop.plan[order.index], Progress()
+    made = make_epoch(workshop.config, epoch, workshop.stages, progress)
+    with progress.stage("write"):
+        _store(Path(order.folder), order, workshop.prefix, epoch, made)
+    tiles = len(made.tiles)
+    del made
+    dr.flush_malloc_cache()  # carving, the peak of large walls, does without what the ray tracer took
     return {
         "index": order.index,
         "tiles": tiles,

@@ -469,7 +469,7 @@ def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(made: Path
 
 
 def test_a_killed_worker_costs_nothing(made: Path, tmp_path: Path) -> None:
-    """Dask starts another one and gives it the epoch; which worker makes an epoch, and in what order, leaves no trace."""
+    """Dask starts another one and gives it the run of two epochs; which worker makes an epoch, and when, leaves no trace."""
     pytest.importorskip("distributed")
     import psutil
 
@@ -483,6 +483,26 @@ def test_a_killed_worker_costs_nothing(made: Path, tmp_path: Path) -> None:
     assert int(process.communicate(timeout=300)[0]) == EPOCHS
     assert process.returncode == 0
     assert digests(out) == digests(made)
+
+
+@pytest.mark.parametrize(
+    ("name", "workers"), [("small", 1), ("small", 2), ("rockfall_9", 2), ("rockfall_9", 16), ("rockfall_9", 256)]
+)
+def test_epochs_that_share_a_stage_go_to_one_worker(name: str, workers: int) -> None:
+    """Every epoch once; no run has two stages; whole stages where they are short; enough runs for all workers."""
+    from pipeline.dataset.cluster import runs
+    from pipeline.dataset.worker import Order
+
+    plan = planned_epochs(load_dataset_config(bundled_config("datasets", name)))
+    found = runs([Order("folder", "job", "source", epoch.index, epoch.stage) for epoch in plan], workers)
+    assert [order.index for run in found for order in run] == list(range(len(plan)))
+    assert all(len({order.stage for order in run}) == 1 for run in found)
+    assert max(len(run) for run in found) <= 8
+    stages = len({epoch.stage for epoch in plan})
+    if name == "small":
+        assert len(found) == stages
+    else:
+        assert len(found) >= max(2 * workers - stages, stages)
 
 
 def test_a_scheduler_of_the_users(made: Path, tmp_path: Path) -> None:
