@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.parser import at_least, one_of
+from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "measure the noise of real epochs and fit the simulation's noise to it"
 EXAMPLE = """  scarpsim calibrate my_measurement --out calibration
@@ -31,16 +32,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
     parser.add_argument("--no-greedy", action="store_true", help="leave out the thesis's search, which is run for comparison")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.bundled import bundled_config
     from pipeline.cli.simulate import new_folder
     from pipeline.config import load_config
     from pipeline.noise.calibrate import calibrate
     from pipeline.noise.inputs import config_of, sensor_of
-    from pipeline.noise.write import write
+    from pipeline.noise.write import RECORD_FILE, write
     from pipeline.progress import shown_progress
     from pipeline.report.calibration import summary
 
@@ -50,5 +51,4 @@ def run(arguments: argparse.Namespace) -> int:
     with shown_progress(quiet=arguments.quiet) as progress:
         result = calibrate(config, sensor, arguments.measured, progress, with_greedy=not arguments.no_greedy)
         report = write(arguments.out or new_folder(Path("runs"), "calibrate"), config, result, arguments.measured)
-    print(f"{summary(result)}\nreport: {report}")
-    return 0
+    return Answer(f"{summary(result)}\nreport: {report}", recorded(report, RECORD_FILE))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.parser import at_least, one_of
+from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "compare sensors on one wall and the same blocks: noise, level of detection, smallest block, completeness"
 EXAMPLE = """  scarpsim compare my_site.yaml
@@ -46,16 +47,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="override a key of every config, as a.b=c",
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
     from pipeline.formats.atomic import empty_folder
     from pipeline.noise.comparison import compare_sensors
     from pipeline.noise.contestants import contestants
     from pipeline.progress import shown_progress
-    from pipeline.report.comparison import summary, write_comparison
+    from pipeline.report.comparison import COMPARISON_FILE, summary, write_comparison
 
     sensors = contestants(arguments.configs, arguments.overrides, arguments.seed)
     out = empty_folder(arguments.out or new_folder(Path("runs"), "compare"))
@@ -63,5 +64,4 @@ def run(arguments: argparse.Namespace) -> int:
     with shown_progress(quiet=arguments.quiet) as progress:
         comparison = compare_sensors(sensors, arguments.measured, arguments.epochs, sizes, progress)
     report = write_comparison(out, comparison)
-    print(f"{summary(comparison)}\nreport: {report}")
-    return 0
+    return Answer(f"{summary(comparison)}\nreport: {report}", recorded(report, COMPARISON_FILE))

@@ -5,9 +5,14 @@ from __future__ import annotations
 import argparse
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from pipeline.cli.parser import at_least
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options, at_least
 from scene.errors import InputError
+
+if TYPE_CHECKING:
+    from pipeline.dataset.run import DatasetSummary
 
 SUMMARY = "make a set of annotated tiles for training, or check, merge, split finished ones"
 EXAMPLE = """  scarpsim dataset configs/datasets/small.yaml --out sets/small --workers 2
@@ -31,10 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--by", default="sensor,noise,size", metavar="KEYS", help="split: one set for each combination (default: %(default)s)"
     )
     parser.add_argument("--report-only", action="store_true", help="verify: do not make damaged tiles again; exit with 1")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     if arguments.workers and arguments.scheduler:
         raise InputError("are given both", where="--workers and --scheduler", remedy="give one of them")
     action, *folders = arguments.words
@@ -49,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     return _make(arguments, Path(action))
 
 
-def _make(arguments: argparse.Namespace, path: Path) -> int:
+def _make(arguments: argparse.Namespace, path: Path) -> Answer:
     out = _out(arguments)
     from pipeline.dataset.config import load_dataset_config
     from pipeline.dataset.run import Workers, make_dataset
@@ -60,41 +65,45 @@ def _make(arguments: argparse.Namespace, path: Path) -> int:
     workers = Workers(arguments.workers or 0, arguments.scheduler or "")
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = make_dataset(config, out, workers, command=_command(arguments, path), progress=progress)
-    print(summary.summary())
-    return 0
+    return Answer(summary.summary(), lambda: _document(summary))
 
 
-def _verify(arguments: argparse.Namespace, folder: Path) -> int:
+def _verify(arguments: argparse.Namespace, folder: Path) -> Answer:
     from pipeline.dataset.run import Workers, verify_dataset
     from pipeline.progress import shown_progress
 
     workers = Workers(arguments.workers or 0, arguments.scheduler or "")
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = verify_dataset(folder, workers, repair=not arguments.report_only, progress=progress)
-    for damage in summary.damage:
-        print(f"{damage.problem}: {folder / damage.file}")
+    found = [f"{damage.problem}: {folder / damage.file}" for damage in summary.damage]
     if arguments.report_only:
-        print(f"{len(summary.damage)} files are missing or damaged" if summary.damage else "the set is whole")
-        return 1 if summary.damage else 0
-    print(f"{len(summary.damage)} files were missing or damaged, {len(summary.made)} epochs made again; the set is whole")
-    return 0
+        end = f"{len(found)} files are missing or damaged" if found else "the set is whole"
+        return Answer("\n".join([*found, end]), lambda: _document(summary), 1 if found else 0)
+    end = f"{len(found)} files were missing or damaged, {len(summary.made)} epochs made again; the set is whole"
+    return Answer("\n".join([*found, end]), lambda: _document(summary))
 
 
-def _merge(arguments: argparse.Namespace, folders: list[str]) -> int:
+def _merge(arguments: argparse.Namespace, folders: list[str]) -> Answer:
     out = _out(arguments)
     from pipeline.dataset.combine import merge_datasets
 
-    print(merge_datasets([Path(folder) for folder in folders], out).summary())
-    return 0
+    summary = merge_datasets([Path(folder) for folder in folders], out)
+    return Answer(summary.summary(), lambda: _document(summary))
 
 
-def _split(arguments: argparse.Namespace, folder: Path) -> int:
+def _split(arguments: argparse.Namespace, folder: Path) -> Answer:
     out = _out(arguments)
     from pipeline.dataset.combine import split_dataset
 
-    for summary in split_dataset(folder, out, arguments.by.split(",")):
-        print(summary.summary())
-    return 0
+    parts = list(split_dataset(folder, out, arguments.by.split(",")))
+    return Answer("\n".join(part.summary() for part in parts), lambda: {"sets": [_document(part) for part in parts]})
+
+
+def _document(summary: DatasetSummary) -> dict[str, Any]:
+    """What --json prints of a set."""
+    damage = [{"file": str(each.file), "problem": each.problem} for each in summary.damage]
+    counts = {"images": summary.images, "annotations": summary.annotations}
+    return {"folder": str(summary.folder), "epochs_made": len(summary.made), **counts, "damage": damage}
 
 
 def _one(folders: list[str], action: str) -> Path:

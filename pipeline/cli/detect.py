@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
+
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options
 
 SUMMARY = "find rockfalls in difference maps: masks, events, pictures"
 EXAMPLE = """  scarpsim detect default runs/my_run --out found
@@ -33,10 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="lowest score, may be given several times (default: 0.9 0.95 0.99)",
     )
     parser.add_argument("--no-pictures", action="store_true", help="neither overlays nor rasters of masks")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
     from pipeline.detect.run import BASELINE, CONFIDENCES, checked_confidences, detect
     from pipeline.progress import shown_progress
@@ -50,5 +54,11 @@ def run(arguments: argparse.Namespace) -> int:
     with shown_progress(quiet=arguments.quiet) as progress:
         found = detect(arguments.model, arguments.inputs, out, confidences, not arguments.no_pictures, progress)
     volume = sum(item.volume_m3 for item in found)
-    print(f"{len(found)} blocks with a score of {min(confidences):g} or more, {volume:.3g} m3\nresults: {out}")
-    return 0
+    told = f"{len(found)} blocks with a score of {min(confidences):g} or more, {volume:.3g} m3"
+    document = {
+        "folder": str(out),
+        "confidence": min(confidences),
+        "volume_m3": volume,
+        "events": [asdict(item) for item in found],
+    }
+    return Answer(f"{told}\nresults: {out}", lambda: document)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
 import os
 import platform
 import shutil
@@ -17,6 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.cli import system_libraries
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options
 from scene.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,19 +52,15 @@ class Finding:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     findings = examine()
     ready = all(finding.ok is not False for finding in findings)
-    if arguments.json:
-        print(json.dumps({"ready": ready, "findings": [asdict(finding) for finding in findings]}, indent=2))
-    else:
-        for finding in findings:
-            print(_line(finding))
-        print("\nready: `simulate` can run here" if ready else "\nnot ready: mend what is marked PROBLEM")
-    return 0 if ready else 1
+    end = "\nready: `simulate` can run here" if ready else "\nnot ready: mend what is marked PROBLEM"
+    document = {"ready": ready, "findings": [asdict(finding) for finding in findings]}
+    return Answer("\n".join([*map(_line, findings), end]), lambda: document, 0 if ready else 1)
 
 
 def examine() -> list[Finding]:

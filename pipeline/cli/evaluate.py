@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.parser import one_of
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options, one_of
 
 SUMMARY = "compare detections with the truth: precision, recall, F1, mask areas, COCO metrics"
 EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detections.json
@@ -22,14 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--iou", type=one_of("segm", "bbox"), default="segm", metavar="segm|bbox", help="overlap of masks or of boxes"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for scores.json and scores.csv (default: only print)")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.detect.score_files import as_text, assess, write
 
     assessment = assess(arguments.truth, arguments.predictions, arguments.by, arguments.iou)
-    print(as_text(assessment))
     if arguments.out:
         write(assessment, arguments.out)
-        print(f"scores: {arguments.out}")
-    return 0
+    place = f"\nscores: {arguments.out}" if arguments.out else ""
+    return Answer(as_text(assessment) + place, assessment.to_dict)

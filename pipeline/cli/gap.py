@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.parser import at_least, one_of
+from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "find where a measurement and the model disagree, name the effect, add it, show the gap shrink"
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
@@ -36,27 +37,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="with --identifiability: error of the known surface, correlated over 3 m (default: 0.001 tls, 0.005 stereo)",
     )
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
 
     out = arguments.out or new_folder(Path("runs"), "gap")
     return _identifiability(arguments, out) if arguments.identifiability else _diagnosis(arguments, out)
 
 
-def _diagnosis(arguments: argparse.Namespace, out: Path) -> int:
+def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
     from pipeline.gap.measurement import read_measurement
     from pipeline.gap.report import summary, write
     from pipeline.gap.workflow import diagnose
 
     measurement = read_measurement(arguments.measurement)
     found = diagnose(measurement, arguments.seed)
-    print(f"{summary(found)}\nreport: {write(out, found, measurement)}")
-    return 0
+    report = write(out, found, measurement)
+    return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "gap.json"))
 
 
-def _identifiability(arguments: argparse.Namespace, out: Path) -> int:
+def _identifiability(arguments: argparse.Namespace, out: Path) -> Answer:
     from pipeline.gap.identifiability import identifiability, table
     from pipeline.gap.identifiability_report import in_words, write_identifiability
     from pipeline.gap.surveys import surveys
@@ -64,5 +66,5 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> int:
     wanted = surveys(arguments.measurement, arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
-    print("\n\n".join(f"{in_words(each)}\n{table(each)}" for each in found) + f"\nreport: {report}")
-    return 0
+    told = "\n\n".join(f"{in_words(each)}\n{table(each)}" for each in found)
+    return Answer(f"{told}\nreport: {report}", recorded(report, "identifiability.json"))

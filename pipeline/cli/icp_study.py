@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.parser import at_least, one_of
+from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.errors import InputError
 
 SUMMARY = "find the settings of ICP that suit a run, against the true transform"
@@ -26,10 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of a config, as a.b=c"
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
     from pipeline.config import load_config
     from pipeline.formats.atomic import empty_folder
@@ -53,5 +54,4 @@ def run(arguments: argparse.Namespace) -> int:
         settings = {"offset_m": arguments.offset_m, "repeats": arguments.repeats}
         found = study(sensor, surfaces, config.icp or IcpConfig(), KeyedRandom(config.seed), **settings, progress=progress)
     report = write_icp_study(out, found)
-    print(f"{summary(found)}\nreport: {report}")
-    return 0
+    return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "icp_study.json"))

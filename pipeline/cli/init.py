@@ -5,31 +5,62 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options
+from scene.errors import InputError
+
 SUMMARY = "write a complete config with every key explained"
-EXAMPLE = """  scarpsim init --site glendale --out my_site.yaml
-  simulate --sensor tls --config my_site.yaml"""
+EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml
+  simulate --sensor tls --config my_site.yaml
+  scarpsim init --dataset small --out my_set.yaml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--site", metavar="NAME", help="start from a bundled site, such as glendale (default: the demo)")
+    parser.add_argument("--scanner", metavar="NAME", help="with this scanner, such as riegl_vz400i, its noise and its beam")
+    parser.add_argument("--dataset", metavar="NAME", help="the config of a data set instead, such as small")
     parser.add_argument("--out", type=Path, default=Path("scarpsim.yaml"), metavar="FILE", help="default: %(default)s")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
+    out = arguments.out
+    if arguments.dataset and (arguments.site or arguments.scanner):
+        raise InputError("stands beside --site or --scanner", where="--dataset", remedy="a data set's walls name their sites")
+    kind = "dataset" if arguments.dataset else "simulation"
+    text = _dataset(arguments.dataset) if arguments.dataset else _simulation(arguments.site, arguments.scanner)
+    from pipeline.formats.atomic import write_text
+    from pipeline.schema import schema_line, schema_name, schema_text
+
+    schema = out.parent / schema_name(kind)
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.write(schema_line(kind) + text)
+    except FileExistsError:
+        raise InputError("exists already", where=str(out), remedy="choose another name with --out") from None
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError("there is no such folder", where=str(out.parent), remedy="make it first") from None
+    write_text(schema, schema_text(kind))
+    command = f"scarpsim dataset {out} --out my_set" if arguments.dataset else f"simulate --sensor tls --config {out}"
+    told = f"wrote {out} and, for editors, {schema}; run it with: {command}"
+    return Answer(told, lambda: {"file": str(out), "schema": str(schema), "command": command})
+
+
+def _simulation(site: str | None, scanner: str | None) -> str:
     from pipeline.bundled import bundled_config
     from pipeline.commented import commented_yaml
     from pipeline.config import SimulationConfig
     from scene.config import load_yaml, parse
-    from scene.errors import InputError
 
-    source = bundled_config("sites", arguments.site) if arguments.site else bundled_config("", "demo")
-    text = commented_yaml(parse(SimulationConfig, load_yaml(source) or {}, str(source)))
-    try:
-        with arguments.out.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise InputError("exists already", where=str(arguments.out), remedy="choose another name with --out") from None
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError("there is no such folder", where=str(arguments.out.parent), remedy="make it first") from None
-    print(f"wrote {arguments.out}; run it with: simulate --sensor tls --config {arguments.out}")
-    return 0
+    source = bundled_config("sites", site) if site else bundled_config("", "demo")
+    values = load_yaml(source) or {}
+    if scanner:
+        models = [model for model in values.get("sensor", []) if model.get("sensor") != "tls"]
+        values |= {"scanner": scanner, "sensor": models}
+    return commented_yaml(parse(SimulationConfig, values, str(source)))
+
+
+def _dataset(name: str) -> str:
+    from pipeline.bundled import bundled_config
+
+    return bundled_config("datasets", name).read_text(encoding="utf-8")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
-from pipeline.cli.parser import at_least, one_of
+from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "map what a planned set-up promises: precision, spacing, blind spots, smallest block"
 EXAMPLE = """  scarpsim inspect my_site.yaml
@@ -23,21 +23,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
     from pipeline.config import load_config
-    from pipeline.planning.inspect import inspect, write_plans
+    from pipeline.planning.inspect import PLAN_FILE, inspect, write_plans
     from pipeline.report.plan import summary
 
     config = load_config(arguments.config, arguments.overrides, arguments.sensor, arguments.seed)
     sensors = [arguments.sensor] if arguments.sensor else config.sensor_names()
     plans = inspect(config, sensors)
     report = write_plans(arguments.out or new_folder(Path("runs"), "inspect"), config, plans)
-    if arguments.json:
-        print(json.dumps({"report": str(report), "plans": [plan.to_dict() for plan in plans]}, indent=2))
-    else:
-        print("\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]))
-    return 0
+    return Answer("\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]), recorded(report, PLAN_FILE))

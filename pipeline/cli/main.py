@@ -11,11 +11,27 @@ import os
 import sys
 import tempfile
 import traceback
+from contextlib import nullcontext, redirect_stdout
 from importlib import metadata
 from typing import Protocol
 
-from pipeline.cli import calibrate, compare, dataset, detect, doctor, evaluate, gap, icp_study, init, inspect, train
+from pipeline.cli import (
+    calibrate,
+    compare,
+    completion,
+    dataset,
+    detect,
+    doctor,
+    evaluate,
+    gap,
+    icp_study,
+    init,
+    inspect,
+    schema,
+    train,
+)
 from pipeline.cli import simulate as simulate_command
+from pipeline.cli.answer import Answer, as_json
 from pipeline.cli.parser import Parser
 from scene.errors import InputError, nearest
 
@@ -37,8 +53,8 @@ class Command(Protocol):
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
 
-    def run(self, arguments: argparse.Namespace) -> int:
-        """Carry the command out; returns the exit code. It may set `arguments.kept`, what an interrupt leaves usable."""
+    def run(self, arguments: argparse.Namespace) -> Answer:
+        """Carry the command out. It may set `arguments.kept`, what an interrupt leaves usable."""
         ...
 
 
@@ -54,6 +70,8 @@ COMMANDS: dict[str, Command] = {
     "detect": detect,
     "evaluate": evaluate,
     "init": init,
+    "schema": schema,
+    "completion": completion,
     "doctor": doctor,
 }
 
@@ -91,35 +109,57 @@ commands:
 `scarpsim COMMAND --help` explains one.
 
 example:
-{simulate_command.EXAMPLE}"""
+{simulate_command.EXAMPLE}
+
+exit status: 0 done; 2 the input or the config is wrong (one message says what, where, what is allowed, how to mend it);
+1 anything else, also `doctor` and `dataset verify --report-only` that found something; 130 interrupted"""
+
+
+def command_parser(prog: str, command: Command) -> Parser:
+    """The parser of one command, as its help shows it."""
+    parser = Parser(prog, command.SUMMARY, command.EXAMPLE)
+    command.add_arguments(parser)
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
+    return parser
 
 
 def _carry_out(prog: str, command: Command, words: list[str]) -> int:
-    """Run one command; the only place where errors become exit codes."""
+    """Run one command and print its answer; with --json one document on stdout, of an error too, and all else on stderr."""
     arguments = argparse.Namespace(debug="--debug" in words, kept="")
+    as_document = "--json" in words
     try:
-        parser = Parser(prog, command.SUMMARY, command.EXAMPLE)
-        command.add_arguments(parser)
-        parser.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
+        parser = command_parser(prog, command)
         arguments = parser.parse(words)
-        return command.run(arguments)
+        as_document = getattr(arguments, "json", False)
+        with redirect_stdout(sys.stderr) if as_document else nullcontext():
+            answer = command.run(arguments)
+            text = as_json(answer.document()) if as_document else answer.text
+        print(text)
+        return answer.code
     except SystemExit as stop:  # argparse, after --help
         return int(stop.code or DONE)
-    except InputError as error:
-        return _complain(str(error), WRONG_INPUT)
-    except KeyboardInterrupt:
-        kept = getattr(arguments, "kept", "")
-        return _complain(f"interrupted; {kept}" if kept else "interrupted", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output went away, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except ImportError as error:
-        return _complain(f"a library does not load ({error}); `scarpsim doctor` says what is missing", FAILED)
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno in _BAD_PLACES:
-            reason = f"{error.filename or 'output'}: {error.strerror}; {_BAD_PLACES[error.errno]}"
-            return _complain(reason, WRONG_INPUT)
-        return _unexpected(error, show=arguments.debug)
+    except (Exception, KeyboardInterrupt) as error:
+        message, code = _explained(error, arguments)
+        if as_document:
+            print(as_json({"error": message, "exit_status": code}))
+        return _complain(message, code)
+
+
+def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str, int]:
+    """The message and the exit code of an error; the only place where errors become exit codes."""
+    if isinstance(error, InputError):
+        return str(error), WRONG_INPUT
+    if isinstance(error, KeyboardInterrupt):
+        kept = getattr(arguments, "kept", "")
+        return f"interrupted; {kept}" if kept else "interrupted", INTERRUPTED
+    if isinstance(error, ImportError):
+        return f"a library does not load ({error}); `scarpsim doctor` says what is missing", FAILED
+    if isinstance(error, OSError) and error.errno in _BAD_PLACES:
+        return f"{error.filename or 'output'}: {error.strerror}; {_BAD_PLACES[error.errno]}", WRONG_INPUT
+    return _unexpected(error, show=arguments.debug), FAILED
 
 
 def _complain(message: str, code: int) -> int:
@@ -127,17 +167,17 @@ def _complain(message: str, code: int) -> int:
     return code
 
 
-def _unexpected(error: Exception, *, show: bool) -> int:
-    """Report a fault of the program's own: one line, and the traceback where --debug asks for it or else in a file."""
+def _unexpected(error: BaseException, *, show: bool) -> str:
+    """A fault of the program's own in one line; its traceback on stderr where --debug asks for it, or else in a file."""
     text = "".join(traceback.format_exception(error))
     summary = " ".join(f"{type(error).__name__}: {error}".split())
     if show:
         print(text, file=sys.stderr, end="")
-        return _complain(summary, FAILED)
+        return summary
     try:
         with tempfile.NamedTemporaryFile("w", prefix="scarpsim_error_", suffix=".txt", delete=False) as file:
             file.write(text)
         where = f"the traceback is in {file.name}"
     except OSError:
         where = "run it again with --debug to see the traceback"
-    return _complain(f"unexpected fault of the program, {summary}; {where}", FAILED)
+    return f"unexpected fault of the program, {summary}; {where}"

@@ -41,6 +41,12 @@ class Parser(argparse.ArgumentParser):
         raise InputError(message, where=self.prog, remedy=self._see_help)
 
 
+def add_output_options(parser: argparse.ArgumentParser) -> None:
+    """--quiet and --json, the same for every command that computes something."""
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+    parser.add_argument("--json", action="store_true", help="print one JSON document instead of text; words go to stderr")
+
+
 def one_of(*allowed: str) -> Callable[[str], str]:
     """An argument's type: one of the words `allowed`."""
 
@@ -50,6 +56,7 @@ def one_of(*allowed: str) -> Callable[[str], str]:
         hint = nearest(text.lower(), allowed) or f"allowed: {', '.join(allowed)}"
         raise argparse.ArgumentTypeError(f"got '{text}'; {hint}")
 
+    check.allowed = allowed  # type: ignore[attr-defined]  # for the shells' completion
     return check
 
 

@@ -7,7 +7,8 @@ import os
 from datetime import datetime
 from pathlib import Path
 
-from pipeline.cli.parser import at_least, one_of
+from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.errors import InputError
 
 SUMMARY = "observe a rock wall before and after rocks fall, and map the differences"
@@ -31,10 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threads", type=at_least(1), metavar="N", help="threads to use (default: all; the results are the same)"
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     if arguments.resume and not arguments.out:
         raise InputError("needs the folder to go on with", where="--resume", remedy="add --out DIR")
     out = arguments.out or new_folder(Path("runs"), arguments.sensor)
@@ -49,8 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.kept = f"what was finished is in {out} and usable; go on with --resume --out {out}"
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = pipeline_run.simulate(config, arguments.sensor, out, resume=arguments.resume, progress=progress)
-    print(f"report: {summary.report}")
-    return 0
+    return Answer(f"report: {summary.report}", recorded(summary.report, "run.json"))
 
 
 def new_folder(parent: Path, name: str) -> Path:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.parser import at_least
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options, at_least
 
 SUMMARY = "train a rockfall detector on a data set"
 EXAMPLE = """  scarpsim train my_dataset --out my_detector
@@ -27,10 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of weights, order and flips (default: the config's)")
     parser.add_argument("--resume", action="store_true", help="go on with the interrupted training in the folder --out")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.bundled import bundled_config
     from pipeline.detect.config import load_train_config
     from pipeline.detect.keras_backend import keras_ready
@@ -44,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.kept = f"what was learned is in {arguments.out}; go on with --resume"
     with shown_progress(quiet=arguments.quiet) as progress:
         history = train(arguments.data_set, config, arguments.out, resume=arguments.resume, progress=progress)
-    best = min(history.total)
-    print(f"{len(history.total)} epochs, validation loss {history.total[-1]:.4f}, best {best:.4f}: {arguments.out / 'best'}")
-    return 0
+    best, model = min(history.total), arguments.out / "best"
+    told = f"{len(history.total)} epochs, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
+    document = {"folder": str(arguments.out), "model": str(model), "epochs": len(history.total)}
+    return Answer(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import jsonschema
+import numpy as np
 import pytest
 
 from pipeline.cli import main as cli
+from pipeline.cli.answer import as_json
 from pipeline.cli.simulate import new_folder
-from scene.config import Config
+from pipeline.config import load_config
+from pipeline.dataset.config import load_dataset_config
+from pipeline.presets import read_preset
+from pipeline.schema import json_schema
+from scene.config import load_yaml
 from scene.errors import InputError
 
 
@@ -24,6 +34,7 @@ class Pipeline:
         self.loaded: tuple[Any, ...] = ()
         self.ran: tuple[Any, ...] = ()
         self.error: BaseException | None = None
+        self.words = ""
 
     def load_config(self, *arguments: Any) -> str:
         self.loaded = arguments
@@ -31,6 +42,8 @@ class Pipeline:
 
     def simulate(self, *arguments: Any, resume: bool, progress: Any) -> SimpleNamespace:
         self.ran = (*arguments, resume)
+        if self.words:
+            sys.stdout.write(self.words)
         with progress.stage("wall"):
             if self.error:
                 raise self.error
@@ -79,7 +92,8 @@ MISTAKES = [
     (["simulat"], "did you mean 'simulate'?"),
     (
         ["frobnicate"],
-        "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, gap, train, detect, evaluate, init, doctor",
+        "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, gap, train, detect, evaluate, "
+        "init, schema, completion, doctor",
     ),
     (["--versio"], "did you mean '--version'?"),
     (["simulate"], "required: --sensor"),
@@ -91,6 +105,8 @@ MISTAKES = [
     ([*SIMULATE, "--seed", "three"], "allowed: a whole number from 0"),
     ([*SIMULATE, "--seed", "-1"], "allowed: a whole number from 0"),
     ([*SIMULATE, "--threads", "0"], "allowed: a whole number from 1"),
+    (["completion", "powershell"], "allowed: bash, zsh, fish"),
+    (["schema", "simulatoin"], "did you mean 'simulation'?"),
     ([*SIMULATE, "more.yaml"], "unexpected argument 'more.yaml'"),
     (["simulate", "--sensor", "tls", "--resume"], "add --out DIR"),
     (["doctor", "--jsno"], "did you mean '--json'?"),
@@ -153,29 +169,130 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
         assert "example:\n  " in capsys.readouterr().out
 
 
-class Toy(Config):
-    """A toy."""
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        (["--site", "glendale", "--scanner", "riegl_vz400i"], "simulation"),
+        (["--scanner", "leica_p50"], "simulation"),
+        (["--dataset", "small"], "dataset"),
+    ],
+)
+def test_init_writes_a_config_that_loads_and_its_schema(words: list[str], kind: str, tmp_path: Path) -> None:
+    out = tmp_path / "mine.yaml"
+    assert cli.main(["init", *words, "--out", str(out)]) == 0
+    assert out.read_text().startswith(f"# yaml-language-server: $schema=scarpsim.{kind}.schema.json\n")
+    schema = json.loads((tmp_path / f"scarpsim.{kind}.schema.json").read_text())
+    jsonschema.validate(load_yaml(out), schema)
+    if kind == "simulation":
+        config = load_config(out, [], "tls", None)
+        preset = read_preset(words[-1])
+        assert config.tls_model() == preset.model()
+        assert config.scanner.name == preset.name
+    else:
+        assert load_dataset_config(out).walls
 
-    seed: int = 3
 
-
-def test_init_writes_once(
-    pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    for kind, name in (("", "demo"), ("sites", "glendale")):
-        (tmp_path / "configs" / kind).mkdir(parents=True, exist_ok=True)
-        (tmp_path / "configs" / kind / f"{name}.yaml").touch()
-    monkeypatch.setattr("pipeline.bundled._PLACES", (tmp_path / "configs",))
-    monkeypatch.setattr(sys.modules["pipeline.config"], "SimulationConfig", Toy, raising=False)
-    assert cli.main(["init", "--site", "glendale", "--out", "site.yaml"]) == 0
-    assert Path("site.yaml").read_text() == "# A toy.\n\nseed: 3\n"
+def test_init_writes_once(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["init", "--out", "site.yaml"]) == 0
+    before = Path("site.yaml").read_text()
     capsys.readouterr()
     for words, expected in (
         (["--out", "site.yaml"], "site.yaml: exists already; choose another name"),
         (["--out", "none/site.yaml"], "none: there is no such folder"),
-        (["--site", "glendal"], "configs/sites: there is no 'glendal'; allowed: glendale; did you mean 'glendale'?"),
+        (["--site", "glendal"], "configs/sites: there is no 'glendal'; allowed: bismantova,"),
         (["--site", "../demo"], "there is no '../demo'"),
+        (["--scanner", "riegl_vz400"], "exists already"),
+        (["--scanner", "riegl"], "configs/scanners: there is no 'riegl'"),
+        (["--dataset", "small", "--site", "glendale"], "--dataset: stands beside --site"),
     ):
-        assert cli.main(["init", *words]) == 2
+        assert cli.main(["init", "--out", "site.yaml", *words]) == 2
         assert expected in capsys.readouterr().err
-    assert "seed: 3" in Path("site.yaml").read_text()
+    assert Path("site.yaml").read_text() == before
+
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+KINDS = {"sites": "simulation", "datasets": "dataset", "detectors": "detector", "scanners": "scanner", "noise": "model"}
+
+
+@pytest.mark.parametrize("folder", KINDS)
+def test_the_schemas_accept_what_comes_with_the_program(folder: str) -> None:
+    check = jsonschema.Draft202012Validator(json_schema(KINDS[folder]))
+    check.check_schema(check.schema)
+    files = sorted((CONFIGS / folder).glob("*.yaml"))
+    assert files
+    assert {file.name: [error.message for error in check.iter_errors(load_yaml(file))] for file in files} == {
+        file.name: [] for file in files
+    }
+
+
+def test_the_schema_marks_mistakes() -> None:
+    check = jsonschema.Draft202012Validator(json_schema("simulation"))
+    for wrong in (
+        {"seeed": 1},
+        {"epochs": 0},
+        {"depth_map": "best"},
+        {"scanner": {"azimuth_step": 1}},
+        {"wall": {"style": "alps"}},
+    ):
+        assert not check.is_valid(wrong), wrong
+    for right in ({}, {"scanner": "riegl_vz400i"}, {"scanner": {"preset": "riegl_vz400i", "faces": 2}}, {"sensor": "sgbm"}):
+        assert check.is_valid(right), right
+
+
+def test_scripts_get_one_document(pipeline: Pipeline, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Also where a library prints, and of an error."""
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here/run.json").write_text('{"schema": 1, "config": {"long": 1}, "epochs": [{"points": 5}]}')
+    pipeline.words = "from a library"
+    assert cli.main([*SIMULATE, "--json"]) == 0
+    output = capsys.readouterr()
+    assert json.loads(output.out) == {
+        "folder": "here",
+        "report": "here/report.html",
+        "schema": 1,
+        "epochs": [{"points": 5}],
+    }
+    assert "from a library" in output.err
+    pipeline.error = InputError("negative", where="step_rad", remedy="use a positive one")
+    assert cli.main([*SIMULATE, "--json"]) == 2
+    assert json.loads(capsys.readouterr().out) == {"error": "step_rad: negative; use a positive one", "exit_status": 2}
+    assert cli.main(["simulate", "--json", "--sens", "tls"]) == 2
+    assert json.loads(capsys.readouterr().out)["exit_status"] == 2
+
+
+def test_documents_hold_no_nan() -> None:
+    assert json.loads(as_json({"a": float("nan"), "b": [np.float32(2.0), np.array([1.0, np.inf])], "c": Path("x")})) == {
+        "a": None,
+        "b": [2.0, [1.0, None]],
+        "c": "x",
+    }
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_knows_commands_options_and_words(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(word in script for word in (*cli.COMMANDS, "icp-study", "no-greedy", "stereo", "resume"))
+    if shutil.which(shell):  # the shells' own check of the grammar
+        subprocess.run([shell, "-n"], input=script, text=True, check=True)
+
+
+def test_bash_completes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["completion", "bash"]) == 0
+    script = tmp_path / "completion.bash"
+    script.write_text(capsys.readouterr().out)
+    ask = 'COMP_WORDS=(scarpsim simulate --sensor ""); COMP_CWORD=3; _shtab_scarpsim; echo "${COMPREPLY[@]}"'
+    shown = subprocess.run(["bash", "-c", f"source {script}; {ask}"], capture_output=True, text=True, check=True)
+    assert shown.stdout.split() == ["stereo", "tls"]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """The start-up of --help: only the standard library and ours (`benchmarks/startup.py` times it)."""
+    program = (
+        "import sys; from pipeline.cli.main import main; main(['--help']); main(['simulate', '--help']); print(*sys.modules)"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = {name.partition(".")[0] for name in shown.stdout.splitlines()[-1].split()}
+    assert {"pipeline", "scene"} <= loaded
+    assert loaded & {"numpy", "pydantic", "yaml", "scipy", "matplotlib", "mitsuba", "shtab", "dash", "plotly", "rich"} == set()

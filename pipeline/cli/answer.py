@@ -1,0 +1,48 @@
+"""What a command tells at its end: text for people, or with --json one document for scripts."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+_BULKY = ("config", "versions")
+"""What the records in result folders hold to make them again; too long for a script's standard input."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The end of a command. text: for people, on stdout; document: gives what --json prints instead; code: exit status."""
+
+    text: str
+    document: Callable[[], dict[str, Any]] = field(default=dict)
+    code: int = 0
+
+
+def as_json(document: dict[str, Any]) -> str:
+    """The document as JSON; NaN and infinity, which JSON does not know, become null, paths text."""
+    return json.dumps(_without_nan(document), indent=2, allow_nan=False, default=str)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    if hasattr(value, "tolist"):  # NumPy's
+        return _without_nan(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def recorded(report: Path, record: str) -> Callable[[], dict[str, Any]]:
+    """A document made of the JSON file `record` beside a report, without what is only there to make the results again."""
+
+    def document() -> dict[str, Any]:
+        values = json.loads((report.parent / record).read_text(encoding="utf-8"))
+        kept = {key: value for key, value in values.items() if key not in _BULKY}
+        return {"folder": str(report.parent), "report": str(report), **kept}
+
+    return document

@@ -1,0 +1,55 @@
+"""`scarpsim completion`: what makes a shell complete commands, options and words."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import one_of
+
+SUMMARY = "print the completion script of a shell"
+EXAMPLE = """  scarpsim completion bash > ~/.local/share/bash-completion/completions/scarpsim
+  scarpsim completion zsh > ~/.zfunc/_scarpsim        # with fpath+=~/.zfunc before compinit in ~/.zshrc
+  scarpsim completion fish > ~/.config/fish/completions/scarpsim.fish
+  scarpsim completion bash --script simulate > ~/.local/share/bash-completion/completions/simulate"""
+_SHELLS, _SCRIPTS = ("bash", "zsh", "fish"), ("scarpsim", "simulate")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shell", type=one_of(*_SHELLS), metavar="|".join(_SHELLS), help="the shell that completes")
+    parser.add_argument(
+        "--script", type=one_of(*_SCRIPTS), default=_SCRIPTS[0], metavar="|".join(_SCRIPTS), help="the command to complete"
+    )
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    import shtab
+
+    from pipeline.cli.main import COMMANDS, command_parser
+
+    if arguments.script == "simulate":
+        whole: argparse.ArgumentParser = command_parser("simulate", COMMANDS["simulate"])
+        _describe(whole)
+    else:
+        whole = argparse.ArgumentParser("scarpsim", description="rock walls as sensors see them")
+        whole.add_argument("--version", action="store_true", help="print the version")
+        below = whole.add_subparsers(dest="command")
+        for name, command in COMMANDS.items():
+            one = below.add_parser(name, help=command.SUMMARY)
+            command.add_arguments(one)
+            one.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
+            _describe(one)
+    return Answer(shtab.complete(whole, arguments.shell).rstrip("\n"))
+
+
+def _describe(parser: argparse.ArgumentParser) -> None:
+    """Tell shtab what the types of arguments tell argparse: the words that are allowed, and where a path is wanted."""
+    import shtab
+
+    for action in parser._actions:
+        words = getattr(action.type, "allowed", None)
+        if words:
+            action.choices = words
+        elif action.type is Path:
+            action.complete = shtab.FILE  # type: ignore[attr-defined]

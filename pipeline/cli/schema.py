@@ -1,0 +1,30 @@
+"""`scarpsim schema`: the JSON schema of a config file, for editors."""
+
+from __future__ import annotations
+
+import argparse
+
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import one_of
+
+SUMMARY = "print the JSON schema of a config file, for editors"
+EXAMPLE = """  scarpsim schema simulation > scarpsim.schema.json
+  scarpsim schema dataset"""
+_KINDS = ("simulation", "dataset", "detector", "scanner", "model", "measurement")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "kind",
+        type=one_of(*_KINDS),
+        nargs="?",
+        default="simulation",
+        metavar="KIND",
+        help=f"{', '.join(_KINDS)} (default: first)",
+    )
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.schema import schema_text
+
+    return Answer(schema_text(arguments.kind).rstrip("\n"))
