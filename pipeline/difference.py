@@ -10,6 +10,7 @@ import psutil
 from numpy.typing import NDArray
 from pydantic import Field
 
+from pipeline.robust import nmad
 from scene.backend import dr, mi
 from scene.config import Config
 from scene.errors import InputError
@@ -22,8 +23,6 @@ _BYTES_PER_PIXEL = 64
 """What reference, epoch, difference, labels and the copies of statistics and pictures take at their peak."""
 _MOST_PIXELS = 2**32 - 1
 """Dr.Jit numbers the elements of an array with 32 bits."""
-_NMAD_FACTOR = 1.4826
-"""Median absolute deviation to standard deviation, for normal errors."""
 
 
 class DifferenceConfig(Config):
@@ -128,7 +127,7 @@ def statistics(values: NDArray[np.floating]) -> DifferenceStatistics:
         mean=float(mean),
         standard_deviation=float(np.sqrt(variance)),
         rmse=float(np.sqrt(variance + mean**2)),
-        nmad=float(_NMAD_FACTOR * np.median(np.abs(values - median))),
+        nmad=nmad(values, median),
     )
 
 

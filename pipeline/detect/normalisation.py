@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import robust
 from pipeline.detect.config import NormalisationConfig
 
 Image = NDArray[np.float32]
 LEVEL_OF_DETECTION = 1.96
 """Of normal errors, 95 % lie within this many standard deviations."""
-_NMAD_FACTOR = 1.4826
 
 
 def nmad(difference: Image) -> float:
     """Robust standard deviation of the pixels with data, m; 0 where there are none."""
     values = difference[np.isfinite(difference)]
-    return float(_NMAD_FACTOR * np.median(np.abs(values - np.median(values)))) if values.size else 0.0
+    return robust.nmad(values) if values.size else 0.0
 
 
 def normalised(difference: Image, config: NormalisationConfig, noise_m: float | None = None) -> Image:

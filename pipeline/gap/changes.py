@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.gap.residuals import Residuals
+from pipeline.robust import nmad
 from scene.frame import WallFrame
 from scene.mesh import FloatArray
 
@@ -64,7 +65,7 @@ def find_changes(
     raster = _rastered(residuals, metres, eligible)
     around = _around(raster.median)
     contrast = raster.median - around
-    scatter = max(1.4826 * float(np.nanmedian(np.abs(contrast / raster.error))), 1.0)
+    scatter = max(nmad(contrast / raster.error, 0.0), 1.0)
     score = np.nan_to_num(contrast / (raster.error * scatter))
     found, marked = [], np.zeros(raster.shape, dtype=bool)
     for sign in (1, -1):

@@ -12,6 +12,7 @@ from pipeline.gap.residuals import Residuals
 from pipeline.gap.stereo_residuals import stereo_residuals
 from pipeline.gap.tls_residuals import tls_residuals
 from pipeline.rigid import rotation_matrix
+from pipeline.robust import nmad
 from scene.mesh import FloatArray
 from sensors.camera import Camera, CameraPair
 
@@ -29,7 +30,7 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
         pose = pose_of(residuals.part(kept))
         value = residuals.value - residuals.pose @ pose
         z = np.abs(value / residuals.sigma)
-        scale = max(1.0, 1.4826 * float(np.median(z[residuals.smooth])))
+        scale = max(1.0, nmad(z[residuals.smooth], 0.0))
         kept = residuals.smooth & (z < _OUTLIER * scale)
         if kept.sum() < _FEWEST:
             kept = residuals.smooth

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.gap.cells import Cells, block_numbers
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.tls_spread import slant
+from pipeline.robust import nmad
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
@@ -130,7 +131,7 @@ def stereo_candidates(residuals: Residuals) -> list[SpreadCandidate]:
 def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> list[SpreadFound]:
     """The effects that the spread asks for, at most two. value: (n,) residuals without the mean effects found."""
     z = standardised(residuals, cells, value)
-    kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, 1.4826 * float(np.nanmedian(np.abs(z)))))
+    kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, nmad(z, 0.0)))
     squared = z[kept] ** 2
     candidates = tls_candidates(residuals) if residuals.sensor == "tls" else stereo_candidates(residuals)
     forms = [candidate.variance[kept] / residuals.sigma[kept, None] ** 2 for candidate in candidates]

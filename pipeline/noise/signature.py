@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.noise.windows import Windows
+from pipeline.robust import nmad
 from scene.mesh import FloatArray
 
 _LAGS_PX = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 _STEEP = 0.9
 _FLOOR_M = 1e-6
 """Added to every length, so that a silent model has a logarithm."""
-_NMAD = 1.4826
 _LEAST_IN_CLASS = 10
 
 
@@ -136,10 +136,8 @@ class Signature:
 
 
 def _spread(values: FloatArray) -> float:
-    """NMAD; the values have a median near 0 or not."""
-    if values.size < _LEAST_IN_CLASS:
-        return 0.0
-    return float(_NMAD * np.median(np.abs(values - np.median(values))))
+    """NMAD; 0 for too few values."""
+    return nmad(values) if values.size >= _LEAST_IN_CLASS else 0.0
 
 
 def _root_semivariance(rest: FloatArray, lag: int) -> float:

@@ -16,6 +16,7 @@ from pipeline.difference import (
     surface_raster,
 )
 from pipeline.mesh import SurfaceConfig, mesh_observation
+from pipeline.robust import nmad
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import TriangleMesh
@@ -136,6 +137,11 @@ def test_statistics_of_known_values():
     assert found.rmse == pytest.approx(np.sqrt(51))
     assert found.nmad == pytest.approx(1.4826)
     assert found.summary() == "median 3000.0 mm, StD 5099.0 mm, RMSE 7141.4 mm, NMAD 1482.6 mm (5 pixels)"
+
+
+def test_nmad_about_a_centre_of_nothing():
+    assert nmad(np.array([-1.0, 2.0, 4.0, np.nan]), 0.0) == pytest.approx(2 * 1.4826)
+    assert np.isnan(nmad(np.array([np.nan])))
 
 
 def test_nmad_is_the_deviation_of_normal_errors():
