@@ -5,8 +5,8 @@
     python benchmarks/dataset.py memory [--epochs 100] [--sensor tls] [--small]    peak memory of one worker over many epochs
 
 Rates are of wall time and of processor time; on a machine that others use too only the latter tells of the program.
-The projection plays the plan through: a free worker takes the next epoch and pays for a stage (wall, frame, scene, reference)
-where it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two workers.
+The projection plays the plan through: a free worker takes the next run of epochs and pays for a stage (wall, frame, scene,
+reference) where it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two workers.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.bundled import bundled_config
+from pipeline.dataset.cluster import runs
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs
 from pipeline.dataset.run import DatasetSummary, Workers, make_dataset
+from pipeline.dataset.worker import Order
 
 WORKERS = (2, 16, 256)
 SIZES = ("small", "medium", "large")
@@ -81,10 +83,12 @@ def makespan(plan: Sequence[PlannedEpoch], workers: int, set_up: dict[str, float
     """Time until the last epoch of the plan is done, s, by the rule above; costs by sensor, and by sensor and size."""
     free: list[tuple[float, int]] = [(0.0, number) for number in range(workers)]
     has: dict[int, object] = {}
-    for planned in plan:
+    for run in runs([Order("", "", "", planned.index, planned.stage) for planned in plan], workers):
         now, worker = heapq.heappop(free)
-        now += epoch[planned.sensor, planned.size] + (0.0 if has.get(worker) == planned.stage else set_up[planned.sensor])
-        has[worker] = planned.stage
+        first = plan[run[0].index]
+        now += 0.0 if has.get(worker) == first.stage else set_up[first.sensor]
+        now += sum(epoch[plan[order.index].sensor, plan[order.index].size] for order in run)
+        has[worker] = first.stage
         heapq.heappush(free, (now, worker))
     return max(now for now, _ in free)
 
