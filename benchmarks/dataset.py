@@ -6,7 +6,8 @@
 
 Rates are of wall time and of processor time; on a machine that others use too only the latter tells of the program.
 The projection plays the plan through: a free worker takes the next run of epochs and pays for a stage (wall, frame, scene,
-reference) where it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two workers.
+reference) where it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two
+workers.
 """
 
 from __future__ import annotations
