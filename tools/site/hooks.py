@@ -1,0 +1,45 @@
+"""What MkDocs calls while it builds the site: pages that are made from the program, and folders in the navigation."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+import api  # noqa: E402
+import commands  # noqa: E402
+import configuration  # noqa: E402
+import licences  # noqa: E402
+import notebooks  # noqa: E402
+import scanners  # noqa: E402
+
+_MAKERS = (api, commands, configuration, licences, notebooks, scanners)
+"""Modules with `pages()`: the path in the site and the content of each page or picture that they make."""
+_FIRST = ("index.md", "README.md")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the made pages and write the navigation's folders out."""
+    for maker in _MAKERS:
+        for path, content in maker.pages().items():
+            files.append(File.generated(config, path, content=content))
+    config.nav = _written_out(config.nav, sorted(file.src_uri for file in files.documentation_pages()))
+    return files
+
+
+def _written_out(entry: Any, pages: list[str]) -> Any:
+    """The navigation with each entry that ends in / replaced by the pages of that folder, its index first."""
+    if isinstance(entry, list):
+        return [_written_out(part, pages) for part in entry]
+    if isinstance(entry, dict):
+        return {title: _written_out(part, pages) for title, part in entry.items()}
+    if not entry.endswith("/"):
+        return entry
+    inside = [page for page in pages if page.startswith(entry)]
+    return sorted(inside, key=lambda page: (page.removeprefix(entry) not in _FIRST, page))
