@@ -22,7 +22,7 @@ from sensors.tls import LaserScanner, Pattern, ScannerConfig
 _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
 _SPREAD = {
     "range_noise", "range_noise_proportional", "range_noise_incidence", "range_noise_intensity", "angle_noise",
-    "range_quantization", "beam_divergence",
+    "range_quantization",
 }  # fmt: skip
 """Effects that leave the mean as it is."""
 

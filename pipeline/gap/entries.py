@@ -13,8 +13,8 @@ from pipeline.gap.missing import MissingFound
 from pipeline.gap.quantization import Comb
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.selection import Chosen
+from pipeline.gap.shapes import ShapeFound
 from pipeline.gap.spread import SpreadFound
-from pipeline.gap.stereo_shapes import ShapeFound
 from scene.config import parse
 from scene.errors import InputError
 from scene.mesh import FloatArray
@@ -125,9 +125,9 @@ def from_spread(found: SpreadFound, sensor: str) -> Named:
 
 
 def from_shape(found: ShapeFound) -> Named:
-    """An effect at depth steps."""
-    entry = {"name": found.name, **found.parameters}
-    return Named(f"stereo.{found.name}", "physical", entry, found.std, (), found.p_value, found.gain)
+    """An effect where the surface is not smooth."""
+    entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
+    return Named(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), found.p_value, found.gain)
 
 
 def from_tails(sensor: str, sigma: float, points: int) -> Named:

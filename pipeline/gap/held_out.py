@@ -14,7 +14,10 @@ from pipeline.gap.registration import pose_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from scene.mesh import FloatArray
 
-NOT_SCORED = ("range_quantization", "pixel_locking", "detection_limit", "precipitation", "edge_fattening")
+NOT_SCORED = (
+    *("range_quantization", "pixel_locking", "detection_limit", "precipitation"),
+    *("edge_fattening", "occlusion_fill", "beam_divergence"),
+)
 """Effects that show in other things than mean and spread of residuals."""
 _POINTS_PER_PATCH = 30.0
 _LARGEST = 5.0

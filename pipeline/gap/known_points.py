@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.gap.candidates import Candidate
+from pipeline.gap.nominal_pair import NominalPair, moved_pair, project, real_pair
 from pipeline.gap.planned import View
 from pipeline.gap.residuals import Residuals
-from pipeline.gap.stereo_residuals import NominalPair, moved_pair, project, real_pair
 from pipeline.gap.tls_residuals import TlsGeometry
 from scene.mesh import FloatArray
 from sensors.camera import CameraPair

@@ -148,12 +148,12 @@ def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: K
         if candidates[first].name != candidates[second].name
     ]
     pair = max(pairs, key=lambda fit: fit.score, default=best)
-    free_name, free_score = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()}, residuals.sensor)
+    free_name, free_score, free = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()})
     # where one effect leaves something over, a second of the catalogue comes before a form of no effect
     needed = _SECOND_GAIN if free_score > best.score + _FREE_MARGIN else _LEAST_GAIN
     agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    empirical = free_score > chosen.score + _FREE_MARGIN
+    empirical = free_score > chosen.score + _FREE_MARGIN and _blocks_agree(squared, chosen.added(forms), free, block)
     if empirical:
         chosen = best
     tried = tuple(sorted(((c.name, fit.score) for c, fit in zip(candidates, singles, strict=True)), key=lambda item: -item[1]))
@@ -265,16 +265,17 @@ def find_tails(z: FloatArray, block: NDArray[np.int64]) -> float | None:
     return float(np.sqrt(max(excess, 0.0))) if spread_out else None
 
 
-def _free_form(squared: FloatArray, covariates: Mapping[str, FloatArray], sensor: str) -> tuple[str, float]:
-    """The covariate along which a variance free in each of some bins explains most, with its score."""
-    best = ("", -np.inf)
+def _free_form(squared: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
+    """The covariate along which a variance free in each of some bins explains most, its score, and what it adds (n,)."""
+    best: tuple[str, float, FloatArray] = ("", -np.inf, np.zeros(len(squared)))
     for name, values in covariates.items():
         if name in ("edge_step", "line"):
             continue
         edges = np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1])
         group = np.searchsorted(edges, values)
         count = np.maximum(np.bincount(group, minlength=_BINS), 1)
-        variance = np.bincount(group, squared, _BINS) / count
-        score = float(0.5 * np.sum(count * (variance - 1 - np.log(np.maximum(variance, 1e-9))))) - _BINS
-        best = max(best, (name, score), key=lambda item: item[1])
+        variance = np.maximum(np.bincount(group, squared, _BINS) / count, 1e-9)
+        score = float(0.5 * np.sum(count * (variance - 1 - np.log(variance)))) - _BINS
+        if score > best[1]:
+            best = name, score, (variance - 1)[group]
     return best

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from pipeline.gap.disparity_raster import RASTER_EFFECTS, DisparityRaster
 from pipeline.gap.measurement import Measurement
+from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, is_hidden, moved_pair, project, rays, real_pair, seen_disparity
 from pipeline.gap.residuals import Residuals
 from pipeline.rigid import RigidTransform
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair
-from sensors.effects.base import Effect, Stage
+from sensors.camera import Camera
 from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.effects.range_empirical import LARGEST
 from sensors.model import StereoModel
-from sensors.rectify import Rectification, rectify
 
 _PROBE_PX = 3.0
 _EDGE_PX = 1.0
@@ -29,68 +26,6 @@ _ON_RAY = 0.1
 """A registration counts as found where it leaves less than this share of the distance from the points to their rays."""
 _REGULARIZATION_SHARE = 4 / 9
 """Mean variance of a bilinearly interpolated grid of independent values."""
-
-
-@dataclass(frozen=True)
-class StereoGeometry:
-    """Per point: left pixel and right row (px), disparity of the reference (px), tangent point and unit normal (wall frame, m),
-    albedo-free texture is not known. pair: nominal cameras, wall frame."""
-
-    u: FloatArray
-    v: FloatArray
-    v_right: FloatArray
-    disparity: FloatArray
-    found: FloatArray
-    point: FloatArray
-    normal: FloatArray
-    radius: FloatArray
-    radius_right: FloatArray
-
-    def part(self, rows: Any) -> StereoGeometry:
-        """The same of some of the points."""
-        return StereoGeometry(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})
-
-
-@dataclass(frozen=True)
-class NominalPair:
-    """The nominal pair in the wall frame, with its rectification."""
-
-    pair: CameraPair
-    geometry: Rectification
-
-    @classmethod
-    def of(cls, measurement: Measurement) -> NominalPair:
-        """Raises InputError where a stereo measurement has no cameras."""
-        if measurement.cameras is None:
-            raise InputError("a stereo measurement needs `cameras`", where="measurement.yaml")
-        pair = measurement.cameras.in_wall_frame(measurement.frame)
-        return cls(pair, rectify(pair))
-
-    def rectified(self, camera: Camera, turn: FloatArray, u: FloatArray, v: FloatArray, centre: float) -> FloatArray:
-        """(n,) rectified column of image pixels."""
-        x, y = camera.tangents(u, v)
-        ray = np.einsum("ij,nj->ni", turn, np.stack([x, y, np.ones_like(x)], axis=1))
-        return np.asarray(self.geometry.f * ray[:, 0] / ray[:, 2] + centre)
-
-    def disparity(self, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]) -> FloatArray:
-        """(n,) disparity of pixels of the left and of the right image, px."""
-        rect = self.geometry
-        return self.rectified(self.pair.left, rect.left, *left, rect.u_left) - self.rectified(
-            self.pair.right, rect.right, *right, rect.u_right
-        )
-
-
-def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (u, v) of points (n, 3)."""
-    local = np.einsum("ji,nj->ni", camera.rotation, points - camera.position)
-    u, v = camera.pixel(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
-    return np.asarray(u), np.asarray(v)
-
-
-def rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
-    """(n, 3) directions of pixels with unit component along the camera's axis."""
-    x, y = camera.tangents(u, v)
-    return np.einsum("ij,nj->ni", camera.rotation, np.stack([x, y, np.ones_like(x)], axis=1))
 
 
 def on_their_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
@@ -120,16 +55,6 @@ def _miss(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> Flo
     return np.concatenate([found[0] - u, found[1] - v])
 
 
-def seen_disparity(nominal: NominalPair, real: CameraPair, geometry: StereoGeometry) -> FloatArray:
-    """(n,) disparity that a real pair gives on each point's tangent plane, in the nominal rectified pair."""
-    ray = rays(real.left, geometry.u, geometry.v)
-    distance = np.einsum("ni,ni->n", geometry.point - real.left.position, geometry.normal) / np.einsum(
-        "ni,ni->n", ray, geometry.normal
-    )
-    point = real.left.position + distance[:, None] * ray
-    return nominal.disparity((geometry.u, geometry.v), project(real.right, point))
-
-
 def stereo_residuals(measurement: Measurement) -> Residuals:
     """Disparity residuals with predicted spread and covariates; points whose pixel does not see the surface are left out."""
     nominal, model = NominalPair.of(measurement), measurement.model
@@ -143,6 +68,7 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
         u, v = project(nominal.pair.left, points)
     measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
     geometry, curvature, depth = _reference(nominal, measurement.scene, u, v, measured)
+    hidden = is_hidden(measurement.scene, nominal.pair.right.position, geometry.point)
     hit = np.isfinite(geometry.disparity)
     slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
     covariates = _covariates(nominal, geometry, depth, curvature)
@@ -152,7 +78,7 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
         value=measured - geometry.disparity - mean,
         sigma=np.full(len(u), np.sqrt(predicted_variance(model))),
         unit_m=1 / slope,
-        smooth=hit & (curvature < _EDGE_PX),
+        smooth=hit & ~hidden & (curvature < _EDGE_PX),
         pose=_pose(nominal, geometry),
         at=geometry.point[:, :2],
         covariates=covariates,
@@ -212,35 +138,16 @@ def _pose(nominal: NominalPair, geometry: StereoGeometry) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
-    """The pair shifted by `vector` (m) or turned by it (rad, small) about `centre`, in the frame that it is given in."""
-    if not turned:
-        return pair.shifted("both", vector)
-    x, y, z = vector
-    turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sides = (
-        Camera(**{**camera.__dict__, "rotation": turn @ camera.rotation, "position": centre + turn @ (camera.position - centre)})
-        for camera in (pair.left, pair.right)
-    )
-    return CameraPair(*sides)
-
-
-def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: Measurement) -> CameraPair:
-    """The nominal pair with camera effects, wall frame."""
-    pair = measurement.cameras
-    assert pair is not None
-    for effect in effects:
-        pair = effect.apply(pair, KeyedRandom(0)) if effect.stage == Stage.CAMERA else pair
-    return pair.in_wall_frame(measurement.frame)
-
-
 def _mean_error(nominal: NominalPair, model: StereoModel, geometry: StereoGeometry, measurement: Measurement) -> FloatArray:
     """(n,) what the model's effects add to the disparity, px."""
     from pipeline.gap.stereo_signatures import exposure_and_locking
 
     real = real_pair(nominal, model.effects, measurement)
     plain = seen_disparity(nominal, nominal.pair, geometry)
-    return seen_disparity(nominal, real, geometry) - plain + exposure_and_locking(model.effects, geometry)
+    found = seen_disparity(nominal, real, geometry) - plain + exposure_and_locking(model.effects, geometry)
+    shapes = [effect for effect in model.effects if effect.name in RASTER_EFFECTS]
+    raster = DisparityRaster.of(measurement, geometry) if shapes else None
+    return found if raster is None else found + raster.moved(shapes, geometry.disparity)
 
 
 def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatArray:

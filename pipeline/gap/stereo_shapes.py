@@ -1,135 +1,177 @@
-"""Effects on the shape of a disparity map at depth steps: outlines that grow."""
+"""Effects on the shape of a disparity map: outlines that grow, a low-pass, half-occluded strips that are filled.
+
+Each is predicted on the reference's own raster; what bears witness is that the measured disparities lie nearer to the shape
+with the effect than to that without, in blocks all over the wall.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binom
 
-from pipeline.gap.cells import patches
+from pipeline.gap.disparity_raster import RASTER_EFFECTS, DisparityRaster
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import BoolArray, Residuals
-from pipeline.gap.stereo_residuals import NominalPair, StereoGeometry, project, rays
+from pipeline.gap.shapes import Blocks, ShapeFound, log_density, refined
 from scene.mesh import FloatArray
-from sensors.effects.edge_fattening import fattened
+from sensors.effects import EdgeFattening, OcclusionFill, Smoothing
+from sensors.effects.base import Effect
 
 _RADII = (1, 2, 3, 4, 5, 6, 8)
-_HIDDEN_SHARE = 0.002
-"""A point is hidden where another surface stands before it by this share of its distance."""
+_SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
+"""Cells that outlines grow by, and standard deviations of the low-pass in cells."""
+_FINER = (1.1, 1.03)
 _CLEAR = 3.0
-"""Predicted sigmas by which an effect must move a point for it to bear witness."""
-_LEAST_GAIN, _BLOCK_SIGMAS = 20.0, 4.0
-_STRAY = 1e-3
-_SLACK = 0.15
-"""Share of a depth step by which its height on the reference may be off."""
-_MOST_CELLS = 1_000_000
-_STEPS, _ON_RASTER = range(2, 33), 0.5
-_STEEP = 0.3
-"""Disparity per pixel along the image beyond which neighbouring cells lie on both sides of a depth step."""
+"""Predicted sigmas by which an effect at depth steps must move a point for it to bear witness."""
+_FEWEST_FILLED, _LEAST_FILLED_GAIN = 8, 10.0
+_LEAST_HELD, _HELD_BY_CHANCE = 0.6, 0.3
+_FILLED, _STRAY_FILLED = 0.9, 0.02
+"""Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
+_NEAR_STEPS = 2
 
 
 @dataclass(frozen=True)
-class ShapeFound:
-    """An effect at depth steps. touched: (n,) points that it may move."""
+class _Witnesses:
+    """raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px; sigma: (n,) their spread; blocks."""
 
-    name: str
-    parameters: dict[str, float]
-    std: dict[str, float]
-    gain: float
-    p_value: float
-    touched: BoolArray
-
-
-@dataclass(frozen=True)
-class DisparityRaster:
-    """The reference as the depth map's cells see it. step: px per cell; disparity: (rows, columns) px, NaN where no match can be;
-    row, column: (n,) cell of each point."""
-
-    step: float
+    raster: DisparityRaster
     disparity: FloatArray
-    row: NDArray[np.int64]
-    column: NDArray[np.int64]
+    rough: FloatArray
+    sigma: FloatArray
+    blocks: Blocks
 
-    @classmethod
-    def of(cls, measurement: Measurement, geometry: StereoGeometry) -> DisparityRaster | None:
-        """None where the pixels are on no raster."""
-        step = _spacing(geometry.u)
-        if step is None:
-            return None
-        nominal = NominalPair.of(measurement)
-        low = geometry.u.min(), geometry.v.min()
-        column, row = (np.rint((x - x0) / step).astype(np.int64) for x, x0 in zip((geometry.u, geometry.v), low, strict=True))
-        shape = int(row.max()) + 1, int(column.max()) + 1
-        if np.prod(shape) > _MOST_CELLS:
-            return None
-        rows, columns = np.indices(shape)
-        u, v = low[0] + step * columns.ravel(), low[1] + step * rows.ravel()
-        left, right = nominal.pair.left, nominal.pair.right
-        ray = rays(left, u, v)
-        point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
-        seen = np.asarray(np.isfinite(point).all(axis=1))
-        there = np.where(seen[:, None], point, 0.0)
-        back = there - right.position
-        length = np.linalg.norm(back, axis=1)
-        first = measurement.scene.cast(right.position, back / length[:, None])[0]
-        hidden = seen & (first < length * (1 - _HIDDEN_SHARE))
-        disparity = np.where(seen & ~hidden, nominal.disparity((u, v), project(right, there)), np.nan)
-        return cls(step, disparity.reshape(shape), row, column)
-
-    def at_points(self, raster: FloatArray) -> FloatArray:
-        """(n,) what a raster holds at the points."""
-        return np.asarray(raster[self.row, self.column])
+    def gains(self, beside: list[Effect], effect: Effect) -> FloatArray:
+        """(n,) log-likelihood with an effect beside others less that of the others alone."""
+        without = self.raster.moved(beside, self.disparity)
+        moved = self.raster.moved([*beside, effect], self.disparity)
+        if isinstance(effect, EdgeFattening):
+            moved = np.where(np.abs(moved - without) > _CLEAR * self.sigma, moved, without)
+        more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
+        return np.where(moved == without, 0.0, more)
 
 
-def _spacing(u: FloatArray) -> float | None:
-    """Distance of neighbouring columns of a raster of pixels, px; also where a registration has moved them a little."""
-    gaps = np.diff(np.unique(np.round(u, 3)))
-    step = float(np.median(gaps)) if len(gaps) > 10 else 0.0
-    steps = gaps / max(step, 1e-9)
-    if step > 0.9 and np.count_nonzero(np.abs(steps - np.rint(steps)) < 0.01) > 0.99 * len(gaps):
-        return step
-    whole = [each for each in _STEPS if abs(np.exp(2j * np.pi * u / each).mean()) > _ON_RASTER]
-    return float(max(whole)) if whole else None
+def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArray) -> list[ShapeFound]:
+    """The effects on the shape that the points ask for, one after another. rough: (n,) registered residuals, px.
 
-
-def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArray, scale: float) -> list[ShapeFound]:
-    """Outlines that grow. rough: (n,) registered residuals, px; scale: sigmas that they spread."""
+    None where the points are on no raster, or where the model holds the effect already.
+    """
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:
         return []
-    found = _fattening(raster, residuals, rough, scale)
-    return [] if found is None else [found]
+    scale = 1.4826 * float(np.median(np.abs(rough / residuals.sigma)[residuals.smooth]))
+    believed = [effect for effect in measurement.model.effects if effect.name in RASTER_EFFECTS]
+    witnesses = _Witnesses(
+        raster,
+        residuals.geometry.disparity,
+        rough + raster.moved(believed, residuals.geometry.disparity),
+        scale * residuals.sigma,
+        Blocks.over(residuals.at),
+    )
+    found: list[ShapeFound] = []
+    trials: dict[str, Callable[[_Witnesses, list[Effect]], ShapeFound | None]] = {
+        "edge_fattening": _fattening,
+        "smoothing": _smoothing,
+        "occlusion_fill": _filling,
+    }
+    for name in {effect.name for effect in believed}:
+        del trials[name]
+    while trials:
+        beside = [*believed, *(each.effect for each in found)]
+        tried = [each for trial in trials.values() if (each := trial(witnesses, beside)) is not None]
+        if not tried:
+            break
+        found.append(max(tried, key=lambda each: each.gain))
+        del trials[found[-1].name]
+    return found
 
 
-def _fattening(raster: DisparityRaster, residuals: Residuals, rough: FloatArray, scale: float) -> ShapeFound | None:
-    sigma = scale * residuals.sigma
-    block = patches(residuals.at, 100.0)
-    best: tuple[float, int, FloatArray, FloatArray] | None = None
-    for radius in _RADII:
-        moved = raster.at_points(_grown(raster, radius)) - raster.at_points(raster.disparity)
-        moved = np.where(np.nan_to_num(moved) > _CLEAR * sigma, np.nan_to_num(moved), 0.0)
-        gains = np.where(
-            moved > 0, _log_density(rough - moved, np.hypot(sigma, _SLACK * moved)) - _log_density(rough, sigma), 0.0
-        )
-        if best is None or gains.sum() > best[0]:
-            best = float(gains.sum()), radius, gains, moved
-    assert best is not None
-    total, radius, gains, _ = best
-    sums = np.asarray(np.bincount(block, gains))
-    sigmas = total / max(float(np.linalg.norm(sums)), 1e-12)
-    if total < _LEAST_GAIN or sigmas < _BLOCK_SIGMAS:
+def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+    """Radii are whole cells: any between one and the next does the same."""
+    step, raster = witnesses.raster.step, witnesses.raster
+    trials = [(radius, witnesses.gains(beside, _grown(radius, step))) for radius in _RADII]
+    radius, gains = max(trials, key=lambda trial: float(trial[1].sum()))
+    tested = witnesses.blocks.tested(gains)
+    if tested is None:
         return None
-    wider = raster.at_points(_grown(raster, radius + 2)) - raster.at_points(raster.disparity)
-    # radii are whole cells: any between this one and the next does the same
-    parameters, std = {"radius_px": (radius + 0.5) * raster.step}, {"radius_px": raster.step / np.sqrt(12)}
-    p_value = max(float(np.exp(-(sigmas**2) / 2)), 1 / 2000)
-    return ShapeFound("edge_fattening", parameters, std, total, p_value, np.nan_to_num(wider) > 0)
+    touched = raster.moved([_grown(radius + _NEAR_STEPS, step)], witnesses.disparity) != 0
+    return ShapeFound(_grown(radius, step), {"radius_px": step / np.sqrt(12)}, *tested, touched)
 
 
-def _grown(raster: DisparityRaster, radius: int) -> FloatArray:
-    return np.asarray(fattened(raster.disparity, radius, max(_STEEP * raster.step, 1.0)))
+def _grown(radius: int, step: float) -> EdgeFattening:
+    return EdgeFattening(radius_px=(radius + 0.5) * step)
 
 
-def _log_density(value: FloatArray, sigma: FloatArray) -> FloatArray:
-    return np.asarray(np.log(np.exp(-0.5 * (value / sigma) ** 2) / sigma + _STRAY))
+def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+    """The standard deviation at the top of the likelihood."""
+    step = witnesses.raster.step
+
+    def gains(sigma: float) -> FloatArray:
+        return witnesses.gains(beside, Smoothing(sigma_px=sigma))
+
+    sigma = refined(gains, [step * each for each in _SIGMAS], _FINER)
+    tested = witnesses.blocks.tested(gains(sigma))
+    if tested is None:
+        return None
+    std = witnesses.blocks.std(gains, sigma)
+    return ShapeFound(Smoothing(sigma_px=sigma), {"sigma_px": std}, *tested, np.zeros(len(witnesses.rough), dtype=bool))
+
+
+def _filling(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+    """Points where the right camera sees nothing, at the disparity of the background beside them.
+
+    Without it hardly any of those cells holds a point (up to a fifth, by edges that are not quite where the reference has them).
+    """
+    raster = witnesses.raster
+    before = raster.after(beside)
+    points = np.isnan(raster.at_points(before)) & raster.at_points(raster.hidden)
+    gain = float(witnesses.gains(beside, OcclusionFill(reach_px=1e5))[points].sum())
+    if points.sum() < _FEWEST_FILLED or gain < _LEAST_FILLED_GAIN:
+        return None
+    widths, held = _strips(before, raster)
+    reach, std = _reach(widths, held, raster.step)
+    narrow = held[widths <= reach / raster.step]
+    if narrow.mean() < _LEAST_HELD:
+        return None
+    p_value = max(float(binom.sf(narrow.sum() - 1, len(narrow), _HELD_BY_CHANCE)), 1 / 2000)
+    return ShapeFound(OcclusionFill(reach_px=reach), {"reach_px": std}, gain, p_value, points)
+
+
+def _strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArray[np.int64], BoolArray]:
+    """Of the half-occluded cells: how wide the strip is in which each lies, in cells, and whether it holds a point."""
+    held = np.zeros(before.shape, dtype=bool)
+    held[raster.row, raster.column] = True
+    width = _widths(before)
+    inside = (width > 0) & raster.hidden
+    return width[inside], held[inside]
+
+
+def _reach(widths: NDArray[np.int64], held: BoolArray, step: float) -> tuple[float, float]:
+    """Widest strip that is filled and its standard deviation, px: by which strips hold points.
+
+    Where all of them do, the widest is the least that the reach may be: it is given with a standard deviation as large as itself.
+    """
+    tried = np.unique(widths)
+    best = int(np.argmax([_log_chance(held, widths <= each) for each in tried]))
+    low = float(tried[best])
+    if best + 1 == len(tried):
+        return (low + 0.5) * step, low * step
+    return (low + tried[best + 1]) / 2 * step, (tried[best + 1] - low) / np.sqrt(12) * step
+
+
+def _log_chance(held: BoolArray, filled: BoolArray) -> float:
+    """Of cells that hold points or not, where strips are filled or not."""
+    chance = np.where(filled, _FILLED, _STRAY_FILLED)
+    return float(np.sum(np.log(np.where(held, chance, 1 - chance))))
+
+
+def _widths(disparity: FloatArray) -> NDArray[np.int64]:
+    """(rows, columns) width in cells of the unmatched run between two matched ones in which a cell lies, 0 elsewhere."""
+    columns = disparity.shape[1]
+    matched, column = ~np.isnan(disparity), np.arange(columns)
+    before = np.maximum.accumulate(np.where(matched, column, -1), axis=1)
+    after = np.minimum.accumulate(np.where(matched, column, columns)[:, ::-1], axis=1)[:, ::-1]
+    return np.where(~matched & (before >= 0) & (after < columns), after - before - 1, 0)

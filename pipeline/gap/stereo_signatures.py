@@ -9,8 +9,8 @@ import numpy as np
 
 from pipeline.gap.candidates import Candidate, Grid, Wave, frequencies, variants
 from pipeline.gap.measurement import Measurement
+from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, real_pair, seen_disparity
 from pipeline.gap.residuals import Residuals
-from pipeline.gap.stereo_residuals import NominalPair, StereoGeometry, real_pair, seen_disparity
 from scene.mesh import FloatArray
 from sensors.effects import (
     AffinitySkew,

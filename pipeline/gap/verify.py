@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pipeline.gap.cells import patches
 from pipeline.gap.directed import simulate_ranges
 from pipeline.gap.measurement import Measurement
+from pipeline.gap.nominal_pair import NominalPair, project
 from pipeline.gap.residuals import Residuals
-from pipeline.gap.stereo_residuals import NominalPair, project
 from pipeline.rigid import rotation_matrix
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -130,25 +130,20 @@ def measure_gap(
     """Score two versions of the model on held-out residuals, with common random numbers; None where too few points remain.
 
     reference_sigma: standard deviation of the reference's own error in the observable's unit, which is part of every draw;
-    largest: predicted sigmas at which residuals are cut off, measured and simulated ones alike.
+    largest: predicted sigmas by which a point may lie off one of the versions; those farther off both are left out.
     """
     patch = patches(residuals.at, _POINTS_PER_PATCH)
-    centre, reach = residuals.pose @ after.pose, largest * residuals.sigma
-
-    def draws(version: Version, purpose: str) -> FloatArray:
-        return centre + np.clip(_draws(measurement, version, residuals, random.child(purpose)) - centre, -reach, reach)
-
-    versions = [draws(version, "ensemble") for version in (before, after)]
-    truth = draws(after, "floor")
-    usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0) & np.isin(
-        patch, np.flatnonzero(np.bincount(patch) >= _FEWEST_POINTS)
-    )
+    versions = [_draws(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
+    truth, measured = _draws(measurement, after, residuals, random.child("floor")), observed(residuals)
+    usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
+    off = np.min([np.abs(measured - draws.mean(axis=0)) for draws in versions], axis=0)
+    usable &= off < largest * residuals.sigma
+    usable &= np.isin(patch, np.flatnonzero(np.bincount(patch[usable], minlength=patch.max() + 1) >= _FEWEST_POINTS))
     if not usable.any():
         return None
     _, number = np.unique(patch[usable], return_inverse=True)
     unit = np.bincount(number, residuals.unit_m[usable]) / np.bincount(number)
     errors = reference_sigma * random.child("reference").generator().standard_normal((3, _DRAWS, len(unit)))
-    measured = centre + np.clip(observed(residuals) - centre, -reach, reach)
     value = _summaries(measured[None, usable], number)[:, 0]
     ensembles = [_summaries(drawn[:, usable], number, errors[0]) for drawn in versions]
     drawn = _summaries(truth[:, usable], number, errors[1])

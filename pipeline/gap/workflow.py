@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.gap.cells import Cells, block_numbers, held_out_blocks
 from pipeline.gap.changes import SceneChange, find_changes
 from pipeline.gap.entries import SPREADS, Named, from_missing, from_shape, from_tails, with_effects
+from pipeline.gap.footprint import find_footprint
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.missing import find_missing
@@ -19,6 +20,7 @@ from pipeline.gap.naming import believes, name_effects
 from pipeline.gap.registration import pose_of, registered, residuals_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Tried
+from pipeline.gap.shapes import ShapeFound
 from pipeline.gap.spread import find_tails
 from pipeline.gap.stereo_shapes import find_shapes
 from pipeline.gap.verify import Gap, Version, measure_gap, thinned
@@ -68,10 +70,9 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     if residuals.smooth.sum() < FEWEST_POINTS:
         return _insufficient(measurement, residuals, clock)
     there, residuals, surveyed = settled(measurement)
-    rough, _, scale = registered(residuals)
-    shapes = find_shapes(there, residuals, rough, scale) if measurement.sensor == "stereo" else []
-    for shape in shapes:
-        residuals = replace(residuals, smooth=residuals.smooth & ~shape.touched)
+    shapes = _shapes(there, residuals)
+    plain, touched = residuals, np.logical_or.reduce([np.zeros(len(residuals), dtype=bool), *(each.touched for each in shapes)])
+    shaped, residuals = _shaped(there, residuals, shapes, touched)
     rough, _, scale = registered(residuals)
     changes, changed = find_changes(replace(residuals, value=rough), there.cloud.points[residuals.index], residuals.smooth)
     rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
@@ -81,28 +82,27 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     usable = residuals.smooth & ~changed & (np.abs(rough) < _CLIP * scale * residuals.sigma)
     chosen = np.flatnonzero(usable & ~held_out)
     chosen = chosen[:: max(len(chosen) // _MOST_POINTS, 1)]
-    named, naming = name_effects(there, residuals.part(chosen), scale, random)
-    shaped = [from_shape(shape) for shape in shapes if not believes(measurement, shape.name)]
-    named = sorted([*named, *shaped, *_missing(there, residuals, rough, changed)], key=lambda item: -item.gain)
+    named, naming = name_effects(shaped, residuals.part(chosen), scale, random)
+    named = sorted([*named, *map(from_shape, shapes), *_missing(there, residuals, rough, changed)], key=lambda item: -item.gain)
     clock.lap("naming")
     scored = score_effects(there, named, residuals, chosen, residuals.smooth & ~changed & held_out, naming.reference_sigma)
     named = _with_tails(there, scored.named, residuals, np.flatnonzero(residuals.smooth & ~changed & ~held_out), cells)
     after = with_effects(measurement.model, [item.entry for item in named])
-    before = pose_of(residuals.part(chosen))
-    corrected, turned = (
-        _corrected(there, after, residuals, chosen) if named else (residuals.value - residuals.pose @ before, before)
-    )
+    before = pose_of(plain.part(chosen))
+    value = plain.value - plain.pose @ before
+    corrected, turned = _corrected(there, after, plain, chosen) if named else (value, before)
     versions = Version(measurement.model, before), Version(after, turned)
-    gap = _gap(there, versions, residuals, residuals.smooth & ~changed & held_out, naming.reference_sigma, scale, random)
+    scored_on = (residuals.smooth | touched) & ~changed & held_out
+    gap = _gap(there, versions, plain, scored_on, naming.reference_sigma, scale, random)
     clock.lap("verification")
     return Diagnosis(
         verdict=_verdict(named),
         effects=tuple(named),
         changes=tuple(changes),
-        residuals=residuals,
+        residuals=replace(plain, smooth=residuals.smooth),
         held_out=held_out,
-        before=residuals.value - residuals.pose @ before,
-        after=np.where(np.isfinite(corrected), corrected, residuals.value - residuals.pose @ before),
+        before=value,
+        after=np.where(np.isfinite(corrected), corrected, value),
         pose=surveyed + turned,
         model_after=after,
         gap=gap,
@@ -114,10 +114,37 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     )
 
 
+def _shapes(measurement: Measurement, residuals: Residuals) -> list[ShapeFound]:
+    """Effects where the surface is not smooth that the model does not hold."""
+    rough, _, scale = registered(residuals)
+    if measurement.sensor == "stereo":
+        return find_shapes(measurement, residuals, rough)
+    return [] if believes(measurement, "beam_divergence") else find_footprint(measurement, residuals, rough, scale)
+
+
+def _shaped(
+    measurement: Measurement, residuals: Residuals, shapes: list[ShapeFound], touched: BoolArray
+) -> tuple[Measurement, Residuals]:
+    """The measurement with these effects in its model, and the residuals of the same points against that."""
+    if not shapes:
+        return measurement, residuals
+    entries = [from_shape(shape).entry for shape in shapes]
+    shaped = measurement.changed(model=with_effects(measurement.model, entries))
+    found = residuals_of(shaped)
+    value = np.full(len(measurement.cloud.points), np.nan)
+    value[found.index] = found.value
+    there = value[residuals.index]
+    smooth = residuals.smooth & ~touched & np.isfinite(there)
+    return shaped, replace(residuals, value=np.where(np.isfinite(there), there, residuals.value), smooth=smooth)
+
+
 def _with_tails(
     measurement: Measurement, named: list[Named], residuals: Residuals, rows: NDArray[np.int64], cells: Cells
 ) -> list[Named]:
-    """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes."""
+    """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes but one: strips that
+    are filled are also cells that had no match by chance."""
+    if any(item.name == "stereo.occlusion_fill" for item in named):
+        return named
     model = with_effects(measurement.model, [item.entry for item in named])
     _, found, _ = settled(measurement.changed(model=model), residuals.index[rows])
     trusted = np.flatnonzero(found.smooth & np.isin(found.index, residuals.index[rows]))

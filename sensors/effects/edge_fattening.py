@@ -27,7 +27,7 @@ class EdgeFattening(Effect):
     sensor = "stereo"
     stage = Stage.MATCH
     order = 10
-    radius_px: float = parameter("reach beyond the outline", unit="px", source="Hirschmueller 2008", typical=8.0, ge=0, le=50)
+    radius_px: float = parameter("reach beyond the outline", unit="px", source="Hirschmueller 2008", typical=8.0, ge=0, le=1000)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         radius = int(self.radius_px / state.reduction + 1e-9)
