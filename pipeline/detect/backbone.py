@@ -11,16 +11,17 @@ import keras
 from keras import layers
 
 _GROUPS = 8
-_STAGES = {"light": (1, 1, 2, 2), "resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}
-_LIGHT_WIDTHS = (32, 64, 128, 192)
+_STAGES = {"fine": (1, 1, 2, 2), "light": (1, 1, 2, 2), "resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}
 _BOTTLENECK_WIDTHS = (64, 128, 256, 512)
+_PLAIN_WIDTHS = {"fine": (16, 32, 64, 128), "light": (32, 64, 128, 192)}
 
 
 def feature_pyramid(name: str, image_px: int, channels_in: int, channels: int) -> keras.Model:
     """A model from images (b, h, w, channels_in) to the levels P2 to P6, (b, h / stride, w / stride, channels) each.
 
     name: resnet50 and resnet101 of He et al. (2016), bottleneck blocks; `light` has six plain blocks of two convolutions and a
-    quarter of the width.
+    quarter of the width; `fine` is narrower still and has no pooling at its start, so that all its levels are twice as fine, as
+    blocks of five pixels need.
     """
     image = keras.Input((image_px, image_px, channels_in), name="image")
     stages = _resnet(image, name)
@@ -35,12 +36,13 @@ def feature_pyramid(name: str, image_px: int, channels_in: int, channels: int) -
 
 
 def _resnet(image: Any, name: str) -> list[Any]:
-    """The outputs of the four stages, at 1/4, 1/8, 1/16 and 1/32 of the image."""
-    light = name == "light"
-    widths = _LIGHT_WIDTHS if light else _BOTTLENECK_WIDTHS
-    block = _plain if light else _bottleneck
-    x = _convolution(image, widths[0], 3 if light else 7, 2, "stem")
-    x = layers.MaxPooling2D(3, strides=2, padding="same")(x)
+    """The outputs of the four stages, at 1/4, 1/8, 1/16 and 1/32 of the image, or 1/2 to 1/16 for `fine`."""
+    plain = name in _PLAIN_WIDTHS
+    widths = _PLAIN_WIDTHS.get(name, _BOTTLENECK_WIDTHS)
+    block = _plain if plain else _bottleneck
+    x = _convolution(image, widths[0], 3 if plain else 7, 2, "stem")
+    if name != "fine":
+        x = layers.MaxPooling2D(3, strides=2, padding="same")(x)
     stages = []
     for stage, (count, width) in enumerate(zip(_STAGES[name], widths, strict=True), start=2):
         for number in range(count):

@@ -16,18 +16,19 @@ Tensor = Any
 _DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)
 """Typical sizes of the four numbers of a code, by which they are divided (He et al. 2017, as everybody's code has it)."""
 _LARGEST_LOG = float(np.log(1000 / 16))
-STRIDES = (4, 8, 16, 32, 64)
-"""Pixels of the image per cell of the levels P2 to P6."""
 
 
-def anchors(height: int, width: int, sizes: tuple[float, ...], ratios: tuple[float, ...]) -> NDArray[np.float32]:
+def anchors(
+    height: int, width: int, strides: tuple[int, ...], sizes: tuple[float, ...], ratios: tuple[float, ...]
+) -> NDArray[np.float32]:
     """(a, 4) anchors of all levels, level by level, row by row, column by column, ratio by ratio.
 
-    An anchor is centred on its cell; sizes: square root of the area, px, one per level; ratios: height over width.
+    An anchor is centred on its cell; strides: pixels per cell, one per level; sizes: square root of the area, px, one per level;
+    ratios: height over width.
     """
     root = np.sqrt(np.asarray(ratios))
     levels = []
-    for stride, size in zip(STRIDES, sizes, strict=True):
+    for stride, size in zip(strides, sizes, strict=True):
         y = (np.arange(-(-height // stride)) + 0.5) * stride
         x = (np.arange(-(-width // stride)) + 0.5) * stride
         centre = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)[:, :, None]

@@ -37,6 +37,7 @@ class ProposalConfig(Config):
         (8, 16, 32, 64, 128), min_length=5, max_length=5, description="one per pyramid level"
     )
     anchor_ratios: tuple[float, ...] = Field((0.5, 1.0, 2.0), min_length=1, description="height over width")
+    convolution_px: Literal[1, 3] = Field(3, description="side of the head's hidden convolution; 1 takes a ninth of the time")
     positive_iou: float = Field(0.6, gt=0, le=1, description="an anchor this near a block is a block")
     negative_iou: float = Field(0.3, ge=0, lt=1, description="an anchor this far from every block is background")
     sampled_anchors: int = Field(256, ge=4, description="anchors per image that enter the loss, at most half of them positive")
@@ -59,7 +60,9 @@ class HeadConfig(Config):
 class DetectorConfig(Config):
     """The network, Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017)."""
 
-    backbone: Literal["light", "resnet50", "resnet101"] = Field("light", description="light is for CPUs")
+    backbone: Literal["fine", "light", "resnet50", "resnet101"] = Field(
+        "light", description="light and fine are for CPUs, fine for blocks of a few pixels"
+    )
     pyramid_channels: int = Field(
         64, ge=8, multiple_of=8, description="channels of the feature pyramid and of the heads; 256 in the papers"
     )
@@ -68,6 +71,12 @@ class DetectorConfig(Config):
     normalisation: NormalisationConfig = NormalisationConfig()
     proposal: ProposalConfig = ProposalConfig()
     head: HeadConfig = HeadConfig()
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """Pixels of the image per cell of the pyramid's levels P2 to P6."""
+        finest = 2 if self.backbone == "fine" else 4
+        return tuple(finest << level for level in range(5))
 
 
 class TrainingConfig(Config):

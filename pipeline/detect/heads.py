@@ -15,10 +15,13 @@ _RARE = initializers.Constant(-4.0)
 """First guess of an anchor's logit: few hold a block, so that the first steps are not spent on saying no (Lin et al. 2017b)."""
 
 
-def proposal_head(channels: int, ratios: int) -> keras.Model:
-    """From one level of the pyramid to (b, h, w, 5 ratios): per anchor a logit, then the four numbers of its code."""
+def proposal_head(channels: int, ratios: int, size_px: int) -> keras.Model:
+    """From one level of the pyramid, (b, h, w, channels), to a logit (b, h w ratios, 1) and a code (b, h w ratios, 4) per anchor.
+
+    size_px: side of the hidden convolution, cells.
+    """
     level = keras.Input((None, None, channels))
-    x = layers.Conv2D(channels, 3, padding="same", activation="relu", kernel_initializer="he_normal", name="shared")(level)
+    x = layers.Conv2D(channels, size_px, padding="same", activation="relu", kernel_initializer="he_normal", name="shared")(level)
     logits = layers.Conv2D(ratios, 1, bias_initializer=_RARE, kernel_initializer=_small(), name="logit")(x)
     codes = layers.Conv2D(4 * ratios, 1, kernel_initializer=_small(), name="code")(x)
     return keras.Model(level, [layers.Reshape((-1, 1))(logits), layers.Reshape((-1, 4))(codes)], name="proposal_head")

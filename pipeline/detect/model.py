@@ -38,10 +38,10 @@ class MaskRCNN(keras.Model):
         size = image_px or config.image_px
         channels = config.pyramid_channels
         self.pyramid = feature_pyramid(config.backbone, size, config.normalisation.channels, channels)
-        self.proposal_head = proposal_head(channels, len(config.proposal.anchor_ratios))
+        self.proposal_head = proposal_head(channels, len(config.proposal.anchor_ratios), config.proposal.convolution_px)
         self.box_head = box_head(channels, config.head.hidden_units)
         self.mask_head = mask_head(channels, config.head.mask_size_px)
-        self.anchors = anchors(size, size, config.proposal.anchor_sizes_px, config.proposal.anchor_ratios)
+        self.anchors = anchors(size, size, config.strides, config.proposal.anchor_sizes_px, config.proposal.anchor_ratios)
         self.samples = keras.random.SeedGenerator(seed)
         self.means = {name: keras.metrics.Mean(name=name) for name in LOSSES}
         self.size = size
@@ -115,13 +115,15 @@ class MaskRCNN(keras.Model):
     def _on_boxes(self, levels: list[Tensor], boxes: Tensor, training: bool) -> tuple[Tensor, Tensor]:
         """Class logits (b, n, classes) and codes (b, n, 4)."""
         count = boxes.shape[1]
-        logits, codes = self.box_head(_flat(roi_align(levels, boxes, POOLED_PX)), training=training)
+        logits, codes = self.box_head(_flat(roi_align(levels, boxes, self.config.strides, POOLED_PX)), training=training)
         return ops.reshape(logits, (-1, count, logits.shape[-1])), ops.reshape(codes, (-1, count, 4))
 
     def _masks(self, levels: list[Tensor], boxes: Tensor, training: bool) -> Tensor:
         """(b, n, m, m) logits."""
         size = self.config.head.mask_size_px
-        logits = self.mask_head(_flat(roi_align(levels, boxes, MASK_POOLED_PX, samples=1)), training=training)
+        logits = self.mask_head(
+            _flat(roi_align(levels, boxes, self.config.strides, MASK_POOLED_PX, samples=1)), training=training
+        )
         return ops.reshape(logits, (-1, boxes.shape[1], size, size))
 
 

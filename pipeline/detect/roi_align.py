@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 from keras import ops
 
-from pipeline.detect.boxes import STRIDES, Tensor
+from pipeline.detect.boxes import Tensor
 
-_CANONICAL_PX = 56.0
-"""A box of twice this side takes its features from P3, of four times from P4: a 14 px mask input samples P2 at its own pitch."""
+_CANONICAL_CELLS = 14.0
+"""A box of twice this side, in cells of P2, takes its features from P3, of four times from P4: a 14 px mask input samples P2 at
+its own pitch."""
 
 
-def roi_align(features: list[Tensor], boxes: Tensor, size: int, samples: int = 2) -> Tensor:
+def roi_align(features: list[Tensor], boxes: Tensor, strides: tuple[int, ...], size: int, samples: int = 2) -> Tensor:
     """(b, n, size, size, c) features of boxes (b, n, 4), px of the image, from the levels P2, P3, ... ((b, h, w, c) each).
+
+    strides: pixels of the image per cell of each level.
 
     Each of the size x size bins is the mean of samples x samples interpolated values at the centres of its parts. A cell's value
     stands at the cell's centre, so a box's feature of a linear ramp is the ramp at the bin's centre; beyond the outermost
@@ -21,13 +24,15 @@ def roi_align(features: list[Tensor], boxes: Tensor, size: int, samples: int = 2
     shapes = np.array([feature.shape[1:3] for feature in features], np.int32)
     starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))]).astype(np.int32)
     channels = features[0].shape[-1]
-    flat = ops.concatenate(
+    cells = ops.concatenate(
         [ops.reshape(feature, (-1, starts[i + 1] - starts[i], channels)) for i, feature in enumerate(features)], axis=1
     )
-    level = _levels(boxes, len(features))
-    stride = ops.take(np.array(STRIDES[: len(features)], np.float32), level, axis=0)
+    flat = ops.reshape(cells, (-1, channels))  # once: the gradients of all gathers then reach it in one piece
+    image = ops.arange(ops.shape(cells)[0], dtype="int32")[:, None] * int(starts[-1])
+    level = _levels(boxes, len(features), _CANONICAL_CELLS * strides[0])
+    stride = ops.take(np.array(strides[: len(features)], np.float32), level, axis=0)
     height, width = ops.take(shapes[:, 0], level, axis=0), ops.take(shapes[:, 1], level, axis=0)
-    start = ops.take(starts[:-1], level, axis=0)
+    start = ops.take(starts[:-1], level, axis=0) + image
     parts = (np.arange(size * samples, dtype=np.float32) + 0.5) / (size * samples)
     total = 0.0
     for i in range(samples):
@@ -38,13 +43,13 @@ def roi_align(features: list[Tensor], boxes: Tensor, size: int, samples: int = 2
                 for columns, column_weight in ((x0, 1 - wx), (x1, wx)):
                     index = start[..., None, None] + rows[..., :, None] * width[..., None, None] + columns[..., None, :]
                     weight = row_weight[..., :, None] * column_weight[..., None, :]
-                    total = total + _gathered(flat, index) * weight[..., None]
+                    total = total + ops.take(flat, index, axis=0) * weight[..., None]
     return total / samples**2
 
 
-def _levels(boxes: Tensor, count: int) -> Tensor:
+def _levels(boxes: Tensor, count: int, canonical_px: float) -> Tensor:
     area = ops.maximum((boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1]), 1e-6)
-    level = ops.floor(0.5 * ops.log(area / _CANONICAL_PX**2) / float(np.log(2.0)))
+    level = ops.floor(0.5 * ops.log(area / canonical_px**2) / float(np.log(2.0)))
     return ops.cast(ops.clip(level, 0, count - 1), "int32")
 
 
@@ -56,9 +61,3 @@ def _neighbours(low: Tensor, high: Tensor, parts: np.ndarray, stride: Tensor, le
     first = ops.minimum(ops.floor(at), ops.maximum(last - 1, 0.0))
     second = ops.minimum(first + 1, last)
     return ops.cast(first, "int32"), ops.cast(second, "int32"), at - first
-
-
-def _gathered(flat: Tensor, index: Tensor) -> Tensor:
-    """(b, n, size, size, c) the rows of flat (b, s, c) at index (b, n, size, size)."""
-    offset = ops.arange(ops.shape(flat)[0], dtype="int32") * flat.shape[1]
-    return ops.take(ops.reshape(flat, (-1, flat.shape[-1])), index + offset[:, None, None, None], axis=0)

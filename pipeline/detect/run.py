@@ -92,8 +92,8 @@ def detect(
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     found_events: list[events.Event] = []
-    with progress, progress.stage("detection"):
-        progress.plan({"detection": 1.0})
+    progress.plan({"detection": 1.0})
+    with progress.stage("detection"):
         for number, item in enumerate(inputs):
             difference, grid = read_geotiff(item.path)
             found = find(difference)

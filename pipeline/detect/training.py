@@ -52,17 +52,16 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     history = _begun(out, config, model, resume=resume)
     steps = -(-len(folders[0]) // training.batch)
     logged = _EventLog(out / "events")
-    with progress:
-        progress.plan({f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)})
-        for epoch in range(len(history.training), training.epochs):
-            if has_settled(history.total, training):
-                break
-            with progress.stage(f"epoch {epoch + 1}"):
-                history.training.append(_learn(model, folders[0], config, epoch, steps, progress))
-                history.validation.append(_validate(model, folders[1], config))
-            logged.add(epoch, history)
-            _save(out, config, model, history)
-            write_loss_figure(history.training, history.validation, out / "losses.png")
+    progress.plan({f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)})
+    for epoch in range(len(history.training), training.epochs):
+        if has_settled(history.total, training):
+            break
+        with progress.stage(f"epoch {epoch + 1}"):
+            history.training.append(_learn(model, folders[0], config, epoch, steps, progress))
+            history.validation.append(_validate(model, folders[1], config))
+        logged.add(epoch, history)
+        _save(out, config, model, history)
+        write_loss_figure(history.training, history.validation, out / "losses.png")
     return history
 
 

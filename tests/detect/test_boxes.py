@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detect.boxes import STRIDES, anchors, clip, decode, encode, intersection_over_union, suppressed
+from pipeline.detect.boxes import anchors, clip, decode, encode, intersection_over_union, suppressed
 from pipeline.detect.roi_align import roi_align
+
+STRIDES = (4, 8, 16, 32, 64)
 
 
 def _random_boxes(count: int, seed: int, side: float = 200.0) -> np.ndarray:
@@ -27,7 +29,7 @@ def _greedy(boxes: np.ndarray, threshold: float) -> list[int]:
 
 
 def test_anchors_are_centred_on_their_cells_with_the_size_and_ratio_asked_for():
-    made = anchors(64, 128, (8, 16, 32, 64, 128), (0.5, 1.0, 2.0))
+    made = anchors(64, 128, STRIDES, (8, 16, 32, 64, 128), (0.5, 1.0, 2.0))
     assert len(made) == 3 * sum((64 // s) * (128 // s) for s in STRIDES)
     height, width = (made[:, 2:] - made[:, :2]).T
     assert_allclose(np.sqrt(height * width)[:3], 8, rtol=1e-6)
@@ -81,7 +83,7 @@ def test_roi_align_is_exact_on_a_ramp(samples):
         y, x = np.meshgrid(centre, centre, indexing="ij")
         levels.append(np.stack([y, x, 3 - 0.5 * y + 2 * x], axis=-1)[None].astype(np.float32))
     boxes = np.array([[[100.3, 60.7, 131.9, 170.2], [33, 40, 250.5, 300.25], [200, 200, 208, 212]]], np.float32)
-    found = np.asarray(roi_align(levels, boxes, 7, samples))
+    found = np.asarray(roi_align(levels, boxes, STRIDES[:4], 7, samples))
     parts = (np.arange(7) + 0.5) / 7
     for box, features in zip(boxes[0], found[0], strict=True):
         y = box[0] + parts * (box[2] - box[0])
@@ -94,5 +96,5 @@ def test_roi_align_is_exact_on_a_ramp(samples):
 def test_roi_align_takes_small_boxes_from_the_finest_level_and_keeps_images_apart():
     levels = [np.stack([np.full((128 // 2**k, 128 // 2**k, 1), 10 * b + k, np.float32) for b in range(2)]) for k in range(4)]
     boxes = np.tile(np.array([[0, 0, 8, 8], [0, 0, 60, 60], [0, 0, 120, 120], [0, 0, 500, 500]], np.float32), (2, 1, 1))
-    found = np.asarray(roi_align(levels, boxes, 2))[:, :, 0, 0, 0]
+    found = np.asarray(roi_align(levels, boxes, STRIDES, 2))[:, :, 0, 0, 0]
     assert_array_equal(found, [[0, 0, 1, 3], [10, 10, 11, 13]])

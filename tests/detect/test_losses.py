@@ -11,6 +11,8 @@ from pipeline.detect.config import HeadConfig, ProposalConfig
 from pipeline.detect.losses import binary_cross_entropy, cross_entropy, smooth_l1
 from pipeline.detect.targets import anchor_targets, box_targets, mask_targets
 
+STRIDES = (4, 8, 16, 32, 64)
+
 
 def test_binary_cross_entropy_by_hand():
     logits = np.array([0.0, 2.0, -2.0, 90.0], np.float32)
@@ -36,7 +38,7 @@ def test_smooth_l1_by_hand():
 
 def test_anchors_near_a_block_and_the_nearest_are_positive():
     config = ProposalConfig(sampled_anchors=64)
-    places = anchors(128, 128, config.anchor_sizes_px, config.anchor_ratios)
+    places = anchors(128, 128, STRIDES, config.anchor_sizes_px, config.anchor_ratios)
     blocks = np.zeros((1, 3, 4), np.float32)
     blocks[0, 0] = places[100]  # an anchor's own place
     blocks[0, 1] = (60, 60, 65, 64)  # nothing comes near it: its best anchor has to do
@@ -55,7 +57,7 @@ def test_anchors_near_a_block_and_the_nearest_are_positive():
 
 def test_an_image_without_blocks_gives_background_alone():
     config = ProposalConfig(sampled_anchors=64)
-    places = anchors(64, 64, config.anchor_sizes_px, config.anchor_ratios)
+    places = anchors(64, 64, STRIDES, config.anchor_sizes_px, config.anchor_ratios)
     found = anchor_targets(
         places, np.zeros((1, 2, 4), np.float32), np.zeros((1, 2), np.float32), config, keras.random.SeedGenerator(1)
     )

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.annotate import run_length_encoding
 from pipeline.detect import weights
+from pipeline.detect.backbone import feature_pyramid
 from pipeline.detect.config import DetectorConfig, HeadConfig, TrainConfig, TrainingConfig, load_train_config
 from pipeline.detect.data import CocoFolder, network_input, window
 from pipeline.detect.inference import detect
@@ -177,6 +178,14 @@ def test_the_backbones_are_the_papers(name, millions):
         int(np.prod(weight.shape)) for weight in model.weights if "lateral" not in weight.path and "pyramid_" not in weight.path
     )
     assert backbone / 1e6 == pytest.approx(millions, abs=0.1)
+
+
+@pytest.mark.parametrize(("name", "finest"), [("fine", 2), ("light", 4)])
+def test_levels_have_the_pixels_per_cell_that_the_config_says(name, finest):
+    config = DetectorConfig(backbone=name, image_px=SIDE)
+    levels = feature_pyramid(name, SIDE, 1, 16).outputs
+    assert config.strides == tuple(finest * 2**number for number in range(5))
+    assert [level.shape[1:] for level in levels] == [(SIDE // stride, SIDE // stride, 16) for stride in config.strides]
 
 
 def test_the_shipped_configs_load():

@@ -1,0 +1,109 @@
+"""Training images per second and inference megapixels per second against the bare backbone and pyramid, in the same run.
+
+    KERAS_BACKEND=tensorflow python benchmarks/detector.py [--config configs/detectors/fine.yaml] [--threads 1]
+
+To reach: half of the bare rate, forward and backward for training, forward for inference. Processor times in turns, so that
+other work on the machine counts little; images are noise with a dozen blocks in each 256 px square.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROUNDS = 7
+
+
+def processor_seconds(*works: Callable[[], object]) -> list[float]:
+    """Median processor time of each work, s, taken in turns after one round that traces and compiles."""
+    for work in works:
+        work()
+    timed = []
+    for _ in range(ROUNDS):
+        row = []
+        for work in works:
+            start = time.process_time()
+            work()
+            row.append(time.process_time() - start)
+        timed.append(row)
+    return [statistics.median(column) for column in zip(*timed, strict=True)]
+
+
+def examples(count: int, size: int, most_blocks: int, channels: int) -> dict[str, np.ndarray]:
+    """A batch as `pipeline.detect.data.batches` makes it."""
+    random = np.random.default_rng(1)
+    image = random.normal(0, 0.3, (count, size, size, channels)).astype(np.float32)
+    boxes, valid = np.zeros((count, most_blocks, 4), np.float32), np.zeros((count, most_blocks), np.float32)
+    labels = np.zeros((count, size, size), np.int32)
+    for number in range(count):
+        for block in range(min(12 * (size // 256) ** 2, most_blocks)):
+            height, width = random.integers(5, 25, 2)
+            y, x = random.integers(0, size - 25, 2)
+            labels[number, y : y + height, x : x + width] = block + 1
+            image[number, y : y + height, x : x + width, 0] += 2
+            boxes[number, block], valid[number, block] = (y, x, y + height, x + width), 1
+    return {"image": image, "boxes": boxes, "valid": valid, "labels": labels}
+
+
+def bare(pyramid: Any, image: np.ndarray, *, backward: bool) -> Callable[[], object]:
+    """The backbone with its pyramid alone, compiled."""
+    import tensorflow as tf
+
+    @tf.function(reduce_retracing=True)
+    def work(values: Any) -> Any:
+        if not backward:
+            return pyramid(values, training=False)
+        with tf.GradientTape() as tape:
+            total = sum(tf.reduce_mean(tf.square(level)) for level in pyramid(values, training=True))
+        return tape.gradient(total, pyramid.trainable_variables)
+
+    values = tf.constant(image)
+    return lambda: work(values)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", type=Path, default=Path(__file__).parents[1] / "configs" / "detectors" / "fine.yaml")
+    parser.add_argument("--threads", type=int, default=1)
+    arguments = parser.parse_args()
+    os.environ.setdefault("OMP_NUM_THREADS", str(arguments.threads))
+    from pipeline.detect.keras_backend import keras_ready
+
+    keras_ready()
+    import keras
+    import tensorflow as tf
+
+    from pipeline.detect.config import load_train_config
+    from pipeline.detect.model import MaskRCNN
+
+    tf.config.threading.set_intra_op_parallelism_threads(arguments.threads)
+    tf.config.threading.set_inter_op_parallelism_threads(1)
+    config = load_train_config(arguments.config)
+    crop, size, channels = config.training.crop_px, config.detector.image_px, config.detector.normalisation.channels
+    learner = MaskRCNN(config.detector, crop)
+    learner.compile(optimizer=keras.optimizers.AdamW(1e-4), jit_compile=False)
+    batch = examples(config.training.batch, crop or size, config.detector.most_blocks, channels)
+    whole, alone = processor_seconds(lambda: learner.train_on_batch(batch), bare(learner.pyramid, batch["image"], backward=True))
+    count = config.training.batch
+    print(
+        f"training at {crop or size} px, {count} a step: {count / whole:.2f} images/s, bare {count / alone:.2f}, "
+        f"ratio {alone / whole:.2f}"
+    )
+    finder = MaskRCNN(config.detector)
+    image = examples(4, size, config.detector.most_blocks, channels)["image"]
+    whole, alone = processor_seconds(
+        lambda: finder.predict_on_batch({"image": image}), bare(finder.pyramid, image, backward=False)
+    )
+    megapixels = 4 * size**2 / 1e6
+    print(f"inference at {size} px: {megapixels / whole:.2f} MP/s, bare {megapixels / alone:.2f}, ratio {alone / whole:.2f}")
+
+
+if __name__ == "__main__":
+    main()
