@@ -29,6 +29,7 @@ from pipeline.cli import (
     inspect,
     schema,
     train,
+    view,
 )
 from pipeline.cli import simulate as simulate_command
 from pipeline.cli.answer import Answer, as_json
@@ -69,6 +70,7 @@ COMMANDS: dict[str, Command] = {
     "train": train,
     "detect": detect,
     "evaluate": evaluate,
+    "view": view,
     "init": init,
     "schema": schema,
     "completion": completion,

@@ -93,7 +93,7 @@ MISTAKES = [
     (
         ["frobnicate"],
         "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, gap, train, detect, evaluate, "
-        "init, schema, completion, doctor",
+        "view, init, schema, completion, doctor",
     ),
     (["--versio"], "did you mean '--version'?"),
     (["simulate"], "required: --sensor"),

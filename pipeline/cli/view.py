@@ -1,0 +1,29 @@
+"""`scarpsim view`: results in 3D, on a page of this machine alone."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import at_least
+
+SUMMARY = "look at results in 3D: wall, differences, blocks, detections, residuals"
+EXAMPLE = """  scarpsim view runs/my_run
+  scarpsim view runs/my_run --detections found --port 8123
+  scarpsim view diagnosis"""
+_PORT = 8050
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run, a result of scarpsim gap, or a split of a data set")
+    parser.add_argument("--detections", type=Path, metavar="FOLDER", help="result of scarpsim detect on the run")
+    parser.add_argument("--port", type=at_least(0), default=_PORT, metavar="N", help="of the page; 0: any (default: %(default)s)")
+    parser.add_argument("--no-browser", action="store_true", help="only say the address, open no browser")
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.view.server import serve
+
+    serve(arguments.folder, arguments.detections, arguments.port, open_browser=not arguments.no_browser)
+    return Answer("the page is closed")

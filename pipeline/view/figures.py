@@ -1,0 +1,261 @@
+"""The two pictures of the page, of Plotly: the wall in 3D and the same window as a map."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+from plotly.colors import diverging, sequential
+
+from pipeline.view.results import Item, Layer, Patch, Points, Window
+
+ITEM_TRACES = ("block", "detection", "scene change")
+_COLOURS = {"block": "#000000", "detection": "#D55E00", "scene change": "#009E73"}
+"""Black and Okabe and Ito's: they stand out from red, blue and grey, also for colour-blind readers."""
+_DASHES = {"block": "solid", "detection": "dash", "scene change": "dot"}
+_SELECTED = "#E69F00"
+_GREYS = [[0.0, "#202020"], [1.0, "#f4f4f4"]]
+_PLAIN = "#9aa0a6"
+_NO_DATA = "#c9ccd0"
+_EDGES = ((0, 2, 4), (1, 2, 4), (1, 3, 4), (0, 3, 4), (0, 2, 4), (0, 2, 5), (1, 2, 5), (1, 3, 5), (0, 3, 5), (0, 2, 5))
+_POSTS = ((1, 2), (1, 3), (0, 3))
+"""A box drawn in one line, bottom and top, and its other three upright edges: indices into (x0, x1, y0, y1, z0, z1)."""
+_FLAT = {"ambient": 0.75, "diffuse": 0.45, "specular": 0.02, "roughness": 0.9, "fresnel": 0.05}
+_LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
+_FACTS_SHOWN = 6
+
+
+def wall_figure(
+    patch: Patch, points: Points | None, items: Sequence[Item], layer: Layer, shown: Collection[str], selected: int | None = None
+) -> go.Figure:
+    """The wall in 3D. shown: of surface, points and the kinds of items; selected: the item to mark."""
+    figure = go.Figure()
+    if "surface" in shown:
+        figure.add_trace(_surface(patch, layer))
+    if points is not None and "points" in shown:
+        figure.add_trace(_cloud(points, layer, coloured_alone="surface" not in shown))
+    for kind in ITEM_TRACES:
+        chosen = [(number, item) for number, item in enumerate(items) if item.kind == kind and _overlaps(item, patch)]
+        if kind in shown and chosen:
+            boxes = [_with_depth(item, patch) for _, item in chosen]
+            figure.add_trace(_wires(boxes, _COLOURS[kind], 3, dash=_DASHES[kind]))
+            figure.add_trace(_handles(chosen, boxes, kind))
+    if selected is not None and selected < len(items) and _overlaps(items[selected], patch):
+        figure.add_trace(_wires([_with_depth(items[selected], patch)], _SELECTED, 8))
+    axis: dict[str, Any] = {"showbackground": False, "gridcolor": "#dfe3e6", "zeroline": False, "showspikes": False}
+    figure.update_layout(
+        scene={
+            "aspectmode": "data",
+            "uirevision": "camera",
+            "xaxis": {**axis, "title": "along the wall, m"},
+            "yaxis": {**axis, "title": "up the wall, m"},
+            "zaxis": {**axis, "title": "towards the sensor, m"},
+            "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": {"x": -0.3, "y": -0.2, "z": 1.6}},
+        },
+        uirevision="camera",
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        showlegend=False,
+    )
+    return figure
+
+
+def map_figure(
+    patch: Patch, items: Sequence[Item], layer: Layer, shown: Collection[str], window: Window | None, selected: int | None = None
+) -> go.Figure:
+    """The window as a map; to zoom it is to choose the window of both pictures."""
+    figure = go.Figure(_heatmap(patch, layer))
+    for kind in ITEM_TRACES:
+        chosen = [(number, item) for number, item in enumerate(items) if item.kind == kind and _overlaps(item, patch)]
+        if kind in shown and chosen:
+            outlines = _outlines([item for _, item in chosen])
+            line = {"color": _COLOURS[kind], "width": 1, "dash": _DASHES[kind]}
+            figure.add_trace(go.Scatter(x=outlines[0], y=outlines[1], mode="lines", line=line, hoverinfo="skip", name=kind))
+            figure.add_trace(_map_handles(chosen, kind))
+    if selected is not None and selected < len(items):
+        x, y = _outlines([items[selected]])
+        figure.add_trace(go.Scatter(x=x, y=y, mode="lines", line={"color": _SELECTED, "width": 4}, hoverinfo="skip"))
+    left, right, low, high = window or _extent(patch)
+    plain = {"constrain": "domain", "showgrid": False, "zeroline": False}
+    figure.update_layout(
+        xaxis={**plain, "range": [left, right], "title": "along the wall, m"},
+        yaxis={**plain, "range": [low, high], "scaleanchor": "x", "title": "up the wall, m"},
+        margin={"l": 55, "r": 5, "t": 5, "b": 45},
+        plot_bgcolor=_NO_DATA,
+        showlegend=False,
+        dragmode="zoom",
+        uirevision=str(window),
+    )
+    return figure
+
+
+def _surface(patch: Patch, layer: Layer) -> go.Surface:
+    colour = hillshade(patch) if layer.key == "rock" else patch.value
+    return go.Surface(
+        x=patch.x,
+        y=patch.y,
+        z=patch.height.astype(np.float32),
+        surfacecolor=colour.astype(np.float32),
+        **_hover_data(patch),
+        hovertemplate="x %{x:.2f} m, y %{y:.2f} m, z %{z:.3f} m" + _hover_value(layer),
+        lighting=_FLAT,
+        lightposition={"x": -1000, "y": 1000, "z": 2000},
+        contours={axis: {"highlight": False} for axis in "xyz"},
+        **_scale(colour, layer),
+    )
+
+
+def _heatmap(patch: Patch, layer: Layer) -> go.Heatmap:
+    colour = hillshade(patch) if layer.key == "rock" else patch.value
+    scale = _scale(colour, layer)
+    limits = {"zmin": scale.pop("cmin"), "zmax": scale.pop("cmax")}
+    return go.Heatmap(
+        x=patch.x,
+        y=patch.y,
+        z=colour.astype(np.float32),
+        **_hover_data(patch),
+        hovertemplate="x %{x:.2f} m, y %{y:.2f} m" + _hover_value(layer),
+        **{**scale, "showscale": False},
+        **limits,
+    )
+
+
+def _hover_data(patch: Patch) -> dict[str, Any]:
+    """Value and block of each cell, for its label."""
+    names = {0: ""} | {int(number): f"<br>block {number}" for number in np.unique(patch.label) if number}
+    return {
+        "customdata": patch.value.astype(np.float32),
+        "text": [[names[number] for number in row] for row in patch.label.tolist()],
+    }
+
+
+def _hover_value(layer: Layer) -> str:
+    digits = 1 if layer.unit == "mm" else 3
+    value = "" if layer.key == "rock" else f"<br><b>{layer.label}: %{{customdata:.{digits}f}} {layer.unit}</b>"
+    return f"{value}%{{text}}<extra></extra>"
+
+
+def _scale(colour: NDArray[np.floating], layer: Layer) -> dict[str, Any]:
+    """Colour scale and limits, with the bar's title."""
+    if layer.key == "rock":
+        return {"colorscale": _GREYS, "cmin": -0.1, "cmax": 1.0, "showscale": False}
+    if layer.diverging and layer.limit is not None:
+        low, high, colours = -layer.limit, layer.limit, list(reversed(diverging.RdBu))
+    else:
+        known = colour[np.isfinite(colour)]
+        low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
+        colours = sequential.Viridis
+    bar = {"title": {"text": f"{layer.label}, {layer.unit}", "side": "right"}, "thickness": 14, "len": 0.7}
+    return {"colorscale": colours, "cmin": float(low), "cmax": float(high), "colorbar": bar}
+
+
+def hillshade(patch: Patch) -> NDArray[np.floating]:
+    """The patch lit from the upper left, as the reports' hillshades are."""
+    if min(patch.height.shape) < 2:
+        return np.ones_like(patch.height)
+    down, right = np.gradient(patch.height, -patch.y, patch.x)
+    slope = np.sqrt(1 + right**2 + down**2)
+    return np.asarray((-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / slope)
+
+
+def _cloud(points: Points, layer: Layer, *, coloured_alone: bool) -> go.Scatter3d:
+    """The measured points; what is known of each stands in its label."""
+    facts = {name.replace("_", " "): channel for name, channel in list(points.facts.items())[:_FACTS_SHOWN]}
+    if points.value is not None:
+        facts = {f"{layer.label}, {layer.unit}": np.round(points.value, 2), **facts}
+    known = np.array([channel.astype(object) for channel in facts.values()]).T if facts else None
+    lines = [f"<br>{name}: %{{customdata[{number}]}}" for number, name in enumerate(facts)]
+    marker: dict[str, Any] = {"size": 2, "color": _PLAIN}
+    if points.value is not None:
+        scale = _scale(points.value, layer)
+        marker |= {"color": points.value.astype(np.float32), **scale, "showscale": coloured_alone}
+        marker["colorbar"] = scale["colorbar"]
+    x, y, z = points.points.T
+    return go.Scatter3d(
+        x=x.astype(np.float32),
+        y=y.astype(np.float32),
+        z=z.astype(np.float32),
+        mode="markers",
+        marker=marker,
+        customdata=known,
+        hovertemplate="measured point<br>x %{x:.3f} m, y %{y:.3f} m, z %{z:.3f} m" + "".join(lines) + "<extra></extra>",
+    )
+
+
+def _overlaps(item: Item, patch: Patch) -> bool:
+    x0, x1, y0, y1 = item.box[:4]
+    left, right, low, high = _extent(patch)
+    return x1 >= left and x0 <= right and y1 >= low and y0 <= high
+
+
+def _with_depth(item: Item, patch: Patch) -> tuple[float, ...]:
+    """The item's box, with the surface's heights there where it has none of its own."""
+    x0, x1, y0, y1, z0, _ = item.box
+    if np.isfinite(z0):
+        return item.box
+    columns, rows = (patch.x >= x0) & (patch.x <= x1), (patch.y >= y0) & (patch.y <= y1)
+    near = patch.height[np.ix_(rows, columns)]
+    known = near[np.isfinite(near)]
+    whole = patch.height[np.isfinite(patch.height)]
+    known = known if known.size else (np.array([np.median(whole)]) if whole.size else np.zeros(1))
+    return x0, x1, y0, y1, float(known.min()), float(known.max())
+
+
+def _wires(boxes: Sequence[Sequence[float]], colour: str, width: int, dash: str = "solid") -> go.Scatter3d:
+    """The edges of boxes, as one trace."""
+    x: list[float | None] = []
+    y: list[float | None] = []
+    z: list[float | None] = []
+    for box in boxes:
+        strokes = [[(box[i], box[j], box[k]) for i, j, k in _EDGES]]
+        strokes += [[(box[i], box[j], box[4]), (box[i], box[j], box[5])] for i, j in _POSTS]
+        for stroke in strokes:
+            for into, values in zip((x, y, z), zip(*stroke, strict=True), strict=True):
+                into.extend([*values, None])
+    return go.Scatter3d(x=x, y=y, z=z, mode="lines", line={"color": colour, "width": width, "dash": dash}, hoverinfo="skip")
+
+
+def _handles(chosen: Sequence[tuple[int, Item]], boxes: Sequence[Sequence[float]], kind: str) -> go.Scatter3d:
+    """A marker in front of each item, to point at and click on; its custom datum is the item's number."""
+    return go.Scatter3d(
+        x=[(box[0] + box[1]) / 2 for box in boxes],
+        y=[(box[2] + box[3]) / 2 for box in boxes],
+        z=[box[5] for box in boxes],
+        mode="markers",
+        marker={"size": 5, "color": _COLOURS[kind], "line": {"color": "white", "width": 1}},
+        **_labels(chosen),
+    )
+
+
+def _map_handles(chosen: Sequence[tuple[int, Item]], kind: str) -> go.Scatter:
+    return go.Scatter(
+        x=[(item.box[0] + item.box[1]) / 2 for _, item in chosen],
+        y=[(item.box[2] + item.box[3]) / 2 for _, item in chosen],
+        mode="markers",
+        marker={"size": 6, "color": _COLOURS[kind], "line": {"color": "white", "width": 1}},
+        name=kind,
+        **_labels(chosen),
+    )
+
+
+def _labels(chosen: Sequence[tuple[int, Item]]) -> dict[str, Any]:
+    text = [
+        "<br>".join([f"<b>{item.name}</b>", *(f"{name}: {value}" for name, value in item.facts.items())]) for _, item in chosen
+    ]
+    return {"customdata": [[number] for number, _ in chosen], "text": text, "hovertemplate": "%{text}<extra></extra>"}
+
+
+def _outlines(items: Sequence[Item]) -> tuple[list[float | None], list[float | None]]:
+    x: list[float | None] = []
+    y: list[float | None] = []
+    for item in items:
+        x0, x1, y0, y1 = item.box[:4]
+        x += [x0, x1, x1, x0, x0, None]
+        y += [y0, y0, y1, y1, y0, None]
+    return x, y
+
+
+def _extent(patch: Patch) -> Window:
+    return Window(float(patch.x.min()), float(patch.x.max()), float(patch.y.min()), float(patch.y.max()))

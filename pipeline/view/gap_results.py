@@ -1,0 +1,107 @@
+"""The folder of `scarpsim gap` as something to look at: the measured points with their residuals, before and after."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.laz import read_laz
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.view.results import Item, Layer, Patch, Points, Window, inside
+from scene.errors import InputError
+from scene.frame import WallFrame
+from scene.mesh import FloatArray
+
+_MM = 1e3
+_POINTS_PER_CELL = 4
+_FAR_M = 1e6
+_QUANTILE = 0.98
+
+
+class GapResults:
+    """Residuals, measured minus predicted.
+
+    The folder does not say where the sensor stood, so the wall is looked at from the side on which its normal points upwards.
+    """
+
+    step_name = "model"
+    steps = {"before": "before: model as it was", "after": "after: with what was named"}  # noqa: RUF012
+    surfaces = {"surface": "mean of the points"}  # noqa: RUF012
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError where a file of the diagnosis is absent or damaged."""
+        try:
+            self._record = json.loads((folder / "gap.json").read_text(encoding="utf-8"))
+            self.title = f"{folder.name}: {self._record['sensor']}, verdict {self._record['verdict']}"
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"is no gap.json ({error!r})", where=str(folder), remedy="run scarpsim gap again") from None
+        self._clouds = {step: read_laz(folder / f"{step}.laz") for step in self.steps}
+        before = self._clouds["before"].points
+        if len(before) < 3:
+            raise InputError("holds too few points to show", where=str(folder))
+        self._frame = _frame(before)
+        self._local = {step: self._frame.to_wall(cloud.points) for step, cloud in self._clouds.items()}
+        self._limit = float(np.quantile(np.abs(_residual(self._clouds["before"])), _QUANTILE)) or 1.0
+        self._cells = lru_cache(8)(self._binned)
+
+    def layers(self, step: str) -> list[Layer]:
+        return [Layer("residual", "measured minus predicted", "mm", _MM, diverging=True, limit=self._limit)]
+
+    def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
+        return self._cells(step, window, budget)
+
+    def points(self, step: str, layer: Layer, window: Window | None, budget: int) -> Points | None:
+        shown = np.flatnonzero(inside(self._local[step], window))
+        shown = shown[:: max(1, int(np.ceil(len(shown) / budget)))]
+        cloud = self._clouds[step]
+        held_out = np.where(cloud.extra["held_out"][shown] > 0, "yes", "no")
+        world = {f"world {axis}": column for axis, column in zip("xyz", cloud.points[shown].T, strict=True)}
+        return Points(
+            self._local[step][shown], _residual(cloud)[shown], {"held out": held_out, **world}, len(shown) / len(cloud.points)
+        )
+
+    def items(self, step: str) -> list[Item]:
+        return [self._change(number, each) for number, each in enumerate(self._record.get("scene_changes", []), start=1)]
+
+    def _change(self, number: int, change: dict[str, Any]) -> Item:
+        low, high = np.array(change["bbox_m"]).reshape(2, 3)
+        corners = np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3)
+        local = self._frame.to_wall(corners)
+        (x0, y0, z0), (x1, y1, z1) = local.min(axis=0), local.max(axis=0)
+        facts = {"volume": f"{change['volume_m3']:.4g} m³"}
+        return Item("scene change", f"scene change {number}", (x0, x1, y0, y1, z0, z1), facts)
+
+    def _binned(self, step: str, window: Window | None, budget: int) -> Patch:
+        """Means of residual and height over cells of about four points."""
+        chosen = inside(self._local[step], window)
+        points, residual = self._local[step][chosen], _residual(self._clouds[step])[chosen]
+        if not len(points):
+            empty = np.full((1, 1), np.nan)
+            at = window or Window(0, 1, 0, 1)
+            return Patch(np.array([(at.x0 + at.x1) / 2]), np.array([(at.y0 + at.y1) / 2]), empty, empty, np.zeros((1, 1), int), 1)
+        low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+        cells = min(budget, max(len(points) / _POINTS_PER_CELL, 1))
+        side = float(np.sqrt(max(np.prod(high - low), 1e-12) / cells))
+        width, height = (int(np.ceil(extent / side)) or 1 for extent in high - low)
+        column = np.clip(((points[:, 0] - low[0]) / side).astype(int), 0, width - 1)
+        row = np.clip(((high[1] - points[:, 1]) / side).astype(int), 0, height - 1)
+        place, size = row * width + column, width * height
+        count = np.bincount(place, minlength=size)
+        with np.errstate(invalid="ignore"):
+            z, mean = (np.bincount(place, each, size) / count for each in (points[:, 2], residual))
+        x, y = low[0] + (np.arange(width) + 0.5) * side, high[1] - (np.arange(height) + 0.5) * side
+        shape = height, width
+        return Patch(x, y, z.reshape(shape), mean.reshape(shape), np.zeros(shape, int), 1)
+
+
+def _residual(cloud: PointCloud) -> FloatArray:
+    return cloud.extra["residual_m"].astype(np.float64) * _MM
+
+
+def _frame(points: FloatArray) -> WallFrame:
+    above = points.mean(axis=0) + np.array([0.0, 0.0, _FAR_M])
+    return WallFrame.fit(points, above)

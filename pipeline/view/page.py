@@ -1,0 +1,180 @@
+"""The page's parts and what happens when they are used."""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import Any
+
+import dash
+from dash import Input, Output, State, ctx, dcc, html, no_update
+
+from pipeline.view.figures import ITEM_TRACES, map_figure, wall_figure
+from pipeline.view.results import Item, Layer, Results, Window
+
+CELLS, POINTS = 60_000, 40_000
+"""What a window is thinned to: it turns smoothly on a laptop without a graphics card."""
+_GRAPH: Any = {"displaylogo": False, "scrollZoom": True, "modeBarButtonsToRemove": ["sendDataToCloud", "select2d", "lasso2d"]}
+
+
+def layout(results: Results) -> html.Div:
+    """Controls at the left, the wall in 3D, the map and what is known of the thing that was clicked on."""
+    first, surface = next(iter(results.steps)), next(iter(results.surfaces))
+    shown = ["surface", *ITEM_TRACES]
+    controls = [
+        _control(results.step_name, dcc.Dropdown(_options(results.steps), first, id="step", clearable=False)),
+        _control("colour", dcc.Dropdown([], None, id="layer", clearable=False)),
+        _control("surface", dcc.Dropdown(_options(results.surfaces), surface, id="surface", clearable=False)),
+        _control("show", dcc.Checklist(["surface", "points", *_kinds(results)], shown, id="shown")),
+        _control("look at", dcc.Dropdown([], None, id="item", placeholder="block, detection, ...")),
+        html.Div([html.Button("previous", id="previous"), html.Button("next", id="next"), html.Button("whole wall", id="whole")]),
+        html.Div(id="facts"),
+        html.P(id="note", className="note"),
+    ]
+    return html.Div(
+        [
+            html.H1(results.title),
+            html.Div(
+                [
+                    html.Div(controls, className="controls"),
+                    html.Div(
+                        [
+                            dcc.Graph(id="wall", config=_GRAPH, className="wall", responsive=True),
+                            dcc.Graph(id="map", config=_GRAPH, className="map", responsive=True),
+                        ],
+                        className="pictures",
+                    ),
+                ],
+                className="columns",
+            ),
+            dcc.Store(id="window"),
+        ]
+    )
+
+
+def register_callbacks(app: dash.Dash, results: Results, lock: Lock) -> None:
+    """Connect the page's parts; `lock` lets one request at a time compute."""
+
+    @app.callback(Output("layer", "options"), Output("layer", "value"), Input("step", "value"), State("layer", "value"))
+    def offer_layers(step: str, chosen: str | None) -> tuple[list[dict[str, str]], str]:
+        keys = {layer.key: layer.label for layer in results.layers(step)}
+        return _options(keys), chosen if chosen in keys else next(iter(keys))
+
+    @app.callback(Output("item", "options"), Input("step", "value"))
+    def offer_items(step: str) -> list[dict[str, Any]]:
+        with lock:
+            return [{"label": item.name, "value": number} for number, item in enumerate(results.items(step))]
+
+    @app.callback(
+        Output("item", "value"),
+        Input("previous", "n_clicks"),
+        Input("next", "n_clicks"),
+        Input("wall", "clickData"),
+        Input("map", "clickData"),
+        Input("step", "value"),
+        State("item", "value"),
+        State("item", "options"),
+        prevent_initial_call=True,
+    )
+    def choose(_back: Any, _on: Any, wall: Any, flat: Any, _step: str, now: int | None, options: list[Any]) -> Any:
+        if ctx.triggered_id == "step" or not options:
+            return None
+        if ctx.triggered_id in ("wall", "map"):
+            number = clicked(wall if ctx.triggered_id == "wall" else flat)
+            return no_update if number is None else number
+        move = 1 if ctx.triggered_id == "next" else -1
+        return (now + move) % len(options) if now is not None else (0 if move > 0 else len(options) - 1)
+
+    @app.callback(
+        Output("window", "data"),
+        Output("facts", "children"),
+        Input("item", "value"),
+        Input("whole", "n_clicks"),
+        Input("map", "relayoutData"),
+        State("step", "value"),
+        State("window", "data"),
+        prevent_initial_call=True,
+    )
+    def move(number: int | None, _whole: Any, zoomed: Any, step: str, now: Any) -> Any:
+        if ctx.triggered_id == "whole":
+            return None, no_update
+        if ctx.triggered_id == "map":
+            return zoom(zoomed, now), no_update
+        with lock:
+            items = results.items(step)
+        if number is None or number >= len(items):
+            return no_update, None
+        return list(items[number].window()), facts_table(items[number])
+
+    @app.callback(
+        Output("wall", "figure"),
+        Output("map", "figure"),
+        Output("note", "children"),
+        Input("step", "value"),
+        Input("layer", "value"),
+        Input("surface", "value"),
+        Input("shown", "value"),
+        Input("item", "value"),
+        Input("window", "data"),
+    )
+    def draw(step: str, key: str | None, surface: str, shown: list[str], number: int | None, window: Any) -> Any:
+        layers = {layer.key: layer for layer in results.layers(step)}
+        if key not in layers:
+            return no_update, no_update, no_update
+        with lock:
+            return pictures(results, step, surface, layers[key], shown, number, Window(*window) if window else None)
+
+
+def pictures(
+    results: Results, step: str, surface: str, layer: Layer, shown: list[str], number: int | None, window: Window | None
+) -> tuple[Any, Any, str]:
+    """Both pictures of a window, and what is to be known about them."""
+    patch = results.patch(step, surface, layer, window, CELLS)
+    points = results.points(step, layer, window, POINTS) if "points" in shown else None
+    items = results.items(step)
+    flat = map_figure(patch, items, layer, shown, window, number)
+    cells = (
+        f"a cell shows the mean of {patch.pooled} x {patch.pooled} pixels; zoom the map to see each" if patch.pooled > 1 else ""
+    )
+    thinned = f"{len(points.points):,} points are shown, {points.share:.2%} of all" if points is not None else ""
+    outside = "where there is no data the map is grey and the wall open"
+    note = ". ".join(part[0].upper() + part[1:] for part in (cells, thinned, outside) if part) + "."
+    return wall_figure(patch, points, items, layer, shown, number), flat, note
+
+
+def clicked(data: Any) -> int | None:
+    """The number of the item that a click was on; None for a click on the wall itself."""
+    point = (data or {}).get("points", [{}])[0]
+    known = point.get("customdata")
+    return int(known[0]) if isinstance(known, list) and len(known) == 1 and "text" in point else None
+
+
+def zoom(change: Any, now: Any) -> Any:
+    """The window after the map was zoomed or moved: its ranges; None for the whole wall."""
+    change = change or {}
+    if change.get("xaxis.autorange") or change.get("yaxis.autorange"):
+        return None
+    keys = [f"{axis}.range[{end}]" for axis in ("xaxis", "yaxis") for end in (0, 1)]
+    if not all(key in change for key in keys):
+        return no_update
+    window = [float(change[key]) for key in keys]
+    return no_update if window == now else window
+
+
+def facts_table(item: Item) -> html.Div:
+    """What is known of an item."""
+    rows = [html.Tr([html.Th(name), html.Td(value)]) for name, value in item.facts.items()]
+    return html.Div([html.H2(item.name), html.Table(html.Tbody(rows))])
+
+
+def _kinds(results: Results) -> list[str]:
+    """The kinds of things that any of the first steps holds."""
+    found = {item.kind for step in list(results.steps)[:20] for item in results.items(step)}
+    return [kind for kind in ITEM_TRACES if kind in found]
+
+
+def _control(name: str, part: Any) -> html.Label:
+    return html.Label([html.Span(name), part])
+
+
+def _options(choices: Any) -> list[dict[str, str]]:
+    return [{"label": label, "value": key} for key, label in choices.items()]

@@ -1,0 +1,150 @@
+"""A run folder as something to look at."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.difference import SurfaceRaster, surface_raster
+from pipeline.formats.geotiff import read_geotiff
+from pipeline.formats.laz import read_laz
+from pipeline.formats.ply import read_ply
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.products import epoch_folder
+from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
+from pipeline.view.results import Item, Layer, Patch, Points, Window, centres, cut, inside
+from scene.errors import InputError
+from scene.grid import Grid
+
+_MM = 1e3
+_ROCK, _HEIGHT = Layer("rock", "rock (shaded)", ""), Layer("height", "relief", "m")
+
+
+class RunResults:
+    """The folder of `simulate`, with the detections in the folder `detections` where one is given."""
+
+    step_name = "epoch"
+
+    def __init__(self, folder: Path, detections: Path | None = None) -> None:
+        """Raises InputError where run.json is damaged, no epoch is finished, or the detections are of other maps."""
+        self.folder = folder
+        try:
+            record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+            self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
+            self.title = f"{folder.name}: {record['sensor']}, {record['wall']['name']}"
+        except (ValueError, KeyError, TypeError) as error:
+            problem = f"is not the record of a finished run ({error!r})"
+            raise InputError(problem, where=str(folder / "run.json"), remedy="go on with it by simulate --resume") from None
+        if not self._epochs:
+            raise InputError("holds no finished epoch", where=str(folder), remedy="go on with it by simulate --resume")
+        self.steps = {key: f"epoch {key}" for key in self._epochs}
+        self.surfaces = {"surface": "as measured", "reference": "reference, as measured", "truth": "as it really is"}
+        self._found = _detections(detections) if detections else {}
+        if detections and not set(self._found) & set(self.steps):
+            allowed = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
+            raise InputError("holds no detections of this run's maps", where=str(detections), allowed=allowed)
+        self._map = lru_cache(4)(read_geotiff)
+        self._heights = lru_cache(3)(self._raster_of)
+        self._cloud = lru_cache(1)(read_laz)
+
+    def layers(self, step: str) -> list[Layer]:
+        limit = SCALE_SIGMAS * self._epochs[step]["statistics"]["sigma_m"] * _MM
+        maps = [Layer("difference", "reference minus epoch", "mm", _MM, diverging=True, limit=limit)]
+        if self._map_path("m3c2", step).exists():
+            maps.append(Layer("m3c2", "M3C2 distance", "mm", _MM, diverging=True, limit=limit))
+        return [*maps, _ROCK, _HEIGHT]
+
+    def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
+        grid = self._map(self._map_path("difference", step))[1]
+        raster = self._heights(self._surface_path(step, surface), grid)
+        rows, columns, factor = cut(grid, window, budget)
+        height = mean_pooled(raster.heights[rows, columns], factor)
+        value = self._values(step, layer, rows, columns, factor, height)
+        label = self._heights(self._surface_path(step, "surface"), grid).block[rows, columns]
+        middle = label[factor // 2 :: factor, factor // 2 :: factor][: height.shape[0], : height.shape[1]]
+        return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
+
+    def points(self, step: str, layer: Layer, window: Window | None, budget: int) -> Points | None:
+        path = epoch_folder(self.folder, int(step)) / "points.laz"
+        if not path.exists():
+            return None
+        cloud = self._cloud(path)
+        shown = _thinned(np.flatnonzero(inside(cloud.points, window)), budget)
+        facts = {name: channel[shown] for name, channel in _channels(cloud).items()}
+        return Points(cloud.points[shown], None, facts, len(shown) / max(len(cloud.points), 1))
+
+    def items(self, step: str) -> list[Item]:
+        blocks = [_block(each) for each in self._epochs[step]["blocks"]]
+        return blocks + self._found.get(step, [])
+
+    def _values(
+        self, step: str, layer: Layer, rows: slice, columns: slice, factor: int, height: NDArray[np.floating]
+    ) -> NDArray[np.floating]:
+        if layer.key in ("rock", "height"):
+            return height
+        return mean_pooled(self._map(self._map_path(layer.key, step))[0][rows, columns], factor) * layer.factor
+
+    def _map_path(self, name: str, step: str) -> Path:
+        return self.folder / f"{name}_{int(step):03d}.tif"
+
+    def _surface_path(self, step: str, surface: str) -> Path:
+        number = 0 if surface == "reference" else int(step)
+        return epoch_folder(self.folder, number) / ("truth.ply" if surface == "truth" else "surface.ply")
+
+    def _raster_of(self, path: Path, grid: Grid) -> SurfaceRaster:
+        return surface_raster(read_ply(path), grid)
+
+
+def _channels(cloud: PointCloud) -> dict[str, NDArray[Any]]:
+    known = {} if cloud.intensity is None else {"intensity": cloud.intensity}
+    return known | dict(cloud.extra)
+
+
+def _thinned(index: NDArray[np.integer], budget: int) -> NDArray[np.integer]:
+    """Every k-th of the indices, so that at most `budget` are left."""
+    return index[:: max(1, int(np.ceil(len(index) / budget)))]
+
+
+def _block(block: dict[str, Any]) -> Item:
+    x0, y0, z0, x1, y1, z1 = block["bbox_m"]
+    facts = {
+        "shape": block["shape"],
+        "size": " x ".join(f"{side:.2f}" for side in block["size_m"]) + " m",
+        "volume": f"{block['volume_m3']:.4g} m³",
+        "measured volume": f"{block['measured_volume_m3']:.4g} m³" if block["measured_area_m2"] else "not seen",
+        "measured depth": f"{block['measured_mean_depth_m'] * _MM:.0f} mm" if block["measured_area_m2"] else "not seen",
+        "position": ", ".join(f"{value:.2f}" for value in block["position_m"]) + " m",
+    }
+    return Item("block", f"block {block['label']}", (x0, x1, y0, y1, z0, z1), facts)
+
+
+def _detections(folder: Path) -> dict[str, list[Item]]:
+    """The events of `scarpsim detect` at its lowest confidence, by epoch."""
+    tables = sorted(folder.glob("events_*.csv"), key=lambda path: float(path.stem.removeprefix("events_")))
+    if not tables:
+        raise InputError("holds no events_*.csv", where=str(folder), remedy="give the folder that scarpsim detect filled")
+    found: dict[str, list[Item]] = {}
+    with tables[0].open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            number = re.search(r"difference_(\d+)", row["image"])
+            if number:
+                found.setdefault(str(int(number[1])), []).append(_detection(row))
+    return found
+
+
+def _detection(row: dict[str, str]) -> Item:
+    x, y, width, height = (float(row[name]) for name in ("x_m", "y_m", "width_m", "height_m"))
+    facts = {
+        "score": f"{float(row['score']):.3f}",
+        "volume": f"{float(row['volume_m3']):.4g} m³",
+        "largest depth": f"{float(row['depth_m']) * _MM:.0f} mm",
+    }
+    box = (x - width / 2, x + width / 2, y - height / 2, y + height / 2, np.nan, np.nan)
+    return Item("detection", f"detection {row['number']}", box, facts)

@@ -1,0 +1,90 @@
+"""The local page of `scarpsim view`: Dash serves it, with its scripts, to this machine alone; nothing is fetched."""
+
+from __future__ import annotations
+
+import threading
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import dash
+import flask
+from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
+
+from pipeline.view.gap_results import GapResults
+from pipeline.view.page import layout, register_callbacks
+from pipeline.view.results import Results
+from pipeline.view.run_results import RunResults
+from pipeline.view.tile_results import TileResults
+from scene.errors import InputError
+
+HOST = "127.0.0.1"
+_OWN_NAMES = {"127.0.0.1", "localhost"}
+
+
+def open_results(folder: Path, detections: Path | None = None) -> Results:
+    """What lies in a folder, told by its files; raises InputError where it is none of those that can be looked at."""
+    if not folder.is_dir():
+        raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
+    if (folder / "run.json").exists():
+        return RunResults(folder, detections)
+    if detections:
+        raise InputError("belong to a run", where="--detections", remedy="leave it out, or give the run's folder")
+    if (folder / "gap.json").exists():
+        return GapResults(folder)
+    if (folder / "annotations.json").exists():
+        return TileResults(folder)
+    allowed = "a run (run.json), a result of scarpsim gap (gap.json), a split of a data set (annotations.json)"
+    raise InputError("holds nothing to look at", where=str(folder), allowed=allowed)
+
+
+def make_app(results: Results) -> dash.Dash:
+    """The page on `results`."""
+    app = dash.Dash(
+        __name__,
+        serve_locally=True,
+        title=f"scarpsim: {results.title}",
+        update_title="",
+        assets_folder=str(Path(__file__).parent / "assets"),
+    )
+    app.layout = layout(results)
+    register_callbacks(app, results, threading.Lock())
+    app.server.before_request(_refuse_other_names)
+    return app
+
+
+def make_page_server(results: Results, port: int) -> BaseWSGIServer:
+    """The page's server at `port` (0: any that is free); raises InputError where the port is taken."""
+    try:
+        return make_server(HOST, port, make_app(results).server, threaded=True, request_handler=_Silent)
+    except (OSError, SystemExit, OverflowError):
+        remedy = "choose another, or 0 for any that is free"
+        raise InputError(f"port {port} cannot be used", where="--port", remedy=remedy) from None
+
+
+def serve(folder: Path, detections: Path | None, port: int, *, open_browser: bool) -> None:
+    """Show a folder until interrupted."""
+    server = make_page_server(open_results(folder, detections), port)
+    address = f"http://{HOST}:{server.server_port}/"
+    print(f"{address} shows {folder}; Ctrl-C ends it", flush=True)  # noqa: T201  (what the command is asked for)
+    if open_browser:
+        webbrowser.open(address)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        return
+    finally:
+        server.server_close()
+
+
+def _refuse_other_names() -> Any:
+    """A page elsewhere that reaches this one under a name of its own gets nothing."""
+    name = flask.request.host.rpartition(":")[0] or flask.request.host
+    return None if name in _OWN_NAMES else flask.abort(403)
+
+
+class _Silent(WSGIRequestHandler):
+    """Writes no line for each request."""
+
+    def log(self, type: str, message: str, *args: Any) -> None:
+        """Nothing."""

@@ -1,0 +1,65 @@
+"""A split of a data set as something to look at: tile by tile, the differences themselves as relief."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.detect.data import CocoFolder
+from pipeline.formats.geotiff import read_geotiff
+from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
+from pipeline.view.results import Item, Layer, Patch, Points, Window, centres, cut
+
+_MM = 1e3
+_SIGMA_M = 0.01
+"""Of the colours, where a tile does not say its own noise."""
+
+
+class TileResults:
+    """A folder with annotations.json and the difference maps that it names."""
+
+    step_name = "tile"
+    surfaces = {"relief": "difference, as relief (rock that is missing lies deep)"}  # noqa: RUF012
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError where annotations.json cannot be used."""
+        self.folder, self._coco = folder, CocoFolder(folder)
+        self.title = f"{folder.parent.name}/{folder.name}: {len(self._coco)} tiles"
+        self._images = {str(image["id"]): image for image in self._coco.images}
+        self.steps = {key: str(image["file_name"]) for key, image in self._images.items()}
+        self._map = lru_cache(8)(read_geotiff)
+
+    def layers(self, step: str) -> list[Layer]:
+        sigma = self._images[step].get("noise_sigma_m", _SIGMA_M)
+        return [Layer("difference", "reference minus epoch", "mm", _MM, diverging=True, limit=SCALE_SIGMAS * sigma * _MM)]
+
+    def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
+        values, grid = self._map(self.folder / self.steps[step])
+        rows, columns, factor = cut(grid, window, budget)
+        shown = mean_pooled(values[rows, columns], factor)
+        return Patch(*centres(grid, rows, columns, factor), -shown, shown * _MM, np.zeros(shown.shape, int), factor)
+
+    def points(self, step: str, layer: Layer, window: Window | None, budget: int) -> Points | None:
+        return None
+
+    def items(self, step: str) -> list[Item]:
+        grid = self._map(self.folder / self.steps[step])[1]
+        found = [each for each in self._coco.annotations if each["image_id"] == self._images[step]["id"]]
+        return [_block(each, grid.x_min, grid.y_max, grid.gsd) for each in found]
+
+
+def _block(annotation: dict[str, Any], x_min: float, y_max: float, gsd: float) -> Item:
+    column, row, width, height = annotation["bbox"]
+    x0, y1 = x_min + column * gsd, y_max - row * gsd
+    known = {"volume_m3": "m³", "measured_volume_m3": "m³", "depth_m": "m", "share_in_tile": ""}
+    facts = {
+        key.removesuffix("_m3").removesuffix("_m").replace("_", " "): f"{annotation[key]:.4g} {unit}".strip()
+        for key, unit in known.items()
+        if annotation.get(key) is not None
+    }
+    facts |= {"shape": annotation["shape"]} if "shape" in annotation else {}
+    box = (x0, x0 + width * gsd, y1 - height * gsd, y1, np.nan, np.nan)
+    return Item("block", f"block {annotation.get('block', annotation['id'])}", box, facts)

@@ -1,0 +1,294 @@
+"""`scarpsim view`: the numbers on the page are those of the files, the page needs no network, and a browser draws it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.annotate import BLOCK_CATEGORY
+from pipeline.config import SimulationConfig
+from pipeline.difference import surface_raster
+from pipeline.formats.atomic import write_json, write_text
+from pipeline.formats.geotiff import read_geotiff, write_geotiff
+from pipeline.formats.laz import read_laz, write_laz
+from pipeline.formats.ply import read_ply
+from pipeline.run import simulate
+from pipeline.view.figures import map_figure, wall_figure
+from pipeline.view.page import clicked, zoom
+from pipeline.view.results import Item, Layer, Patch, Window, cut
+from pipeline.view.server import make_page_server, open_results
+from scene.config import parse
+from scene.errors import InputError
+from scene.grid import Grid
+
+SMALL: dict[str, Any] = {
+    "seed": 3,
+    "epochs": 2,
+    "icp": None,
+    "wall": {"style": "glendale", "width_m": 8.0, "height_m": 5.0, "resolution_m": 0.05, "seed": 1},
+    "rockfall": {"count": 5, "size_m": {"kind": "gaussian", "mean": 0.5, "sigma": 0.05, "minimum": 0.3}},
+    "station": {"distance_m": 20.0},
+    "scanner": {"azimuth_step_rad": 0.0015, "zenith_step_rad": 0.0015},
+    "difference": {"gsd_m": 0.03},
+}
+MANY = 10**9
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+OUTSIDE = re.compile(r"""(?:src|href)=["'](?:https?:)?//""")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("view") / "run"
+    simulate(parse(SimulationConfig, SMALL, "test"), "tls", out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def gap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A diagnosis as scarpsim gap writes it: a plane that leans back at 70 degrees, in survey coordinates, with residuals."""
+    out = tmp_path_factory.mktemp("gap") / "gap"
+    x, up = np.meshgrid(np.linspace(0, 20, 101), np.linspace(0, 10, 51))
+    lean = np.deg2rad(70)
+    points = np.stack([x.ravel() + 5e5, 4e6 + up.ravel() * np.cos(lean), 300 + up.ravel() * np.sin(lean)], axis=1)
+    for name, factor in (("before", 1e-3), ("after", 1e-4)):
+        extra = {"residual_m": factor * x.ravel(), "held_out": (x.ravel() > 10).astype(np.uint8)}
+        write_laz(out / f"{name}.laz", points, extra=extra)
+    change = {"bbox_m": [*points[0], *(points[0] + 1)], "volume_m3": 0.12}
+    write_json(out / "gap.json", {"schema": 1, "sensor": "tls", "verdict": "named", "scene_changes": [change]})
+    return out
+
+
+@pytest.fixture(scope="module")
+def tiles(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("set") / "test"
+    values = np.arange(12.0, dtype=np.float32).reshape(3, 4) / 1e3
+    write_geotiff(out / "one.tif", values, Grid(1.0, 5.0, 0.5, 4, 3))
+    image = {"id": 7, "file_name": "one.tif", "width": 4, "height": 3, "noise_sigma_m": 0.002}
+    block = {"id": 1, "image_id": 7, "category_id": 1, "bbox": [1, 0, 2, 1], "block": 5, "volume_m3": 0.25, "shape": "cube"}
+    write_json(out / "annotations.json", {"images": [image], "annotations": [block], "categories": [BLOCK_CATEGORY]})
+    return out
+
+
+def test_a_run_shows_the_values_of_its_files(run: Path) -> None:
+    results = open_results(run)
+    assert list(results.steps) == ["1", "2"]
+    layer = results.layers("2")[0]
+    patch = results.patch("2", "surface", layer, None, MANY)
+    difference, grid = read_geotiff(run / "difference_002.tif")
+    surface = surface_raster(read_ply(run / "epoch_002/surface.ply"), grid)
+    np.testing.assert_allclose(patch.value, difference * 1e3, rtol=1e-6)
+    np.testing.assert_array_equal(patch.height, surface.heights)
+    np.testing.assert_array_equal(patch.label, surface.block)
+    assert (patch.x[0], patch.y[0]) == (grid.x_min + grid.gsd / 2, grid.y_max - grid.gsd / 2)
+    blocks = json.loads((run / "epoch_002/blocks.json").read_text())
+    assert [item.name for item in results.items("2")] == [f"block {block['label']}" for block in blocks]
+
+
+def test_other_surfaces_and_layers(run: Path) -> None:
+    results = open_results(run)
+    layers = {layer.key: layer for layer in results.layers("1")}
+    assert list(layers) == ["difference", "rock", "height"]
+    reference = results.patch("1", "reference", layers["height"], None, MANY)
+    epoch = results.patch("1", "surface", layers["difference"], None, MANY)
+    np.testing.assert_allclose((reference.height - epoch.height) * 1e3, epoch.value, atol=1e-3)  # mm, float32
+    truth = results.patch("1", "truth", layers["height"], None, MANY)
+    assert np.nanmedian(np.abs(truth.height - epoch.height)) < 0.01  # m; noise of 3 mm, registration
+
+
+def test_a_window_is_thinned_to_the_budget_by_means(run: Path) -> None:
+    results, window = open_results(run), Window(2.0, 4.0, 1.0, 3.0)
+    layer = results.layers("1")[0]
+    fine, coarse = (results.patch("1", "surface", layer, window, budget) for budget in (MANY, 300))
+    assert fine.pooled == 1
+    assert coarse.value.size <= 300 < fine.value.size
+    assert (fine.x.min() >= 2.0 - 0.03, fine.x.max() <= 4.03, fine.y.min() >= 0.97, fine.y.max() <= 3.03) == (True,) * 4
+    k = coarse.pooled
+    cell = fine.value[:k, :k]
+    assert coarse.value[0, 0] == pytest.approx(np.nanmean(cell), abs=1e-3)
+
+
+def test_the_points_of_a_run(run: Path) -> None:
+    results = open_results(run)
+    cloud = read_laz(run / "epoch_001/points.laz")
+    points = results.points("1", results.layers("1")[0], None, 1000)
+    assert points is not None
+    assert len(points.points) <= 1000
+    assert points.share == pytest.approx(len(points.points) / len(cloud.points))
+    assert {"intensity", "true_range_m", "block"} <= set(points.facts)
+    inside = results.points("1", results.layers("1")[0], Window(2.0, 4.0, 1.0, 3.0), MANY)
+    assert inside is not None
+    assert inside.points[:, :2].min(axis=0) == pytest.approx([2, 1], abs=0.1)
+
+
+def test_detections_lie_where_they_were_found(run: Path, tmp_path: Path) -> None:
+    header = "image,number,x_m,y_m,width_m,height_m,area_m2,depth_m,mean_depth_m,volume_m3,score\n"
+    write_text(tmp_path / "events_0.9.csv", header + "difference_002.tif,1,3.0,2.0,0.4,0.2,0.08,0.3,0.2,0.016,0.97\n")
+    write_text(tmp_path / "events_0.95.csv", header)
+    results = open_results(run, tmp_path)
+    assert [item.kind for item in results.items("1")] == ["block"] * 5
+    (found,) = [item for item in results.items("2") if item.kind == "detection"]
+    assert found.box[:4] == pytest.approx((2.8, 3.2, 1.9, 2.1))
+    assert found.facts["volume"] == "0.016 m³"
+    write_text(tmp_path / "other/events_0.9.csv", header + "difference_009.tif,1,3,2,1,1,1,1,1,1,0.9\n")
+    with pytest.raises(InputError, match="no detections of this run's maps"):
+        open_results(run, tmp_path / "other")
+
+
+def test_a_diagnosis_in_the_wall_s_own_frame(gap: Path) -> None:
+    """The wall is 20 x 10 m in its own plane, x runs along it, and the residual grows with x: 0 to 20 mm."""
+    results = open_results(gap)
+    layer = results.layers("before")[0]
+    assert (layer.diverging, layer.unit) == (True, "mm")
+    patch = results.patch("before", "surface", layer, None, 60_000)
+    assert np.ptp(patch.x) == pytest.approx(20, abs=1)
+    assert np.ptp(patch.y) == pytest.approx(10, abs=1)
+    assert abs(np.nanmean(patch.value) - 10) < 0.1
+    assert np.nanmax(np.abs(patch.height)) < 1e-3
+    points = results.points("after", layer, None, MANY)
+    assert points is not None
+    assert points.value is not None
+    np.testing.assert_allclose(points.value, 0.1 * points.points[:, 0], atol=1e-3)  # x from the wall's left edge: mm of 0.1 mm/m
+    assert set(points.facts["held out"]) == {"yes", "no"}
+    (change,) = results.items("before")
+    assert change.facts == {"volume": "0.12 m³"}
+
+
+def test_a_tile_as_relief(tiles: Path) -> None:
+    results = open_results(tiles)
+    patch = results.patch("7", "relief", results.layers("7")[0], None, MANY)
+    np.testing.assert_allclose(patch.value, np.arange(12.0).reshape(3, 4), rtol=1e-5)
+    np.testing.assert_allclose(patch.height, -patch.value / 1e3, rtol=1e-5)
+    assert results.layers("7")[0].limit == pytest.approx(12.0)
+    (block,) = results.items("7")
+    assert block.box[:4] == pytest.approx((1.5, 2.5, 4.5, 5.0))
+    assert block.facts == {"volume": "0.25 m³", "shape": "cube"}
+
+
+def test_windows_beyond_the_raster_keep_a_pixel() -> None:
+    grid = Grid(0.0, 10.0, 1.0, 20, 10)
+    for window in (Window(-50, -40, 0, 5), Window(30, 40, 20, 30), Window(5.2, 5.3, 5.2, 5.3)):
+        rows, columns, factor = cut(grid, window, 100)
+        assert (rows.stop > rows.start, columns.stop > columns.start, factor) == (True, True, 1)
+    assert cut(grid, None, 2)[2] == 10
+
+
+def patch_of(values: np.ndarray) -> Patch:
+    height, width = values.shape
+    return Patch(
+        np.arange(width, dtype=float), np.arange(height)[::-1].astype(float), 0 * values, values, (values > 5).astype(int), 1
+    )
+
+
+def test_the_figures_are_about_zero_and_name_their_items() -> None:
+    layer = Layer("difference", "reference minus epoch", "mm", 1e3, diverging=True, limit=6.0)
+    block = Item("block", "block 1", (1, 2, 1, 2, -0.1, 0.1), {"volume": "1 m³"})
+    items = [block, Item("detection", "detection 1", (2, 3, 0, 1, np.nan, np.nan))]
+    far = Item("block", "block 9", (90, 92, 1, 2, 0, 1))
+    patch = patch_of(np.arange(20.0).reshape(4, 5))
+    wall = wall_figure(patch, None, [*items, far], layer, ["surface", "block", "detection"], 0)
+    surface = wall.data[0]
+    assert (surface.cmin, surface.cmax) == (-6, 6)
+    assert surface.colorscale[0][1] != surface.colorscale[-1][1]
+    handles = [trace for trace in wall.data[1:] if trace.mode == "markers"]
+    assert [list(map(list, trace.customdata)) for trace in handles] == [[[0]], [[1]]]  # block 9 is not in the window
+    assert handles[0].text[0] == "<b>block 1</b><br>volume: 1 m³"
+    flat = map_figure(patch, items, layer, ["surface"], None)
+    assert [trace.type for trace in flat.data] == ["heatmap"]
+
+
+def test_clicks_and_zooms() -> None:
+    assert clicked({"points": [{"customdata": [3], "text": "block"}]}) == 3
+    assert clicked({"points": [{"customdata": 3.5, "text": ""}]}) is None
+    assert clicked(None) is None
+    ranges = {"xaxis.range[0]": 1, "xaxis.range[1]": 2, "yaxis.range[0]": 3, "yaxis.range[1]": 4}
+    assert zoom(ranges, None) == [1, 2, 3, 4]
+    assert zoom({"xaxis.autorange": True}, [1, 2, 3, 4]) is None
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda _: Path("/nowhere"), "there is no such folder"),
+        (lambda folder: folder, "holds nothing to look at"),
+        (lambda folder: _written(folder, "run.json", "{"), "is not the record of a finished run"),
+        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "complete": false}'), "not the record of a finished run"),
+        (lambda folder: _written(folder, "gap.json", "[]"), "is no gap.json"),
+        (lambda folder: _written(folder, "annotations.json", "{}"), "is no COCO annotation file"),
+    ],
+)
+def test_other_folders_are_told(make: Any, expected: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=expected):
+        open_results(make(tmp_path))
+
+
+def _written(folder: Path, name: str, text: str) -> Path:
+    (folder / name).write_text(text)
+    return folder
+
+
+@pytest.fixture
+def address(run: Path) -> Iterator[str]:
+    server = make_page_server(open_results(run), 0)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+
+
+def get(address: str, host: str | None = None) -> str:
+    request = urllib.request.Request(address, headers={"Host": host} if host else {})
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        return str(answer.read().decode())
+
+
+def test_the_page_comes_whole_from_this_machine(address: str) -> None:
+    page = get(address)
+    assert OUTSIDE.search(page) is None
+    scripts = re.findall(r'<script src="([^"]+)"', page)
+    assert scripts
+    assert all(len(get(address + script)) > 0 for script in scripts)
+    assert '"wall"' in get(f"{address}/_dash-layout")
+
+
+def test_the_page_answers_to_this_machine_s_names_only(address: str) -> None:
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        get(address, "evil.example")
+    assert address.startswith("http://127.0.0.1:")
+    with pytest.raises(InputError, match="cannot be used"):
+        make_page_server(open_results_of_nothing(), int(address.rpartition(":")[2]))
+
+
+def open_results_of_nothing() -> Any:
+    class Nothing:
+        title, step_name, steps, surfaces = "nothing", "step", {"1": "one"}, {"surface": "surface"}
+
+        def items(self, step: str) -> list[Item]:
+            return []
+
+    return Nothing()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; the server's answers are tested above")
+def test_a_browser_draws_the_page(address: str, tmp_path: Path) -> None:
+    """Headless Chromium without any way out: every script runs, and wall and map are drawn."""
+    flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    flags.append(f"--user-data-dir={tmp_path}")
+    offline = ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--virtual-time-budget=60000", "--timeout=90000"]
+    command = [str(CHROMIUM), *flags, *offline, "--dump-dom", address]
+    page = subprocess.run(command, capture_output=True, text=True, timeout=150, check=True).stdout
+    assert "gl-container" in page  # the 3D scene
+    assert "heatmaplayer" in page
+    assert "reference minus epoch, mm" in page  # the colour bar
+    assert "epoch 1" in page
