@@ -18,6 +18,8 @@ _STEPS = 13
 _MOST_CYCLES = 12.0
 _CHUNK = 32
 PLACE = "place along"
+HARMONICS = "harmonics"
+_OVERTONES = range(2, 6)
 _DIRECTIONS = (30, 60, 120, 150)
 """Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
 
@@ -51,7 +53,7 @@ class Candidate:
     """One explanation. matrix: (n, k) observable per unit of each coefficient; parameters: coefficients to the effect's values.
 
     names: the parameters that the coefficients stand for; fixed: searched or chosen values that belong to this variant, such as
-    the camera; form: of an empirical one; wave: of a searched sine, whose period is `period`.
+    the camera; form: of an empirical one; wave: of a searched sine, whose period is `period` (that of harmonics too).
     """
 
     name: str
@@ -172,6 +174,14 @@ def free_forms(covariate: str, values: FloatArray) -> list[Candidate | Grid]:
         wave = Wave("period", np.ones_like(x), x)
         found.append(Grid(covariate, "amplitude", wave, frequencies(0.8 / reach, _MOST_CYCLES / reach, 0.5 / reach), {}, True))
     return found
+
+
+def harmonics(covariate: str, sine: Candidate) -> Candidate:
+    """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the fifth."""
+    wave = sine.wave
+    assert wave is not None
+    columns = np.concatenate([wave.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
+    return replace(_free(covariate, HARMONICS, columns), period=sine.period)
 
 
 def places(at: FloatArray) -> list[Candidate | Grid]:

@@ -39,7 +39,7 @@ class DisparityRaster:
     @classmethod
     def of(cls, measurement: Measurement, geometry: StereoGeometry) -> DisparityRaster | None:
         """None where the pixels are on no raster, or on one of more than a million cells."""
-        step = _spacing(geometry.u)
+        step = spacing(geometry.u)
         if step is None:
             return None
         nominal = NominalPair.of(measurement)
@@ -83,7 +83,7 @@ class DisparityRaster:
         return np.nan_to_num(self.at_points(self.after(effects)) - np.where(np.isnan(plain), disparity, plain))
 
 
-def _spacing(u: FloatArray) -> float | None:
+def spacing(u: FloatArray) -> float | None:
     """Distance of neighbouring columns of a raster of pixels, px; also where a registration has moved them a little."""
     gaps = np.diff(np.unique(np.round(u, 3)))
     step = float(np.median(gaps)) if len(gaps) > 10 else 0.0

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.candidates import Candidate
+from pipeline.gap.candidates import HARMONICS, Candidate
 from pipeline.gap.locking import Locking
 from pipeline.gap.missing import MissingFound
 from pipeline.gap.quantization import Comb
@@ -22,10 +22,11 @@ from sensors.model import StereoModel, TlsModel
 
 SPREADS = (
     *("range_noise", "range_noise_proportional", "range_noise_incidence", "range_noise_intensity", "angle_noise"),
-    "parallax_noise",
+    *("parallax_noise", "regularization_noise"),
 )
 """Effects that make the residuals spread more."""
-_DEGREES = 5
+_NODES = 65
+"""Of the curve of an empirical term."""
 _BEYOND = 100.0
 """Times its typical size, an effect explains nothing: no instrument is so far out."""
 _SPLITS = {
@@ -185,26 +186,32 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
 
 
 def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:
-    """A free form as a polynomial: of the lowest degree that leaves 2 % of its variance, at most 5."""
+    """A free form as a curve of its covariate: over one cycle of a periodic one, else over all values that occur."""
     x = part.covariates[candidate.name]
-    curve = candidate.columns @ values[: candidate.columns.shape[1]]
-    centre, scale = float(x.mean()), float(x.std()) or 1.0
-    t = np.clip((x - centre) / scale, -4, 4)
-    fits = [
-        np.linalg.lstsq(np.stack([t**k for k in range(degree + 1)], axis=1), curve, rcond=None)[0]
-        for degree in range(1, _DEGREES + 1)
-    ]
-    left = [float(np.var(curve - sum(c * t**k for k, c in enumerate(fit)))) for fit in fits]
-    degree = next((number for number, variance in enumerate(left) if variance < 0.02 * np.var(curve)), len(fits) - 1)
+    error = candidate.columns @ values[: candidate.columns.shape[1]]
+    cycle = candidate.period * (1.0 if candidate.form == HARMONICS else float(x.std()) or 1.0)
+    turned = np.mod(x, cycle) if cycle else x
+    order = np.argsort(turned)
+    low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))
+    curve = np.interp(np.linspace(low, high, _NODES), turned[order], error[order], period=cycle or None)
     unit, name = ("m", "range_empirical") if part.sensor == "tls" else ("px", "disparity_empirical")
+    shift = _shift(candidate.name, part)
     entry = {
         "name": name,
         "covariate": candidate.name,
-        "centre": centre,
-        "scale": scale,
-        f"coefficients_{unit}": [float(value) for value in fits[degree][1:]],
+        "low": low + shift,
+        "high": high + shift,
+        "period": cycle,
+        f"values_{unit}": [float(f"{value:.6g}") for value in curve],
     }
     return Named(f"{part.sensor}.{name}", "empirical", entry, {}, (), item.p_value, item.gain)
+
+
+def _shift(covariate: str, part: Residuals) -> float:
+    """What an effect's covariate is more than that of the residuals, which is relative for the power."""
+    if covariate != "intensity":
+        return 0.0
+    return float(np.median(np.log(np.maximum(part.geometry.power, 1e-12)) - part.covariates[covariate]))
 
 
 def _plain(entry: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.gap import stereo_signatures, tls_signatures
-from pipeline.gap.candidates import PLACE, Candidate, Grid, free_forms, places
+from pipeline.gap.candidates import HARMONICS, PLACE, Candidate, Grid, free_forms, harmonics, places
 from pipeline.gap.cells import Cells
 from pipeline.gap.entries import Estimate, Named, from_comb, from_locking, from_mean, from_spread, is_possible, with_effects
 from pipeline.gap.locking import find_locking
@@ -18,10 +18,14 @@ from pipeline.gap.registration import registered, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Chosen, MeanSearch, Tried
 from pipeline.gap.spread import SpreadFound, find_spread
+from pipeline.gap.stereo_noise import told_apart
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from sensors.model import StereoModel
 
 _NOT_FREE = ("edge_step", "line", "disparity_fraction")
+_PERIODIC = {"range_cyclic": "range", "row_jitter": "image_y"}
+"""Sines whose overtones are looked for: an error that repeats but is no sine is not theirs."""
 
 
 @dataclass(frozen=True)
@@ -80,26 +84,33 @@ def name_effects(
         left_out |= {("pixel_locking", False)}
     part = _noisier(part, added)
     families = [each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out]
-    spread = find_spread(part, Cells.over(part.at), registered(part)[0], random)
+    spread = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random)
     first = MeanSearch(_weighed(part, spread, scale), families, random)
     chosen, tried = first.select()
-    estimates, last, at = _estimates(first, chosen), first, part
+    estimates, last, at, beside = _estimates(first, chosen), first, part, chosen
     physical = [each for each in estimates if not each.candidate.empirical]
     beyond = _beyond(measurement, estimates, at)
     if physical and not beyond:
-        last, at, estimates, tried = _again(measurement, part, families, physical, spread, (scale, added), random)
+        last, at, estimates, beside, tried = _again(measurement, part, families, physical, spread, (scale, added), random)
         beyond = _beyond(measurement, estimates, at)
     if beyond:
         return name_effects(measurement, whole, whole_scale, random, left_out | beyond)
     if chosen:
-        spread = find_spread(at, last.cells, last.without([each.chosen for each in estimates[len(physical) :]]), random)
+        spread = _spread(measurement, at, last.cells, last.without(beside), random)
     named += [from_mean(each, at) for each in estimates]
     named += [from_spread(each, part.sensor) for each in spread]
     names, cosines, survival = first.identifiability()
     remaining = {"p_value": last.p_value(tried[0].score) if tried else 1.0, "note": "; ".join([*part.notes, *_words(left_out)])}
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     shown = tuple(item for item in (chosen[0].tried if chosen else tried) if not item.name.startswith(PLACE))
-    return named, Naming(shown, remaining, table, last.reference_sigma([each.chosen for each in estimates[len(physical) :]]))
+    return named, Naming(shown, remaining, table, last.reference_sigma(beside))
+
+
+def _spread(measurement: Measurement, part: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> list[SpreadFound]:
+    """Effects on the spread of residuals (n,) without the mean effects found."""
+    found = find_spread(part, cells, value, random)
+    model = measurement.model
+    return told_apart(found, part, value, model) if found and isinstance(model, StereoModel) else found
 
 
 def _beyond(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
@@ -119,8 +130,12 @@ def _noisier(part: Residuals, variance: float) -> Residuals:
 
 def _weighed(part: Residuals, spread: list[SpreadFound], scale: float) -> Residuals:
     """With the spread that the points really have."""
-    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in spread)) if spread else part.sigma * scale
-    return replace(part, sigma=sigma)
+    if not spread:
+        return replace(part, sigma=part.sigma * scale)
+    nodes = sum(each.parameters["sigma_px"] ** 2 for each in spread if each.name == "regularization_noise")
+    variance, width = part.shared_noise
+    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in spread))
+    return replace(part, sigma=sigma, shared_noise=(variance + nodes, width))
 
 
 def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
@@ -140,11 +155,11 @@ def _again(
     spread: list[SpreadFound],
     noise: tuple[float, float],
     random: KeyedRandom,
-) -> tuple[MeanSearch, Residuals, list[Estimate], tuple[Tried, ...]]:
+) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]]:
     """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
 
     noise: how many predicted sigmas the residuals spread, and variance to add to the predicted one. Returns the search,
-    its residuals, the effects with what was found beside them, and what was tried last.
+    its residuals, the effects with what was found beside them, that alone, and what was tried last.
     """
     model = with_effects(measurement.model, [from_mean(each, part).entry for each in had])
     there, found, _ = settled(measurement.changed(model=model), part.index)
@@ -155,6 +170,7 @@ def _again(
     others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
     known = [replace(each, candidate=_renewed(each.candidate, renewed)) for each in had]
     columns = [_columns(each) for each in known]
+    others += [harmonics(_PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in _PERIODIC]
     weighed = _weighed(at, [replace(each, variance=each.variance[_kept(at, part)]) for each in spread], noise[0])
     search = MeanSearch(replace(weighed, pose=np.concatenate([at.pose, *columns], axis=1)), others, random.child("again"))
     chosen, tried = search.select()
@@ -163,7 +179,20 @@ def _again(
     for each, matrix in zip(known, columns, strict=True):
         place = slice(start, start := start + matrix.shape[1])
         kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
-    return search, at, [*kept, *_estimates(search, chosen)], tried
+    return search, at, _without_sines([*kept, *_estimates(search, chosen)]), chosen, tried
+
+
+def _without_sines(estimates: list[Estimate]) -> list[Estimate]:
+    """A named sine with overtones becomes one empirical term."""
+    found = list(estimates)
+    for overtones in (each for each in estimates if each.candidate.form == HARMONICS):
+        sine = next(each for each in estimates if _PERIODIC.get(each.candidate.name) == overtones.candidate.name)
+        both = np.concatenate([sine.candidate.columns, overtones.candidate.columns], axis=1)
+        width = sine.candidate.columns.shape[1]
+        values = np.concatenate([sine.values[:width], overtones.values])
+        found = [each for each in found if each is not sine and each is not overtones]
+        found.append(replace(overtones, candidate=replace(overtones.candidate, matrix=both), values=values))
+    return found
 
 
 def _at_points(found: Residuals, part: Residuals) -> Residuals:

@@ -14,8 +14,8 @@ from pipeline.rigid import RigidTransform
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.camera import Camera
+from sensors.curve import curve_on_host
 from sensors.effects.disparity_empirical import DisparityEmpirical
-from sensors.effects.range_empirical import LARGEST
 from sensors.model import StereoModel
 
 _PROBE_PX = 3.0
@@ -155,8 +155,8 @@ def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatAr
     total = np.zeros(len(covariates["depth"]))
     for effect in model.effects:
         if isinstance(effect, DisparityEmpirical):
-            t = np.clip((covariates[effect.covariate] - effect.centre) / effect.scale, -LARGEST, LARGEST)
-            total += sum((c * t**power for power, c in enumerate(effect.coefficients_px, start=1)), np.zeros(len(t)))
+            x = covariates[effect.covariate]
+            total += curve_on_host(x, effect.low, effect.high, effect.values_px, effect.period)
     return total
 
 

@@ -1,4 +1,4 @@
-"""An error of the disparity that no effect of the catalogue explains, as a polynomial of what it was seen to depend on."""
+"""An error of the disparity that no effect of the catalogue explains, as a curve of what it was seen to depend on."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pydantic import Field
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.device import bounded, opaque
+from sensors.curve import curve
 from sensors.effects.base import Effect, Stage
-from sensors.effects.range_empirical import LARGEST
 from sensors.matches import Matches
 
 
 class DisparityEmpirical(Effect):
-    """dd = sum_k c_k t^k, t = (x - centre) / scale, k from 1: empirical, found by `scarpsim gap`; not in the shared catalogue.
+    """dd = c(x), c linear between values at even distances from low to high: empirical, found by `scarpsim gap`; not in the
+    shared catalogue.
 
     x: column, row or distance from the centre of the left image (px), disparity or its fraction (px), or depth (m).
     """
@@ -28,21 +28,18 @@ class DisparityEmpirical(Effect):
     covariate: Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"] = Field(
         "image_x", description="x"
     )
-    centre: float = Field(0.0, description="of x, in its unit")
-    scale: float = Field(1.0, gt=0, description="of x, in its unit")
-    coefficients_px: tuple[float, ...] = Field((), max_length=6, description="of t, t^2, ... [px]")
+    low: float = Field(0.0, description="x of the first value, in its unit; held below")
+    high: float = Field(1.0, description="x of the last value, in its unit; held above")
+    period: float = Field(0.0, ge=0, description="of x, which then counts modulo it; 0: none")
+    values_px: tuple[float, ...] = Field((0.0, 0.0), min_length=2, max_length=1025, description="c from low to high [px]")
 
     @property
     def is_null(self) -> bool:
-        return not any(self.coefficients_px)
+        return not any(self.values_px)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        centre, scale = opaque(self.centre, self.scale)
-        t = bounded((self._covariate(state) - centre) / scale, -LARGEST, LARGEST)
-        total = mi.Float64(0.0)
-        for coefficient in reversed(opaque(*self.coefficients_px)):
-            total = t * (coefficient + total)
-        return replace(state, disparity=state.disparity + total)
+        error = curve(self._covariate(state), self.low, self.high, self.values_px, self.period)
+        return replace(state, disparity=state.disparity + error)
 
     def _covariate(self, matches: Matches) -> mi.Float64:
         match self.covariate:

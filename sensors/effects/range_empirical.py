@@ -1,4 +1,4 @@
-"""An error of the range that no effect of the catalogue explains, as a polynomial of what it was seen to depend on."""
+"""An error of the range that no effect of the catalogue explains, as a curve of what it was seen to depend on."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from pydantic import Field
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.device import bounded, opaque
+from sensors.curve import curve
+from sensors.device import bounded
 from sensors.effects.base import Effect, Stage
 from sensors.pulses import Pulses
 
-LARGEST = 4.0
-"""The covariate is held at this many scales from its centre, so that the polynomial does not run away."""
-
 
 class RangeEmpirical(Effect):
-    """dR = sum_k c_k t^k, t = (x - centre) / scale, k from 1: empirical, found by `scarpsim gap`; not in the shared catalogue.
+    """dR = c(x), c linear between values at even distances from low to high: empirical, found by `scarpsim gap`; not in the
+    shared catalogue.
 
     x: range (m), azimuth, zenith or incidence (rad), the logarithm of the received power, or the share of the scan's duration.
     """
@@ -26,21 +25,17 @@ class RangeEmpirical(Effect):
     sensor = "tls"
     stage = Stage.RANGE
     covariate: Literal["range", "azimuth", "zenith", "incidence", "intensity", "time"] = Field("range", description="x")
-    centre: float = Field(0.0, description="of x, in its unit")
-    scale: float = Field(1.0, gt=0, description="of x, in its unit")
-    coefficients_m: tuple[float, ...] = Field((), max_length=6, description="of t, t^2, ... [m]")
+    low: float = Field(0.0, description="x of the first value, in its unit; held below")
+    high: float = Field(1.0, description="x of the last value, in its unit; held above")
+    period: float = Field(0.0, ge=0, description="of x, which then counts modulo it; 0: none")
+    values_m: tuple[float, ...] = Field((0.0, 0.0), min_length=2, max_length=1025, description="c from low to high [m]")
 
     @property
     def is_null(self) -> bool:
-        return not any(self.coefficients_m)
+        return not any(self.values_m)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        centre, scale = opaque(self.centre, self.scale)
-        t = bounded((self._covariate(state) - centre) / scale, -LARGEST, LARGEST)
-        total = mi.Float64(0.0)
-        for coefficient in reversed(opaque(*self.coefficients_m)):
-            total = t * (coefficient + total)
-        return state.with_range_error(total)
+        return state.with_range_error(curve(self._covariate(state), self.low, self.high, self.values_m, self.period))
 
     def _covariate(self, pulses: Pulses) -> mi.Float64:
         match self.covariate:

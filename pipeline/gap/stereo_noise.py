@@ -1,0 +1,169 @@
+"""White noise of a disparity, or noise on the nodes of a grid: told apart by how neighbours differ.
+
+Half the mean squared difference of two pixels h apart (the semivariogram) is, beyond what the model predicts,
+
+    g(h) = w + r^2 (4/9 - B(hx / s) B(hy / s)) + c h^2
+
+w the variance of white noise, r and s the standard deviation and the step of a grid of nodes that is interpolated bilinearly, B
+the cubic B-spline (2/3 at 0, 0 from 2 on: two hat functions convolved), and c h^2 the reference's error, which is smooth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.gap.cells import patches
+from pipeline.gap.disparity_raster import spacing
+from pipeline.gap.residuals import Residuals
+from pipeline.gap.spread import SpreadFound
+from scene.mesh import FloatArray
+from sensors.model import StereoModel
+
+_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+_LONGEST_PX = 256.0
+_STEPS_PX = tuple(8.0 * 2 ** (half / 2) for half in range(9))
+_POINTS_PER_BLOCK = 400.0
+_FEWEST_BLOCKS, _FEWEST_LAGS = 12, 3
+_CLIP = 4.5
+_FINEST = 2.0
+"""Cells of the raster from which on a grid of nodes differs from white noise."""
+_MARGIN = 6.0
+"""Difference of chi^2 from which on one of the two is named alone."""
+_RIDGE = 0.02
+
+
+@dataclass(frozen=True)
+class _Variogram:
+    """step: px of the raster; lag: (k, 2) px; value: (k,) px^2 less what the model predicts; root: (k, k) whitens it
+    (root @ value has unit variance)."""
+
+    step: float
+    lag: FloatArray
+    value: FloatArray
+    root: FloatArray
+
+    def fitted(self, form: FloatArray) -> tuple[float, float, float]:
+        """chi^2, variance and its standard deviation of a form (k,) beside the reference's error; both at least 0."""
+        smooth = np.sum(self.lag**2, axis=1)
+        columns = self.root @ np.stack([form, smooth / smooth.max()], axis=1)
+        value = self.root @ self.value
+        best = np.linalg.lstsq(columns, value, rcond=None)[0]
+        if best[1] < 0:
+            columns, best = columns[:, :1], np.linalg.lstsq(columns[:, :1], value, rcond=None)[0]
+        covariance = np.linalg.inv(columns.T @ columns)
+        return float(np.sum((value - columns @ best) ** 2)), float(best[0]), float(np.sqrt(covariance[0, 0]))
+
+
+def told_apart(found: list[SpreadFound], part: Residuals, value: FloatArray, model: StereoModel) -> list[SpreadFound]:
+    """Noise that was taken for white, named by how neighbours differ; a class of both where that does not tell.
+
+    value: (n,) residuals without the mean effects found.
+    """
+    return [_named(each, part, value, model) if each.name == "parallax_noise" else each for each in found]
+
+
+def _named(white: SpreadFound, part: Residuals, value: FloatArray, model: StereoModel) -> SpreadFound:
+    both = replace(white, alike=tuple(sorted({*white.alike, "regularization_noise"})))
+    variogram = _variogram(part, value, model)
+    if variogram is None:
+        return both
+    plain, variance, error = variogram.fitted(np.ones(len(variogram.value)))
+    if variance > 0:
+        both = _with_variance(both, variance, error, 1.0)
+    white = replace(both, alike=white.alike)
+    trials = [(variogram.fitted(_nodes(variogram.lag, step)), step) for step in _STEPS_PX if step >= _FINEST * variogram.step]
+    (square, variance, error), step = min(trials, key=lambda trial: trial[0][0], default=((np.inf, 0.0, 0.0), 0.0))
+    if plain < square - _MARGIN:
+        return white
+    if variance <= 0 or plain < square + _MARGIN:
+        return both
+    near = [each for trial, each in trials if trial[0] < square + 1]
+    nodes = _with_variance(
+        replace(white, name="regularization_noise", effect="regularization_noise", alike=()), variance, error, 4 / 9
+    )
+    return replace(
+        nodes,
+        parameters={**nodes.parameters, "step_px": step},
+        std={**nodes.std, "step_px": max(float(np.std(near)), 0.2 * step)},
+    )
+
+
+def _with_variance(found: SpreadFound, variance: float, error: float, share: float) -> SpreadFound:
+    """With the standard deviation sigma_px that a variance with its error gives. share: of it that a disparity has on average."""
+    sigma = float(np.sqrt(variance))
+    return replace(
+        found,
+        parameters={"sigma_px": sigma},
+        std={"sigma_px": error / (2 * sigma)},
+        variance=np.full(len(found.variance), share * variance),
+    )
+
+
+def _variogram(part: Residuals, value: FloatArray, model: StereoModel) -> _Variogram | None:
+    """Along rows and columns, with its covariance by blocks of the wall; None where the pixels are on no raster."""
+    g = part.geometry
+    step = spacing(g.u)
+    if step is None:
+        return None
+    column, row = (np.rint((x - x.min()) / step).astype(np.int64) for x in (g.u, g.v))
+    bound = _CLIP * 1.4826 * float(np.median(np.abs(value - np.median(value))))
+    raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
+    raster[row, column] = np.where(np.abs(value) < bound, value, np.nan)
+    block = np.zeros(raster.shape, dtype=np.int64)
+    block[row, column] = patches(part.at, _POINTS_PER_BLOCK)
+    count = int(block.max()) + 1
+    lags = [each for each in _LAGS if each * step <= _LONGEST_PX]
+    found = [_by_block(raster, block, lag, axis, count) for axis in (0, 1) for lag in lags]
+    pairs, sums = (np.stack(each) for each in zip(*found, strict=True))
+    full = (pairs > 0).all(axis=0)
+    if full.sum() < _FEWEST_BLOCKS or len(lags) < _FEWEST_LAGS:
+        return None
+    means = sums[:, full] / pairs[:, full]
+    weight = pairs[:, full].sum(axis=0) / pairs[:, full].sum()
+    mean = means @ weight
+    left = (means - mean[:, None]) * np.sqrt(weight)
+    covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
+    covariance += _RIDGE * np.diag(np.diag(covariance))
+    offsets = np.array([[lag * step * (axis == 1), lag * step * (axis == 0)] for axis in (0, 1) for lag in lags])
+    return _Variogram(step, offsets, mean - _predicted(offsets, model), np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _by_block(raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """(count,) pairs and half their squared differences, by the block of the first of each pair."""
+    first, second = (raster[:-lag], raster[lag:]) if axis == 0 else (raster[:, :-lag], raster[:, lag:])
+    there = block[:-lag] if axis == 0 else block[:, :-lag]
+    half = 0.5 * (first - second) ** 2
+    known = np.isfinite(half)
+    return (
+        np.bincount(there[known], minlength=count).astype(np.float64),
+        np.bincount(there[known], half[known], count).astype(np.float64),
+    )
+
+
+def _predicted(lag: FloatArray, model: StereoModel) -> FloatArray:
+    """(k,) semivariogram of the noise that a model predicts, px^2."""
+    noise = model.noise
+    total = np.full(len(lag), noise.parallax_sigma_px**2)
+    total += noise.regularization_sigma_px**2 * _nodes(lag, noise.regularization_step_px)
+    for effect in model.effects:
+        match effect.name:
+            case "parallax_noise" | "heavy_tailed_noise":
+                total += effect.sigma_px**2
+            case "regularization_noise":
+                total += effect.sigma_px**2 * _nodes(lag, effect.step_px)
+    return total
+
+
+def _nodes(lag: FloatArray, step: float) -> FloatArray:
+    """(k,) semivariogram of a grid of nodes of variance 1."""
+    across, down = (_spline(lag[:, axis] / step) for axis in (0, 1))
+    return 4 / 9 - across * down
+
+
+def _spline(x: FloatArray) -> FloatArray:
+    """The cubic B-spline: 2/3 at 0, 1/6 at 1, 0 from 2 on."""
+    near, far = 2 / 3 - x**2 + x**3 / 2, (2 - x) ** 3 / 6
+    return np.where(x < 1, near, np.where(x < 2, far, 0.0))
