@@ -1,12 +1,13 @@
 # `make demo` and `make test` work from an empty clone on a bare Debian or Ubuntu with Python 3.11 to 3.13; see tools/setup.sh.
 BIN := .venv/bin
 
-.PHONY: help setup demo test format benchmarks
+.PHONY: help setup demo test docs format benchmarks
 
 help:
 	@echo 'make setup       the environment and the system libraries (seconds when they are there)'
 	@echo 'make demo        simulate both sensors on the demo wall, into a new folder under runs/'
 	@echo 'make test        lint, types and tests'
+	@echo 'make docs        the documentation site, in site/index.html'
 	@echo 'make format      put the code into the project'"'"'s format'
 	@echo 'make benchmarks  every benchmark, each with its ratio to the limit measured in the same run'
 
@@ -24,6 +25,10 @@ test: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/pytest -n 2
+
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@printf 'The site: %s\n' "$$PWD/site/index.html"
 
 format: setup
 	$(BIN)/ruff check --fix-only -q .

@@ -29,12 +29,12 @@ PICTURES = {
     "training_set": "sets/my_set/card/samples_stereo.png",
     "compare_sensors": "comparison/detection.png",
     "calibrate": "calibration/windows.png",
-    "missing_effect": "diagnosis/maps.png",
+    "missing_effect": "diagnosis/profiles.png",
 }
 """The pages, and the picture among their results that each shows."""
 _BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _PROGRAMS: dict[str, Callable[[list[str]], int]] = {"scarpsim": main, "simulate": simulate}
-_COLOURS = 128
+_COLOURS, _WIDEST = 128, 1100
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,7 @@ def _renew(page: str) -> None:
             example_data.measurement(Path("my_measurement"))
         sys.stderr.write(f"== {page}\n{carry_out(page)}\n")
         with Image.open(PICTURES[page]) as picture:
+            picture.thumbnail((_WIDEST, _WIDEST))
             small = picture.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
         small.save(FOLDER / "images" / f"howto_{page}.png", optimize=True)
 

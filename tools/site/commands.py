@@ -19,7 +19,7 @@ What `--help` says of each command. `simulate` alone is the same as `scarpsim si
 | 1 | anything else; the message names the file with the traceback |
 | 130 | interrupted; what was finished is kept and usable |
 """
-_COLUMNS = "110"
+_COLUMNS = "88"
 
 
 def pages() -> dict[str, str]:
