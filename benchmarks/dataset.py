@@ -1,7 +1,7 @@
 """Tiles per minute, share of the stages, memory, and the time that the nine sets would take.
 
     python benchmarks/dataset.py                      workers: a small set by one and by two workers, in turns
-    python benchmarks/dataset.py epochs [--epochs 6]  Glendale: epochs of rockfall_9 in this process, projection of the whole plan
+    python benchmarks/dataset.py epochs [--epochs 6]  epochs of rockfall_9 in this process, projection of the whole plan
     python benchmarks/dataset.py memory [--epochs 100] [--sensor tls] [--small]    peak memory of one worker over many epochs
 
 Rates are of wall time and of processor time; on a machine that others use too only the latter tells of the program.
@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -55,40 +56,59 @@ def stage_seconds(made: Sequence[dict[str, Any]]) -> dict[str, float]:
     return dict(found)
 
 
-def of_glendale(epochs: int, sensors: Sequence[str]) -> DatasetConfig:
-    """rockfall_9 cut down to `epochs` training epochs of each sensor and class of sizes, on Glendale at high noise."""
+def of_glendale(epochs: int, sensors: Sequence[str], *others: dict[str, Any]) -> DatasetConfig:
+    """rockfall_9 cut down to `epochs` training epochs of each sensor and size on Glendale at high noise, and to other parts."""
     values = load_dataset_config(bundled_config("datasets", "rockfall_9")).model_dump(mode="json")
     part = {"walls": ["glendale"], "noise": ["high"], "sizes": SIZES, "train": epochs}
-    return DatasetConfig.model_validate({**values, "sensors": sensors, "parts": [part]})
+    return DatasetConfig.model_validate({**values, "sensors": sensors, "parts": [part, *others]})
 
 
-def costs(config: DatasetConfig, made: Sequence[dict[str, Any]]) -> tuple[dict[str, float], dict[tuple[str, str], float]]:
-    """Processor time of a stage's set-up by sensor, and of an epoch by sensor and size, s.
+@dataclass(frozen=True)
+class Costs:
+    """Processor time, s, of a stage's set-up by wall and sensor, and of an epoch by wall, sensor and size."""
 
-    The set-up's share of the processor time of the epoch that did it is that of its wall time.
-    """
+    set_up: dict[tuple[str, str], float]
+    epoch: dict[tuple[str, str, str], float]
+
+    def of_set_up(self, planned: PlannedEpoch) -> float:
+        """Of the planned epoch's stage; a test's wall costs what the training's of its style does."""
+        return self.set_up[planned.wall.removesuffix("-b"), planned.sensor]
+
+    def of(self, planned: PlannedEpoch) -> float:
+        """Of the epoch itself; a size that was not timed on its wall costs as many times the medium one as on Glendale."""
+        wall, sensor = planned.wall.removesuffix("-b"), planned.sensor
+        if (wall, sensor, planned.size) in self.epoch:
+            return self.epoch[wall, sensor, planned.size]
+        of_size = self.epoch["glendale", sensor, planned.size] / self.epoch["glendale", sensor, "medium"]
+        return of_size * self.epoch[wall, sensor, "medium"]
+
+
+def costs(config: DatasetConfig, made: Sequence[dict[str, Any]]) -> Costs:
+    """The means of what was made. The set-up's share of the processor time of the epoch that did it is that of its wall time."""
     plan = planned_epochs(config)
-    set_up: dict[str, list[float]] = defaultdict(list)
-    epoch: dict[tuple[str, str], list[float]] = defaultdict(list)
+    set_up: dict[tuple[str, str], list[float]] = defaultdict(list)
+    epoch: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for taken in made:
         planned = plan[taken["index"]]
         before = sum(value for name, value in taken["seconds"].items() if name.startswith("set up"))
         share = before / sum(taken["seconds"].values())
         if share:
-            set_up[planned.sensor].append(share * taken["cpu_seconds"])
-        epoch[planned.sensor, planned.size].append((1 - share) * taken["cpu_seconds"])
-    return {key: float(np.mean(each)) for key, each in set_up.items()}, {key: float(np.mean(each)) for key, each in epoch.items()}
+            set_up[planned.wall, planned.sensor].append(share * taken["cpu_seconds"])
+        epoch[planned.wall, planned.sensor, planned.size].append((1 - share) * taken["cpu_seconds"])
+    return Costs(
+        {key: float(np.mean(each)) for key, each in set_up.items()}, {key: float(np.mean(each)) for key, each in epoch.items()}
+    )
 
 
-def makespan(plan: Sequence[PlannedEpoch], workers: int, set_up: dict[str, float], epoch: dict[tuple[str, str], float]) -> float:
-    """Time until the last epoch of the plan is done, s, by the rule above; costs by sensor, and by sensor and size."""
+def makespan(plan: Sequence[PlannedEpoch], workers: int, cost: Costs) -> float:
+    """Time until the last epoch of the plan is done, s, by the rule above."""
     free: list[tuple[float, int]] = [(0.0, number) for number in range(workers)]
     has: dict[int, object] = {}
     for run in runs([Order("", "", "", planned.index, planned.stage) for planned in plan], workers):
         now, worker = heapq.heappop(free)
         first = plan[run[0].index]
-        now += 0.0 if has.get(worker) == first.stage else set_up[first.sensor]
-        now += sum(epoch[plan[order.index].sensor, plan[order.index].size] for order in run)
+        now += 0.0 if has.get(worker) == first.stage else cost.of_set_up(first)
+        now += sum(cost.of(plan[order.index]) for order in run)
         has[worker] = first.stage
         heapq.heappush(free, (now, worker))
     return max(now for now, _ in free)
@@ -118,27 +138,33 @@ def compare_workers(rounds: int) -> None:
             print(f"| {workers} | {wall:.0f} | {rates[workers][-1]:.0f} | {cpu[workers][-1]:.2f} | {set_ups} |", flush=True)
     print(f"scaling efficiency by wall time {np.median(rates[2]) / np.median(rates[1]) / 2:.2f}, ", end="")
     print(f"by processor time {np.median(cpu[1]) / np.median(cpu[2]):.2f}")
-    played = [makespan(plan, workers, *costs(config, summary.made)) for workers in (1, 2)]
+    played = [makespan(plan, workers, costs(config, summary.made)) for workers in (1, 2)]
     print(f"the projection's efficiency for this set, from the last round's costs: {played[0] / played[1] / 2:.2f}")
     print_stages(summary.made)
 
 
 def project(epochs: int) -> None:
-    """Time epochs of Glendale in this process, play the whole plan of rockfall_9 through."""
-    config = of_glendale(epochs, ("stereo", "tls"))
+    """Time epochs of Glendale, and one of each other wall, in this process; play the whole plan of rockfall_9 through."""
+    bulga = {"walls": ["bulga"], "noise": ["high"], "sizes": ["medium"], "train": 1}
+    tests = {"walls": ["bismantova", "pilkington"], "noise": ["7.5cm"], "sizes": ["medium"], "test": 1}
+    config = of_glendale(epochs, ("stereo", "tls"), bulga, tests)
     wall, summary = timed(config, 0)
-    set_up, epoch = costs(config, summary.made)
+    cost = costs(config, summary.made)
     whole = planned_epochs(load_dataset_config(bundled_config("datasets", "rockfall_9")))
     print_stages(summary.made)
-    print(f"set-up {set_up}\nepoch {epoch} processor s")
+    print("| wall, sensor, size | processor s |\n|---|---|")
+    for name, seconds in [*cost.epoch.items(), *((("set-up", *key), value) for key, value in cost.set_up.items())]:
+        print(f"| {', '.join(name)} | {seconds:.1f} |")
+    shown = {(taken["tiles"], planned_epochs(config)[taken["index"]].name) for taken in summary.made}
+    print("tiles:", ", ".join(f"{name} {count}" for count, name in sorted(shown)))
     tiles = sum(taken["tiles"] for taken in summary.made)
     cpu = sum(taken["cpu_seconds"] for taken in summary.made)
     print(f"{tiles} tiles in {wall:.0f} s, {cpu:.0f} s of processor time: {60 * tiles / cpu:.1f} tiles a core minute")
-    print(f"played through, the epochs just timed take one worker {makespan(planned_epochs(config), 1, set_up, epoch):.0f} s")
+    print(f"played through, the epochs just timed take one worker {makespan(planned_epochs(config), 1, cost):.0f} s")
     print("| cores | nine sets and tests, both sensors | of the ideal |\n|---|---|---|")
-    ideal = makespan(whole, 1, set_up, epoch)
+    ideal = makespan(whole, 1, cost)
     for workers in WORKERS:
-        time_taken = makespan(whole, workers, set_up, epoch)
+        time_taken = makespan(whole, workers, cost)
         print(f"| {workers} | {time_taken / 3600:.1f} h | {ideal / workers / time_taken:.2f} |")
 
 

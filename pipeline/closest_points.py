@@ -19,6 +19,7 @@ from scene.mesh import FloatArray
 
 LEAST_POINTS = 6
 """Of a cloud that is registered: one per unknown."""
+_SEES = "check that the sensor sees the wall: its place, its direction, its range, for cameras their overlap"
 _BLOCK = 2**14
 """Points per block of the sums: its arrays fit a core's cache."""
 ON_A_LINE = 1e-12
@@ -123,7 +124,7 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"expected shape (n, 3), got {points.shape}", where=name)
     if len(points) < LEAST_POINTS:
-        raise InputError(f"{len(points)} points are too few", where=name, allowed=f"at least {LEAST_POINTS}")
+        raise InputError(f"{len(points)} points are too few", where=name, allowed=f"at least {LEAST_POINTS}", remedy=_SEES)
     finite = np.isfinite(points)
     if not finite.all():
         bad = int((~finite.all(axis=1)).sum())

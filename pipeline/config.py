@@ -25,7 +25,7 @@ from pipeline.stations import StationsConfig
 from pipeline.tiles import TileConfig
 from scene.blocks import RockfallConfig
 from scene.config import Config, load_yaml, parse
-from scene.errors import InputError, nearest
+from scene.errors import InputError
 from scene.illumination import IlluminationConfig
 from scene.procedural import ProceduralWall
 from scene.texture import TextureConfig
@@ -147,9 +147,7 @@ class SimulationConfig(Config):
         for model in models if isinstance(models, list) else []:
             name = model.get("sensor") if isinstance(model, dict) else None
             if isinstance(model, dict) and name not in ("stereo", "tls"):
-                raise ValueError(
-                    f"a sensor model needs `sensor: stereo` or `sensor: tls`; {nearest(str(name), ('stereo', 'tls'))}"
-                )
+                raise ValueError("a sensor model needs `sensor: stereo` or `sensor: tls`")
         return models
 
     @field_validator("cameras", mode="before")

@@ -6,6 +6,7 @@ therefore usable, and a later call with `resume` makes only what is missing; the
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.annotate import merge
-from pipeline.config import SensorName, SimulationConfig
+from pipeline.config import CamerasFile, SensorName, SimulationConfig
 from pipeline.epoch import STAGES, observe_epoch, observe_reference
 from pipeline.formats.atomic import write_json
 from pipeline.products import EPOCH_RECORD, M3C2_ANNOTATIONS, epoch_folder, write_epoch, write_reference
@@ -23,6 +24,7 @@ from pipeline.report.assemble import write_run_report
 from pipeline.site import Site, prepare_site
 from scene.backend import VARIANT
 from scene.errors import InputError
+from scene.imported import ImportedWall
 from scene.keyed_random import KeyedRandom
 
 RUN_FILE = "run.json"
@@ -50,6 +52,7 @@ def simulate(
     progress = progress or Progress()
     progress.plan(_plan(config))
     identity = {"schema": SCHEMA, "sensor": sensor, "seed": config.seed, "config": config.model_dump(mode="json")}
+    identity["inputs"] = _inputs(config)
     _claim(out, identity, resume)
     random = KeyedRandom(config.seed)
     try:
@@ -80,6 +83,17 @@ def _plan(config: SimulationConfig) -> dict[str, float]:
     stages = {f"epoch 0: {name}": STAGES[name] for name in ("observe", "mesh", "difference", "write")}
     stages |= {f"epoch {number}: {name}": weight for number in range(1, config.epochs + 1) for name, weight in STAGES.items()}
     return {"wall": 3.0, **stages, "report": 1.0}
+
+
+def _inputs(config: SimulationConfig) -> dict[str, str]:
+    """The config's input files and their SHA-256: a mesh replaced under the same name makes another run.
+
+    A file that is not there is left out: whoever reads it says so.
+    """
+    named = [config.wall.mesh] if isinstance(config.wall, ImportedWall) else []
+    named += [config.cameras.file] if isinstance(config.cameras, CamerasFile) else []
+    files = [file for path in named for file in (sorted(path.glob("*.txt")) if path.is_dir() else [path]) if file.is_file()]
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def _claim(out: Path, identity: dict[str, Any], resume: bool) -> None:

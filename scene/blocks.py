@@ -140,6 +140,7 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
     search = _Search(config, zone, solids, random)
     position = np.zeros((len(solids), 3))
     area = np.array([np.ptp(solid.bbox[:, :2], axis=0).prod() for solid in solids])
+    _require_room(area, zone)
     pending = np.argsort(-area, kind="stable")
     while len(pending):
         for index in pending:
@@ -191,6 +192,17 @@ class _Search:
             f"{placed} of {len(self._solids)} blocks are placed",
             where="rockfall",
             remedy="lower count, size_m, minimum_distance_m or safe_zone_offset_m, or raise maximum_attempts",
+        )
+
+
+def _require_room(area: FloatArray, zone: SafeZone) -> None:
+    """Bounding boxes do not overlap and lie in the safe zone, so that their sum cannot exceed its area."""
+    room = zone.free.sum() * zone.grid.gsd**2
+    if area.sum() > room:
+        raise InputError(
+            f"{len(area)} blocks take {area.sum():,.0f} m2, the safe zone of the wall has {room:,.0f} m2",
+            where="rockfall",
+            remedy="lower count, size_m or safe_zone_offset_m",
         )
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import re
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,7 +39,7 @@ def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
     try:
         return model.model_validate(dict(values))
     except pydantic.ValidationError as error:
-        raise InputError("; ".join(_describe(model, item) for item in error.errors()), where=where) from None
+        raise InputError(_listed([_describe(model, item) for item in error.errors()]), where=where) from None
 
 
 def load_yaml(path: Path) -> Any:
@@ -52,11 +55,22 @@ def load_yaml(path: Path) -> Any:
         raise InputError(f"is not valid YAML: {problem}", where=str(path)) from None
 
 
+_MOST_MISTAKES = 4
+"""More are counted only: a file of another kind is wrong in every key."""
+
+
+def _listed(mistakes: list[str]) -> str:
+    more = len(mistakes) - _MOST_MISTAKES
+    return "; ".join(mistakes[:_MOST_MISTAKES] + ([f"and {more} more"] if more > 0 else []))
+
+
 def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
     """One mistake as `section.key: message, got value`, with the nearest key for an unknown one."""
     keys, known = _path(model, item["loc"])
     key = ".".join(keys)
     if item["type"] == "extra_forbidden":
+        if keys[-1] in known:  # of another kind of this section
+            return f"'{key}' does not go with the other keys of '{'.'.join(keys[:-1])}'; leave it or them out"
         hint = nearest(keys[-1], known) or (f"allowed: {', '.join(sorted(known))}" if known else "")
         return f"unknown key '{key}'; {hint}" if hint else f"unknown key '{key}'"
     if item["type"] == "missing":
@@ -64,7 +78,30 @@ def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
     message = item["msg"].removeprefix("Value error, ")
     if not key:  # of the whole, which is not worth repeating
         return message
-    return f"'{key}': {message[0].lower()}{message[1:]}, got {item['input']!r}"
+    hint = _hint(keys, item)
+    return f"'{key}': {message[0].lower()}{message[1:]}, got {_shown(item['input'])}" + (f"; {hint}" if hint else "")
+
+
+def _hint(keys: list[str], item: ErrorDetails) -> str:
+    """What was probably meant: a word in another spelling, or an angle in degrees."""
+    value, told = item["input"], item.get("ctx", {})
+    if item["type"] == "literal_error" and isinstance(value, str):
+        return nearest(value.lower(), re.findall(r"'([^']*)'", told["expected"]))
+    if item["type"] == "union_tag_invalid":
+        return nearest(str(told["tag"]).lower(), re.findall(r"'([^']*)'", told["expected_tags"]))
+    in_radians = any(part.endswith("_rad") for part in keys)
+    if in_radians and item["type"].startswith(("less", "greater")) and isinstance(value, int | float) and value:
+        return f"angles are in radians: {value:g} degrees are {math.radians(value):.4g}"
+    return ""
+
+
+def _shown(value: Any) -> str:
+    """The value as it is written, cut where it is long: a file's aliases can make one of any size."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 80
+    short.maxdict = short.maxlist = 6
+    short.maxlevel = 3
+    return short.repr(value)
 
 
 def _path(model: type[BaseModel], location: tuple[str | int, ...]) -> tuple[list[str], set[str]]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from scene.config import Config
+from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from sensors.camera import Side
 from sensors.effects import (
@@ -34,9 +35,9 @@ from sensors.effects.base import Effect, Stage
 class TlsNoise(Config):
     """A laser scanner's white noise, as a datasheet states it."""
 
-    range_sigma_m: float = Field(0.003, ge=0, description="standard deviation of the range [m]")
-    range_ppm: float = Field(0.0, ge=0, description="further standard deviation of the range, in proportion to it [ppm]")
-    angle_sigma_rad: float = Field(0.00005, ge=0, description="standard deviation of azimuth and of zenith [rad]")
+    range_sigma_m: float = Field(0.003, ge=0, le=10, description="standard deviation of the range [m]")
+    range_ppm: float = Field(0.0, ge=0, le=1e5, description="further standard deviation of the range, in proportion to it [ppm]")
+    angle_sigma_rad: float = Field(0.00005, ge=0, le=0.1, description="standard deviation of azimuth and of zenith [rad]")
 
 
 class TlsModel(Config):
@@ -99,6 +100,14 @@ class OrientationNoise(Config):
     def draw(self, side: Side, random: KeyedRandom) -> tuple[Effect, ...]:
         """One draw of all parameters for one camera, as effects; each parameter has its own random number."""
         value = {name: self._draw(name, random.child(name)) for name in type(self).model_fields}
+        try:
+            return self._effects(side, value)
+        except ValidationError as error:
+            problem = "; ".join(f"{item['loc'][-1]} {item['input']:.4g}: {item['msg'].lower()}" for item in error.errors())
+            remedy = "lower its sigma; angles are in radians"
+            raise InputError(f"a drawn value is out of bounds: {problem}", where="noise.orientation", remedy=remedy) from None
+
+    def _effects(self, side: Side, value: dict[str, float]) -> tuple[Effect, ...]:
         return (
             FocalLength(camera=side, delta_px=value["f_px"]),
             PrincipalPointX(camera=side, delta_px=value["cx_px"]),
@@ -120,8 +129,12 @@ class OrientationNoise(Config):
 class StereoNoise(Config):
     """A stereo pair's noise: matching, and orientation drawn anew at each observation."""
 
-    parallax_sigma_px: float = Field(0.3, ge=0, description="white noise of the disparity [px of the full-resolution frame]")
-    regularization_sigma_px: float = Field(0.1, ge=0, description="smooth noise of the disparity, at the nodes of a grid [px]")
+    parallax_sigma_px: float = Field(
+        0.3, ge=0, le=1000, description="white noise of the disparity [px of the full-resolution frame]"
+    )
+    regularization_sigma_px: float = Field(
+        0.1, ge=0, le=1000, description="smooth noise of the disparity, at the nodes of a grid [px]"
+    )
     regularization_step_px: float = Field(
         32.0, gt=0, description="distance of the grid's nodes [px of the full-resolution frame]"
     )

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from scene.config import Config
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair, Matrix3, Vector3, axis_rotation
+from sensors.camera import Camera, CameraPair, Matrix3, Vector3, axis_rotation, check_rotation
 
 VERTICAL = np.array([0.0, 0.0, 1.0])
 
@@ -58,8 +58,8 @@ class RigConfig(Config):
     height_m: float | None = Field(None, description="height above the wall's toe, none: level with the wall's centre [m]")
     width: int = Field(7360, gt=0, le=100_000, description="frame width [px]")
     height: int = Field(4912, gt=0, le=100_000, description="frame height [px]")
-    sensor_width_m: float = Field(0.0359, gt=0, description="width of the image sensor [m]")
-    focal_length_m: float = Field(0.050, gt=0, description="principal distance [m]")
+    sensor_width_m: float = Field(0.0359, gt=0, le=0.5, description="width of the image sensor [m]")
+    focal_length_m: float = Field(0.050, gt=0, le=3.0, description="principal distance [m]")
     k1: float = Field(0.0, description="radial distortion, r^2")
     k2: float = Field(0.0, description="radial distortion, r^4")
 
@@ -115,6 +115,11 @@ class StationConfig(Config):
     height_m: float = Field(1.6, description="height above the wall's toe, where no position_m is given [m]")
     rotation: Matrix3 | None = Field(None, description="scanner to world; none: levelled, azimuth 0 towards the wall's centre")
     pose_sigma: PoseSigma = EXACT_POSE
+
+    @field_validator("rotation")
+    @classmethod
+    def _orthonormal(cls, rotation: Matrix3 | None) -> Matrix3 | None:
+        return None if rotation is None else check_rotation(rotation)
 
     def place(self, target: Target) -> tuple[FloatArray, FloatArray]:
         """Position (3,) m and rotation (3, 3) scanner to world."""

@@ -39,8 +39,8 @@ class ScannerConfig(Config):
 
     name: str | None = Field(None, min_length=1, description="manufacturer and model; a preset gives its own")
     zenith_limits_rad: Window = Field((0.5, 2.3), description="field of view in zenith: smallest, largest [rad]")
-    azimuth_step_rad: float = Field(0.0005, gt=0, description="angular step between scan lines [rad]")
-    zenith_step_rad: float = Field(0.0005, gt=0, description="angular step between the pulses of a line [rad]")
+    azimuth_step_rad: float = Field(0.0005, gt=0, le=0.02, description="angular step between scan lines [rad]")
+    zenith_step_rad: float = Field(0.0005, gt=0, le=0.02, description="angular step between the pulses of a line [rad]")
     azimuth_rad: Window | None = Field(None, description="window in azimuth: start, stop; none: the wall's extent [rad]")
     zenith_rad: Window | None = Field(None, description="window in zenith: start, stop; none: the wall's extent [rad]")
     pulse_rate_hz: float = Field(100_000.0, gt=0, description="pulses per second [Hz]")
@@ -59,8 +59,11 @@ class ScannerConfig(Config):
             window = getattr(self, name)
             if window is not None and not window[0] < window[1]:
                 raise ValueError(f"{name}: start must be smaller than stop, got {list(window)}")
-        if not 0 <= self.zenith_limits_rad[0] < self.zenith_limits_rad[1] <= np.pi:
-            raise ValueError(f"zenith_limits_rad must lie in 0..pi, got {list(self.zenith_limits_rad)} (are these degrees?)")
+        for name, low, high in (("zenith_limits_rad", 0, 1), ("zenith_rad", 0, 1), ("azimuth_rad", -2, 2)):
+            window = getattr(self, name)
+            if window is not None and not low * np.pi <= window[0] < window[1] <= high * np.pi:
+                allowed = "0..pi" if low == 0 else "-2 pi..2 pi"
+                raise ValueError(f"{name} must lie in {allowed}, got {list(window)} (are these degrees?)")
         if self.minimum_range_m >= self.maximum_range_m:
             raise ValueError("minimum_range_m must be smaller than maximum_range_m")
         return self

@@ -40,8 +40,11 @@ def anchors(
 def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
     """(..., n, m) of boxes (..., n, 4) and (..., m, 4); 0 where both are empty."""
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
-    side = ops.maximum(ops.minimum(left[..., 2:], right[..., 2:]) - ops.maximum(left[..., :2], right[..., :2]), 0.0)
-    common = side[..., 0] * side[..., 1]
+    height, width = (
+        ops.maximum(ops.minimum(left[..., end], right[..., end]) - ops.maximum(left[..., start], right[..., start]), 0.0)
+        for start, end in ((0, 2), (1, 3))
+    )
+    common = height * width
     return common / ops.maximum(_area(left) + _area(right) - common, 1e-6)
 
 

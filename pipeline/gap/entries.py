@@ -140,11 +140,12 @@ def from_tails(sensor: str, sigma: float, points: int) -> Named:
 def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:
     """An effect on the returns; a detection limit shows as the smallest recorded power."""
     parameters, std = dict(found.parameters), dict(found.std)
+    kind = "empirical" if found.covariate else "physical"
     if found.name == "detection_limit" and intensity is not None:
         low = np.sort(intensity)[: max(len(intensity) // 200, 2)]
         parameters["minimum_power"], std["minimum_power"] = float(low[0]), float(low[1] - low[0])
     p_value = max(float(np.exp(-found.score)), 1 / 2000)
-    return Named(f"tls.{found.name}", "physical", {"name": found.name, **parameters}, std, (), p_value, found.gain)
+    return Named(f"tls.{found.name}", kind, {"name": found.name, **parameters}, std, (), p_value, found.gain)
 
 
 @dataclass(frozen=True)

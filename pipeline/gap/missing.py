@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.optimize import minimize
+from scipy.special import expit, logit, ndtr
 
 from pipeline.gap.cells import patches
 from pipeline.gap.residuals import BoolArray, Missing
@@ -14,11 +16,20 @@ from scene.mesh import FloatArray
 _LEAST_GAIN = 9.0
 _PULSES_PER_PATCH = 60.0
 _ABRUPT = 0.7
+_SCATTERED = 0.8
+_FREE_MARGIN, _FREE_RATIO = 6.0, 1.5
+"""A free form must score as much more than the catalogue's effects."""
+_DIRECTIONS = ("azimuth", "zenith")
+"""What losses may depend on for no reason of the catalogue: range, incidence and power have theirs."""
+_BINS = 16
+_MOST_PULSES = 20_000
+"""That decide where the search for a limit starts."""
 
 
 @dataclass(frozen=True)
 class MissingFound:
-    """An effect on the returns. gain: in log-likelihood over a constant share of losses; chance: (m,) of being lost."""
+    """An effect on the returns. gain: in log-likelihood over a constant share of losses; chance: (m,) of being lost; covariate:
+    of a free form, whose name is that of the effect that comes nearest; else empty."""
 
     name: str
     gain: float
@@ -26,7 +37,8 @@ class MissingFound:
     parameters: dict[str, float]
     std: dict[str, float]
     chance: FloatArray
-    tried: tuple[tuple[str, float], ...]
+    tried: tuple[tuple[str, float], ...] = ()
+    covariate: str = ""
 
 
 def find_missing(missing: Missing, early: int, points: int, intensity: FloatArray | None) -> MissingFound | None:
@@ -45,19 +57,28 @@ def find_missing(missing: Missing, early: int, points: int, intensity: FloatArra
     if intensity is not None and not _is_cut(intensity):
         limit = replace(limit, score=-np.inf)
     best, other = (limit, rain) if limit.score >= rain.score else (rain, limit)
+    free = _free(lost, missing.covariates, plain)
+    sureness = 1 / _clustering(lost, free.chance, missing.at)
+    if free.score > _FREE_RATIO * best.score and (free.score - best.score) * sureness > _FREE_MARGIN:
+        best = free
     sureness = 1 / _clustering(lost, best.chance, missing.at)
     best = replace(best, gain=best.gain * sureness, score=best.score * sureness)
     if best.score < _LEAST_GAIN:
         return None
-    return MissingFound(
-        best.name,
-        best.gain,
-        best.score,
-        best.parameters,
-        {key: value / np.sqrt(sureness) for key, value in best.std.items()},
-        best.chance,
-        ((best.name, best.score), (other.name, other.score)),
+    return replace(
+        best,
+        std={key: value / np.sqrt(sureness) for key, value in best.std.items()},
+        tried=((best.name, best.score), (other.name, other.score)),
     )
+
+
+def isolated(at: FloatArray, early: BoolArray) -> int:
+    """How many returns come early from drops, which fall anywhere; what stands before the wall, or an edge of it, returns many
+    pulses side by side, and then it is none."""
+    patch, count = patches(at, _PULSES_PER_PATCH), int(early.sum())
+    number = int(patch.max()) + 1
+    anywhere = number * (1 - (1 - 1 / number) ** count)
+    return count if len(np.unique(patch[early])) >= _SCATTERED * anywhere else 0
 
 
 def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
@@ -81,38 +102,78 @@ def _is_cut(intensity: FloatArray) -> bool:
 
 def _limit(lost: BoolArray, log_power: FloatArray, plain: float) -> MissingFound:
     """P = p0 + (1 - p0) Phi((ln P_min - ln rho - ln(cos i / R^2)) / s): the albedo is unknown, log-normal."""
-    best = (-np.inf, 0.0, 0.0, 0.0)
-    for spread in (0.05, 0.2, 0.4, 0.7):
-        for level in np.quantile(log_power, [0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4]) - spread:
-            steep = ndtr((level - log_power) / spread)
-            for base in (1e-4, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1):
-                best = max(best, (_likelihood(lost, base + (1 - base) * steep) - plain, float(level), spread, base))
-    gain, level, spread, base = best
-    chance = base + (1 - base) * ndtr((level - log_power) / spread)
-    value = float(np.exp(level) * 0.5)
-    return MissingFound(
-        "detection_limit", gain, gain - 3.0, {"minimum_power": value}, {"minimum_power": value * spread}, chance, ()
+
+    def chance(values: FloatArray) -> FloatArray:
+        level, spread, base = values[0], np.exp(values[1]), expit(values[2])
+        return np.asarray(base + (1 - base) * ndtr((level - log_power) / spread))
+
+    levels = np.quantile(log_power, [0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95])
+    starts = [
+        np.array([level - spread, np.log(spread), logit(base)])
+        for spread in (0.05, 0.2, 0.5)
+        for level in levels
+        for base in (0.003, 0.02, 0.08)
+    ]
+    thin = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
+    some = [_likelihood(lost[thin], chance(start)[thin]) for start in starts]
+    found = minimize(
+        lambda values: -_likelihood(lost, chance(values)),
+        starts[int(np.argmax(some))],
+        method="Nelder-Mead",
+        options={"maxiter": 150, "xatol": 1e-3, "fatol": 0.05},
     )
+    gain, level, spread = -float(found.fun) - plain, float(found.x[0]), float(np.exp(found.x[1]))
+    value = float(np.exp(level) * 0.5)
+    parameters, std = {"minimum_power": value}, {"minimum_power": value * spread}
+    return MissingFound("detection_limit", gain, gain - 3.0, parameters, std, chance(found.x))
 
 
 def _rain(lost: BoolArray, range_m: FloatArray, plain: float, early: int, points: int) -> MissingFound:
     """P = 1 - (1 - p0) exp(-2 beta R); early returns count as drops where they are more than a few."""
-    rates = np.concatenate([[0.0], np.geomspace(1e-6, 0.05, 40)])
-    bases = (0.0, 0.003, 0.006, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1)
-    gains = np.array(
-        [[_likelihood(lost, 1 - (1 - base) * np.exp(-2 * rate * range_m)) - plain for base in bases] for rate in rates]
-    )
-    drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
-    profile = gains.max(axis=1)
-    rate = float(rates[int(np.argmax(profile))])
-    base = bases[int(np.argmax(gains[int(np.argmax(profile))]))]
-    chance = 1 - (1 - base) * np.exp(-2 * rate * range_m)
-    near = rates[profile > profile.max() - 0.5]
+
+    def chance(values: FloatArray) -> FloatArray:
+        return np.asarray(1 - (1 - expit(values[1])) * np.exp(-2 * np.exp(values[0]) * range_m))
+
+    def cost(values: FloatArray) -> float:
+        return -_likelihood(lost, chance(values))
+
+    starts = [np.array([np.log(rate), logit(base)]) for rate in np.geomspace(1e-6, 0.05, 20) for base in (0.003, 0.01, 0.03, 0.1)]
+    thin = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
+    first = starts[int(np.argmax([_likelihood(lost[thin], chance(start)[thin]) for start in starts]))]
+    found = minimize(cost, first, method="Nelder-Mead", options={"maxiter": 120, "xatol": 1e-3, "fatol": 0.05})
     share = min(early / max(float(lost.sum()) + early, 1.0), 1.0)
-    parameters = {"rate_per_m": max(rate, 1e-6), "early_share": share}
-    std = {"rate_per_m": float(max(np.ptp(near) / 2, 0.1 * rate)), "early_share": float(np.sqrt(share / max(early, 1)))}
-    gain = float(profile.max()) + drops
-    return MissingFound("precipitation", gain, gain - 2.0, parameters, std, chance, ())
+    rate = max(float(np.exp(found.x[0])) / max(1 - share, 1e-3), 1e-6)
+    drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
+    std = {"rate_per_m": rate * _log_error(cost, found.x), "early_share": float(np.sqrt(share / max(early, 1)))}
+    gain = drops - float(found.fun) - plain
+    return MissingFound("precipitation", gain, gain - 2.0, {"rate_per_m": rate, "early_share": share}, std, chance(found.x))
+
+
+def _log_error(cost: Callable[[FloatArray], float], top: FloatArray) -> float:
+    """Standard deviation of the first of two values at the least cost, by the cost's curvature; 1 where that says nothing."""
+    step = 0.05
+    moves = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
+    a, b, c, d, e, f = (cost(top + move) for move in moves)
+    middle = cost(top)
+    own, other = (a + b - 2 * middle) / step**2, (c + d - 2 * middle) / step**2
+    both = (e + f - a - b - c - d + 2 * middle) / (2 * step**2)
+    determinant = own * other - both**2
+    return float(np.sqrt(other / determinant)) if determinant > 0 < other else 1.0
+
+
+def _free(lost: BoolArray, covariates: dict[str, FloatArray], plain: float) -> MissingFound:
+    """Losses free in each of some bins of one angle; their mean as a rate of precipitation."""
+    found = []
+    for name in _DIRECTIONS:
+        values = covariates[name]
+        group = np.searchsorted(np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1]), values)
+        count = np.maximum(np.bincount(group, minlength=_BINS), 1)
+        chance = (np.bincount(group, lost, _BINS) / count)[group]
+        gain = _likelihood(lost, chance) - plain
+        rate = max(-float(np.log1p(-float(lost.mean()))) / (2 * float(np.mean(covariates["range"]))), 1e-6)
+        parameters = {"rate_per_m": rate, "early_share": 0.0}
+        found.append(MissingFound("precipitation", gain, gain - _BINS, parameters, {}, chance, (), name))
+    return max(found, key=lambda each: each.score)
 
 
 def _likelihood(lost: BoolArray, chance: FloatArray) -> float:

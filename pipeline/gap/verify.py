@@ -136,8 +136,10 @@ def measure_gap(
     versions = [_draws(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
     truth, measured = _draws(measurement, after, residuals, random.child("floor")), observed(residuals)
     usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
-    off = np.min([np.abs(measured - draws.mean(axis=0)) for draws in versions], axis=0)
-    usable &= off < largest * residuals.sigma
+    reach = largest * residuals.sigma
+    off = np.min([np.abs(measured - np.median(draws, axis=0)) for draws in versions], axis=0)
+    usable &= off < reach
+    versions, truth = [_near(draws, reach) for draws in versions], _near(truth, reach)
     usable &= np.isin(patch, np.flatnonzero(np.bincount(patch[usable], minlength=patch.max() + 1) >= _FEWEST_POINTS))
     if not usable.any():
         return None
@@ -159,6 +161,12 @@ def measure_gap(
         floor_error=float((old - floor).std() / np.sqrt(count)),
         points=int(usable.sum()),
     )
+
+
+def _near(draws: FloatArray, reach: FloatArray) -> FloatArray:
+    """Draws (d, n) cut off at a reach (n,) from their median: an early return from a drop is no part of the wall."""
+    middle = np.median(draws, axis=0)
+    return np.asarray(np.clip(draws, middle - reach, middle + reach))
 
 
 def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:

@@ -15,7 +15,7 @@ from pipeline.gap.entries import SPREADS, Named, from_missing, from_shape, from_
 from pipeline.gap.footprint import find_footprint
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
-from pipeline.gap.missing import find_missing
+from pipeline.gap.missing import find_missing, isolated
 from pipeline.gap.naming import believes, name_effects
 from pipeline.gap.registration import pose_of, registered, residuals_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
@@ -141,9 +141,9 @@ def _shaped(
 def _with_tails(
     measurement: Measurement, named: list[Named], residuals: Residuals, rows: NDArray[np.int64], cells: Cells
 ) -> list[Named]:
-    """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes but one: strips that
-    are filled are also cells that had no match by chance."""
-    if any(item.name == "stereo.occlusion_fill" for item in named):
+    """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes but two: strips that
+    are filled are also cells that had no match by chance, and drops return early."""
+    if any(item.name == "stereo.occlusion_fill" or item.entry.get("early_share") for item in named):
         return named
     model = with_effects(measurement.model, [item.entry for item in named])
     _, found, _ = settled(measurement.changed(model=model), residuals.index[rows])
@@ -202,7 +202,7 @@ def _missing(measurement: Measurement, residuals: Residuals, rough: FloatArray, 
     if residuals.missing is None or believes(measurement, "precipitation") or believes(measurement, "detection_limit"):
         return []
     early = residuals.smooth & ~changed & (rough < -np.maximum(_EARLY_SIGMAS * residuals.sigma, _EARLY_M))
-    found = find_missing(residuals.missing, int(early.sum()), len(residuals), measurement.cloud.intensity)
+    found = find_missing(residuals.missing, isolated(residuals.at, early), len(residuals), measurement.cloud.intensity)
     return [] if found is None else [from_missing(found, measurement.cloud.intensity)]
 
 

@@ -129,8 +129,6 @@ def rockfalls(
     """The blocks of each epoch: the config's, or with sides that grow from epoch to epoch, as many of them as have room."""
     if sizes_m is None:
         return [config] * epochs
-    if not 0 < sizes_m[0] <= sizes_m[1]:
-        raise InputError(f"got {sizes_m[0]:g} and {sizes_m[1]:g} m", where="--sizes-m", allowed="0 < smallest <= largest")
     area = float(np.prod((bounds[1] - bounds[0])[:2]))
     result = []
     for side in np.geomspace(*sizes_m, epochs):

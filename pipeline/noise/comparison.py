@@ -12,6 +12,7 @@ from pipeline.noise.compare import Trial, compare
 from pipeline.noise.contestants import Contestant
 from pipeline.noise.measured import MeasuredMaps, read_measured
 from pipeline.progress import Progress
+from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 
 
@@ -43,6 +44,8 @@ def compare_sensors(
     measured: folders as `read_measured` takes them, at the first config's GSD and registered by its ICP. They are read first, as
     a mistake there should not cost a simulation.
     """
+    if sizes_m is not None and not 0 < sizes_m[0] <= sizes_m[1]:
+        raise InputError(f"got {sizes_m[0]:g} and {sizes_m[1]:g} m", where="--sizes-m", allowed="0 < smallest <= largest")
     progress = progress or Progress()
     config = sensors[0].config
     random = KeyedRandom(config.seed)

@@ -7,7 +7,9 @@ The cost of parameters theta (their logarithms x) is the squared Mahalanobis dis
 m the statistics' mean over simulations and S their covariance for so many epochs as were measured: indirect inference
 (Gourieroux, Monfort and Renault 1993), or a synthetic likelihood (Wood 2010). m is a quadratic polynomial fitted to simulations
 around the minimum, which rounds of simulations approach: the first over all bounds (Sobol points), each further one drawn
-around the last minimum with twice its covariance. J is minimised by SciPy's trust region (Branch, Coleman and Li 1999).
+around the last minimum with twice its covariance. J is minimised by SciPy's trust region (Branch, Coleman and Li 1999). A
+polynomial over all bounds can lead to where a parameter is too small to matter, and no way back shows there: a minimum that the
+misfit rejects is sought a second time from more points, and the better of the two is kept.
 
 Intervals. Every simulation of the last round is estimated like the measurement, by a surface that was fitted without it (five
 folds); what comes out minus what went in is the distribution of the estimate's error, bias included: a parametric bootstrap. To
@@ -39,6 +41,9 @@ MODEL_SIGMA = 0.003
 _FOLDS = 5
 _APPROACHES = 3
 _MORE_ROUNDS = 2
+_REJECTED = 0.01
+_DENSITIES = (1, 4)
+"""A minimum of misfit_p below `_REJECTED` is sought a second time, from four times as many points over all bounds."""
 _WIDEN = 2.0
 _LEAST_SPREAD = 0.03
 _SHRINK, _SHRINK_LIMITS = 0.5, (0.05, 0.9)
@@ -162,7 +167,17 @@ class Search:
 
     def run(self, observed: FloatArray, simulations: int, confidence: float) -> Found:
         """Approach the minimum and measure how well it is known. observed: (m,) statistics of the measurement."""
-        x, spread, history = self._approach(observed)
+        found = self._run_once(observed, simulations, confidence, _DENSITIES[0])
+        for density in _DENSITIES[1:]:
+            if found.misfit_p >= _REJECTED:
+                break
+            again = self._run_once(observed, simulations, confidence, density)
+            better = min(found, again, key=lambda each: (-each.misfit_p, each.cost))
+            found = replace(better, history=(*found.history, *again.history), maps=self.maps)
+        return found
+
+    def _run_once(self, observed: FloatArray, simulations: int, confidence: float, density: int) -> Found:
+        x, spread, history = self._approach(observed, density)
         for attempt in range(1 + _MORE_ROUNDS):
             with self.progress.stage(f"last round{' again' * attempt}"):
                 sample = self._sample(self._around(x, spread, simulations), self.epochs)
@@ -175,12 +190,11 @@ class Search:
                 break
         return self._judged(observed, sample, surface, minimum, confidence, tuple(history), inside)
 
-    def _approach(self, observed: FloatArray) -> tuple[FloatArray, FloatArray, list[tuple[int, FloatArray]]]:
-        """Rounds with one later epoch, which is enough for the mean of the statistics."""
+    def _approach(self, observed: FloatArray, density: int) -> tuple[FloatArray, FloatArray, list[tuple[int, FloatArray]]]:
+        """Rounds with one later epoch, which is enough for the mean of the statistics; density: of the first round's points."""
         size = max(3 * self.terms, _LEAST_SETS)
-        sobol = stats.qmc.Sobol(len(self.low), rng=np.random.default_rng(self.random.child("sobol").key)).random(
-            int(2 ** np.ceil(np.log2(size)))
-        )
+        generator = np.random.default_rng(self.random.child("sobol").key)
+        sobol = stats.qmc.Sobol(len(self.low), rng=generator).random(int(2 ** np.ceil(np.log2(density * size))))
         sample = Sample(np.empty((0, len(self.low))), np.empty((0, len(observed))))
         points, history = self.low + sobol * (self.high - self.low), []
         for number in range(_APPROACHES):

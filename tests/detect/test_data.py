@@ -14,6 +14,7 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from test_model import make_set
 
+from pipeline.cli.main import main
 from pipeline.detect import baseline, events
 from pipeline.detect.config import DetectorConfig, NormalisationConfig, TrainingConfig
 from pipeline.detect.data import CocoFolder, batches, mirrored
@@ -144,6 +145,12 @@ def test_detect_writes_what_it_says(tmp_path):
     assert len((out / "events_0.9.csv").read_text().splitlines()) == 7
     for name in ("detections.json", "detections_0.99.json", "1_masks.tif", "1_detections.png"):
         assert (out / name).is_file()
+
+
+def test_the_command_shows_its_progress_and_says_what_it_found(tmp_path, capsys):
+    make_set(tmp_path / "set", 1, 9)
+    assert main(["detect", "baseline", str(tmp_path / "set"), "--out", str(tmp_path / "out"), "--no-pictures"]) == 0
+    assert "3 blocks" in capsys.readouterr().out
 
 
 def test_inputs_that_are_none_are_refused(tmp_path):

@@ -180,6 +180,27 @@ def test_a_model_that_cannot_make_the_measurement_is_told() -> None:
     assert known.search(3).run(observed, 100, 0.95).misfit_p < 0.01
 
 
+def test_a_search_that_went_astray_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the second parameter is too small to matter nothing shows the way back. Five standard deviations; the first search,
+    without the second, ends more than ten away."""
+    known = Known(np.array([[1.0, 0.1], [1.0, 0.3], [0.6, 1.0], [0.1, 1.0], [0.4, 0.4]]))
+    search, truth = known.search(1), np.log([1.0, 0.6])
+    approach = search._approach
+
+    def astray(observed: FloatArray, density: int) -> tuple[FloatArray, FloatArray, list[tuple[int, FloatArray]]]:
+        found = approach(observed, density)
+        return found if density > 1 else (np.log([1.4, 0.06]), np.diag([1e-4, 1e-4]), found[2])
+
+    monkeypatch.setattr(search, "_approach", astray)
+    observed = known(np.exp(truth), 2, KeyedRandom(1).child("measured"))
+    found = search.run(observed, 100, 0.95)
+    sigma = (found.high - found.low) / 4
+    assert found.misfit_p >= 0.01
+    assert np.abs((found.x - truth) / sigma).max() < 5
+    assert np.abs((found.history[3][1] - truth) / sigma).max() > 10
+    assert len(found.history) > 5
+
+
 def test_parameters_that_act_alike_are_correlated() -> None:
     known = Known(np.array([[1.0, 1.0], [1.0, 1.02], [1.02, 1.0]]))
     found = known.search(3).run(known(np.array([1.0, 1.0]), 2, KeyedRandom(1)), 100, 0.95)

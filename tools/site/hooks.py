@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +30,29 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for maker in _MAKERS:
         for path, content in maker.pages().items():
             files.append(File.generated(config, path, content=content))
-    config.nav = _written_out(config.nav, sorted(file.src_uri for file in files.documentation_pages()))
+    pages = sorted(file.src_uri for file in files.documentation_pages())
+    config.nav = _written_out(config.nav, pages, set(_named(config.nav)))
     return files
 
 
-def _written_out(entry: Any, pages: list[str]) -> Any:
-    """The navigation with each entry that ends in / replaced by the pages of that folder, its index first."""
+def _named(entry: Any) -> Iterator[str]:
+    """Every entry of the navigation, whatever its depth."""
+    if isinstance(entry, str):
+        yield entry
+    else:
+        for part in entry.values() if isinstance(entry, dict) else entry:
+            yield from _named(part)
+
+
+def _written_out(entry: Any, pages: list[str], named: set[str]) -> Any:
+    """The navigation with folders (an index first) and "*" replaced by the pages that they stand for."""
     if isinstance(entry, list):
-        return [_written_out(part, pages) for part in entry]
+        parts = [_written_out(part, pages, named) for part in entry]
+        return [page for part in parts for page in (part if isinstance(part, list) else [part])]
     if isinstance(entry, dict):
-        return {title: _written_out(part, pages) for title, part in entry.items()}
+        return {title: _written_out(part, pages, named) for title, part in entry.items()}
+    if entry == "*":
+        return [page for page in pages if "/" not in page and page not in named]
     if not entry.endswith("/"):
         return entry
     inside = [page for page in pages if page.startswith(entry)]

@@ -10,7 +10,7 @@ from packaging.utils import canonicalize_name
 
 _INTRODUCTION = """# Licences of the dependencies
 
-scarpsim is under the MIT licence. It installs the distributions below and holds no copy of any of them. The list is what `pip
+scarpsim is under the MIT licence. It installs the distributions below. The list is what `pip
 install scarpsim` and its extras bring, directly or through another, in the versions of the environment that built this page
 (Linux, Python {python}); the licence is the SPDX expression, field or classifier of the distribution's metadata.
 """
@@ -59,9 +59,8 @@ def _table(title: str, names: set[str]) -> str:
 
 
 def _licence(stated: metadata.PackageMetadata) -> str:
-    """The shortest sure statement: expression, else classifiers, else the field's first line."""
+    """The shortest sure statement: expression, else the field where it is a name and no text, else classifiers."""
     classifiers = [each.removeprefix(_CLASSIFIER) for each in stated.get_all("Classifier") or [] if each.startswith(_CLASSIFIER)]
-    field = (stated.get("License") or "").strip().splitlines()
-    first = field[0].strip() if field else ""
-    text = stated.get("License-Expression") or (first if 0 < len(first) <= _LONGEST else "") or ", ".join(classifiers)
-    return text or "not stated in the metadata"
+    field = (stated.get("License") or "").strip()
+    named = field if 0 < len(field) <= _LONGEST and "\n" not in field else ""
+    return stated.get("License-Expression") or named or ", ".join(classifiers) or "not stated in the metadata"
