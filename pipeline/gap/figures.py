@@ -108,12 +108,13 @@ def profiles_figure(found: Diagnosis) -> bytes:
 
 def gap_figure(gap: Gap) -> bytes:
     """One bar from the floor over the score after to the score before."""
-    floor, after, before = (1e3 * value for value in (gap.floor, gap.after, gap.before))
+    factor, unit = gap.shown
+    floor, after, before = (factor * value for value in (gap.floor, gap.after, gap.before))
     figure = Figure(figsize=(9.0, 1.7), layout="constrained")
     panel = figure.add_subplot()
     panel.barh(0, before - after, left=after, color="#56B4E9", height=0.5, label="closed")
     panel.barh(0, max(after - floor, 0.0), left=floor, color=_BEFORE, height=0.5, label="left")
-    errors = {"before": 1e3 * gap.error, "after": 1e3 * gap.floor_error}
+    errors = {"before": factor * gap.error, "after": factor * gap.floor_error}
     for name, value, level in (("floor", floor, -0.42), ("after", after, 0.34), ("before", before, -0.42)):
         panel.plot([value, value], [-0.33, 0.33], color="black", linewidth=1.2)
         panel.text(value, level, f"{name} {value:.3f}", ha="center", va="bottom" if level > 0 else "top", fontsize=8)
@@ -123,7 +124,8 @@ def gap_figure(gap: Gap) -> bytes:
     panel.set_xlim(min(floor, after, before) - room, max(floor, after, before) + room)
     panel.set_ylim(-0.9, 0.9)
     panel.set_yticks([])
-    panel.set_xlabel("score of the held-out residuals, mm (whiskers: two standard errors of the differences)", fontsize=8)
+    what = f"score of what was held out, {unit} (whiskers: two standard errors of the differences)"
+    panel.set_xlabel(what, fontsize=8)
     panel.tick_params(labelsize=8)
     return png(figure)
 

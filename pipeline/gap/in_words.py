@@ -85,9 +85,10 @@ def _effect(effect: Named) -> str:
 
 
 def _gap(gap: Gap, named: bool) -> str:
-    scores = f"{1e3 * gap.before:.3f} mm before"
-    after = f", {1e3 * gap.after:.3f} mm after" if named else ""
-    text = f"On blocks that no step has used, the gap is {scores}{after}; the model's own noise leaves {1e3 * gap.floor:.3f} mm"
+    factor, unit = gap.shown
+    before, after, floor = (f"{factor * value:.3f} {unit}" for value in (gap.before, gap.after, gap.floor))
+    scores = f"{before} before, {after} after" if named else f"{before} before"
+    text = f"On blocks that no step has used, the gap is {scores}; the model's own noise leaves {floor}"
     if gap.closed is None:
         return f"{text}, so before and floor differ by no more than their uncertainty."
     return f"{text}: {gap.closed:.0%} of the gap is closed."

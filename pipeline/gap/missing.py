@@ -13,6 +13,7 @@ from pipeline.gap.cells import patches
 from pipeline.gap.residuals import BoolArray, Missing
 from scene.mesh import FloatArray
 
+LOSSES = ("detection_limit", "precipitation")
 _LEAST_GAIN = 9.0
 _PULSES_PER_PATCH = 60.0
 _ABRUPT = 0.7
@@ -41,27 +42,62 @@ class MissingFound:
     covariate: str = ""
 
 
-def find_missing(missing: Missing, early: int, points: int, intensity: FloatArray | None) -> MissingFound | None:
-    """The effect that the losses ask for, if any. early: returns far before the surface, of `points`; intensity: (n,) or None.
+@dataclass(frozen=True)
+class Losses:
+    """lost: (m,); fit: (m,) pulses that may be looked at; plain: log-likelihood of those at one share of losses."""
+
+    lost: BoolArray
+    fit: BoolArray
+    plain: float
+
+    @classmethod
+    def of(cls, lost: BoolArray, fit: BoolArray) -> Losses:
+        """Of pulses (m,)."""
+        share = np.full(int(fit.sum()), np.clip(lost[fit].mean(), 1e-9, 1 - 1e-9))
+        return cls(lost, fit, _likelihood(lost[fit], share))
+
+    def best(self, chance: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, starts: list[FloatArray]) -> _Best:
+        """The most likely values of a chance of being lost, which is a function of them and of what x (m,) holds."""
+        seen, lost = x[self.fit], self.lost[self.fit]
+        thin = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
+        first = starts[int(np.argmax([_likelihood(lost[thin], chance(start, seen[thin])) for start in starts]))]
+
+        def cost(values: FloatArray) -> float:
+            return -_likelihood(lost, chance(values, seen))
+
+        found = minimize(cost, first, method="Nelder-Mead", options={"maxiter": 150, "xatol": 1e-3, "fatol": 0.05})
+        return _Best(found.x, -float(found.fun) - self.plain, chance(found.x, x), cost)
+
+
+@dataclass(frozen=True)
+class _Best:
+    """values at the top; gain over one share of losses; chance: (m,); cost: negative log-likelihood of values."""
+
+    values: FloatArray
+    gain: float
+    chance: FloatArray
+    cost: Callable[[FloatArray], float]
+
+
+def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, intensity: FloatArray | None) -> MissingFound | None:
+    """The effect that the losses ask for, if any. fit: (m,) pulses that may be looked at; early: returns far before the surface,
+    of `points`; intensity: (n,) or None.
 
     Losses come in clusters (shrubs, wet rock), so that a likelihood of independent pulses is far too sure: gains are divided by
     how much more the losses of whole patches scatter than independent ones would, under the best explanation itself.
     """
     lost = missing.lost
-    share = float(np.clip(lost.mean(), 1e-9, 1 - 1e-9))
-    plain = float(lost.sum() * np.log(share) + (~lost).sum() * np.log1p(-share))
-    limit, rain = (
-        _limit(lost, missing.covariates["log_power"], plain),
-        _rain(lost, missing.covariates["range"], plain, early, points),
-    )
+    losses = Losses.of(lost, fit)
+    limit = _limit(losses, missing.covariates["log_power"])
+    rain = _rain(losses, missing.covariates["range"], early, points)
     if intensity is not None and not _is_cut(intensity):
         limit = replace(limit, score=-np.inf)
     best, other = (limit, rain) if limit.score >= rain.score else (rain, limit)
-    free = _free(lost, missing.covariates, plain)
-    sureness = 1 / _clustering(lost, free.chance, missing.at)
+    free = _free(losses, missing.covariates)
+    sureness = 1 / _clustering(lost[fit], free.chance[fit], missing.at[fit])
     if free.score > _FREE_RATIO * best.score and (free.score - best.score) * sureness > _FREE_MARGIN:
         best = free
-    sureness = 1 / _clustering(lost, best.chance, missing.at)
+    sureness = 1 / _clustering(lost[fit], best.chance[fit], missing.at[fit])
     best = replace(best, gain=best.gain * sureness, score=best.score * sureness)
     if best.score < _LEAST_GAIN:
         return None
@@ -100,53 +136,39 @@ def _is_cut(intensity: FloatArray) -> bool:
     return (middle - low) < _ABRUPT * (high - low)
 
 
-def _limit(lost: BoolArray, log_power: FloatArray, plain: float) -> MissingFound:
+def _limit(losses: Losses, log_power: FloatArray) -> MissingFound:
     """P = p0 + (1 - p0) Phi((ln P_min - ln rho - ln(cos i / R^2)) / s): the albedo is unknown, log-normal."""
 
-    def chance(values: FloatArray) -> FloatArray:
-        level, spread, base = values[0], np.exp(values[1]), expit(values[2])
-        return np.asarray(base + (1 - base) * ndtr((level - log_power) / spread))
+    def chance(values: FloatArray, x: FloatArray) -> FloatArray:
+        base = expit(values[2])
+        return np.asarray(base + (1 - base) * ndtr((values[0] - x) / np.exp(values[1])))
 
-    levels = np.quantile(log_power, [0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95])
     starts = [
         np.array([level - spread, np.log(spread), logit(base)])
         for spread in (0.05, 0.2, 0.5)
-        for level in levels
+        for level in np.quantile(log_power, [0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95])
         for base in (0.003, 0.02, 0.08)
     ]
-    thin = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
-    some = [_likelihood(lost[thin], chance(start)[thin]) for start in starts]
-    found = minimize(
-        lambda values: -_likelihood(lost, chance(values)),
-        starts[int(np.argmax(some))],
-        method="Nelder-Mead",
-        options={"maxiter": 150, "xatol": 1e-3, "fatol": 0.05},
-    )
-    gain, level, spread = -float(found.fun) - plain, float(found.x[0]), float(np.exp(found.x[1]))
-    value = float(np.exp(level) * 0.5)
-    parameters, std = {"minimum_power": value}, {"minimum_power": value * spread}
-    return MissingFound("detection_limit", gain, gain - 3.0, parameters, std, chance(found.x))
+    found = losses.best(chance, log_power, starts)
+    value = float(np.exp(found.values[0]) * 0.5)
+    std = {"minimum_power": value * float(np.exp(found.values[1]))}
+    return MissingFound("detection_limit", found.gain, found.gain - 3.0, {"minimum_power": value}, std, found.chance)
 
 
-def _rain(lost: BoolArray, range_m: FloatArray, plain: float, early: int, points: int) -> MissingFound:
+def _rain(losses: Losses, range_m: FloatArray, early: int, points: int) -> MissingFound:
     """P = 1 - (1 - p0) exp(-2 beta R); early returns count as drops where they are more than a few."""
 
-    def chance(values: FloatArray) -> FloatArray:
-        return np.asarray(1 - (1 - expit(values[1])) * np.exp(-2 * np.exp(values[0]) * range_m))
-
-    def cost(values: FloatArray) -> float:
-        return -_likelihood(lost, chance(values))
+    def chance(values: FloatArray, x: FloatArray) -> FloatArray:
+        return np.asarray(1 - (1 - expit(values[1])) * np.exp(-2 * np.exp(values[0]) * x))
 
     starts = [np.array([np.log(rate), logit(base)]) for rate in np.geomspace(1e-6, 0.05, 20) for base in (0.003, 0.01, 0.03, 0.1)]
-    thin = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
-    first = starts[int(np.argmax([_likelihood(lost[thin], chance(start)[thin]) for start in starts]))]
-    found = minimize(cost, first, method="Nelder-Mead", options={"maxiter": 120, "xatol": 1e-3, "fatol": 0.05})
-    share = min(early / max(float(lost.sum()) + early, 1.0), 1.0)
-    rate = max(float(np.exp(found.x[0])) / max(1 - share, 1e-3), 1e-6)
+    found = losses.best(chance, range_m, starts)
+    share = min(early / max(float(losses.lost.sum()) + early, 1.0), 1.0)
+    rate = max(float(np.exp(found.values[0])) / max(1 - share, 1e-3), 1e-6)
     drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
-    std = {"rate_per_m": rate * _log_error(cost, found.x), "early_share": float(np.sqrt(share / max(early, 1)))}
-    gain = drops - float(found.fun) - plain
-    return MissingFound("precipitation", gain, gain - 2.0, {"rate_per_m": rate, "early_share": share}, std, chance(found.x))
+    std = {"rate_per_m": rate * _log_error(found.cost, found.values), "early_share": float(np.sqrt(share / max(early, 1)))}
+    gain, parameters = found.gain + drops, {"rate_per_m": rate, "early_share": share}
+    return MissingFound("precipitation", gain, gain - 2.0, parameters, std, found.chance)
 
 
 def _log_error(cost: Callable[[FloatArray], float], top: FloatArray) -> float:
@@ -161,16 +183,16 @@ def _log_error(cost: Callable[[FloatArray], float], top: FloatArray) -> float:
     return float(np.sqrt(other / determinant)) if determinant > 0 < other else 1.0
 
 
-def _free(lost: BoolArray, covariates: dict[str, FloatArray], plain: float) -> MissingFound:
+def _free(losses: Losses, covariates: dict[str, FloatArray]) -> MissingFound:
     """Losses free in each of some bins of one angle; their mean as a rate of precipitation."""
-    found = []
+    found, lost, fit = [], losses.lost, losses.fit
+    rate = max(-float(np.log1p(-min(float(lost.mean()), 0.999))) / (2 * float(np.mean(covariates["range"]))), 1e-6)
     for name in _DIRECTIONS:
         values = covariates[name]
         group = np.searchsorted(np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1]), values)
-        count = np.maximum(np.bincount(group, minlength=_BINS), 1)
-        chance = (np.bincount(group, lost, _BINS) / count)[group]
-        gain = _likelihood(lost, chance) - plain
-        rate = max(-float(np.log1p(-float(lost.mean()))) / (2 * float(np.mean(covariates["range"]))), 1e-6)
+        count = np.maximum(np.bincount(group[fit], minlength=_BINS), 1)
+        chance = (np.bincount(group[fit], lost[fit], _BINS) / count)[group]
+        gain = _likelihood(lost[fit], chance[fit]) - losses.plain
         parameters = {"rate_per_m": rate, "early_share": 0.0}
         found.append(MissingFound("precipitation", gain, gain - _BINS, parameters, {}, chance, (), name))
     return max(found, key=lambda each: each.score)

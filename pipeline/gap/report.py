@@ -65,7 +65,8 @@ def summary(found: Diagnosis) -> str:
         lines.append(f"  {len(found.changes)} regions where the scene itself moved were set aside")
     if found.gap is not None:
         closed = "within its uncertainty" if found.gap.closed is None else f"{found.gap.closed:.0%} closed"
-        scores = ", ".join(f"{1e3 * value:.3f} mm {name}" for name, value in found.gap.scores.items())
+        factor, unit = found.gap.shown
+        scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
         lines.append(f"  gap {scores}: {closed}")
     return "\n".join(lines)
 

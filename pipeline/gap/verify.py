@@ -18,7 +18,7 @@ from pipeline.gap.cells import patches
 from pipeline.gap.directed import simulate_ranges
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.nominal_pair import NominalPair, project
-from pipeline.gap.residuals import Residuals
+from pipeline.gap.residuals import BoolArray, Missing, Residuals
 from pipeline.rigid import rotation_matrix
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -26,6 +26,7 @@ from sensors.model import StereoModel, TlsModel
 from sensors.stereo import REDUCTION, StereoPair
 
 MEASURE = "mean continuous ranked probability score of patches (mean and spread of their residuals) against simulated ones"
+LOSS_MEASURE = "mean Brier score of pulses (lost or not) against the chance of losing them"
 _DRAWS = 8
 _MOST_POINTS = 30_000
 _POINTS_PER_PATCH = 30.0
@@ -35,7 +36,7 @@ _MOST_SIGMAS = 2.0
 
 @dataclass(frozen=True)
 class Gap:
-    """Scores in m on held-out points. error: standard error of before - after; floor_error: of before - floor."""
+    """Scores on held-out points, in `unit`. error: standard error of before - after; floor_error: of before - floor."""
 
     before: float
     after: float
@@ -43,11 +44,18 @@ class Gap:
     error: float
     floor_error: float
     points: int
+    measure: str = MEASURE
+    unit: str = "m"
 
     @property
     def scores(self) -> dict[str, float]:
-        """The three scores by name, m."""
+        """The three scores by name."""
         return {"before": self.before, "after": self.after, "floor": self.floor}
+
+    @property
+    def shown(self) -> tuple[float, str]:
+        """By what a score is multiplied where people read it, and the unit that it then has."""
+        return (1e3, "mm") if self.unit == "m" else (1.0, "Brier")
 
     @property
     def closed(self) -> float | None:
@@ -64,8 +72,8 @@ class Gap:
         """As gap.json holds it."""
         note = "before - floor is within its own uncertainty" if self.uncertain else ""
         return {
-            "measure": MEASURE,
-            "unit": "m",
+            "measure": self.measure,
+            "unit": self.unit,
             "before": self.before,
             "after": self.after,
             "floor": self.floor,
@@ -160,6 +168,32 @@ def measure_gap(
         error=float((old - new).std() / np.sqrt(count)),
         floor_error=float((old - floor).std() / np.sqrt(count)),
         points=int(usable.sum()),
+    )
+
+
+def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) -> Gap | None:
+    """Score a chance (m,) of losing pulses on held-out ones; before, it is the share of losses of all others.
+
+    Floor: the score that pulses lost with that very chance have on average.
+    """
+    if held_out.sum() < 100:
+        return None
+    lost, p = missing.lost[held_out].astype(np.float64), chance[held_out]
+    patch = patches(missing.at[held_out], _POINTS_PER_PATCH)
+    count = np.bincount(patch)
+    share = float(missing.lost[~held_out].mean())
+    old, new, floor = (np.bincount(patch, each) / count for each in ((lost - share) ** 2, (lost - p) ** 2, p * (1 - p)))
+    floor = floor + min(float(new.mean() - floor.mean()), 0.0)
+    errors = [float((old - each).std() / np.sqrt(len(count))) for each in (new, floor)]
+    return Gap(
+        before=float(old.mean()),
+        after=float(new.mean()),
+        floor=float(floor.mean()),
+        error=errors[0],
+        floor_error=errors[1],
+        points=len(lost),
+        measure=LOSS_MEASURE,
+        unit="1",
     )
 
 

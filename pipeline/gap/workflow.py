@@ -15,7 +15,7 @@ from pipeline.gap.entries import SPREADS, Named, from_missing, from_shape, from_
 from pipeline.gap.footprint import find_footprint
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
-from pipeline.gap.missing import find_missing, isolated
+from pipeline.gap.missing import LOSSES, MissingFound, find_missing, isolated
 from pipeline.gap.naming import believes, name_effects
 from pipeline.gap.registration import pose_of, registered, residuals_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
@@ -23,7 +23,7 @@ from pipeline.gap.selection import Tried
 from pipeline.gap.shapes import ShapeFound
 from pipeline.gap.spread import find_tails
 from pipeline.gap.stereo_shapes import find_shapes
-from pipeline.gap.verify import Gap, Version, measure_gap, thinned
+from pipeline.gap.verify import Gap, Version, measure_gap, measure_losses, thinned
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
@@ -83,7 +83,9 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     chosen = np.flatnonzero(usable & ~held_out)
     chosen = chosen[:: max(len(chosen) // _MOST_POINTS, 1)]
     named, naming = name_effects(shaped, residuals.part(chosen), scale, random)
-    named = sorted([*named, *map(from_shape, shapes), *_missing(there, residuals, rough, changed)], key=lambda item: -item.gain)
+    losses = _missing(there, residuals, rough, changed, cells.side_m)
+    lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
+    named = sorted([*named, *map(from_shape, shapes), *lost], key=lambda item: -item.gain)
     clock.lap("naming")
     scored = score_effects(there, named, residuals, chosen, residuals.smooth & ~changed & held_out, naming.reference_sigma)
     named = _with_tails(there, scored.named, residuals, np.flatnonzero(residuals.smooth & ~changed & ~held_out), cells)
@@ -93,7 +95,11 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     corrected, turned = _corrected(there, after, plain, chosen) if named else (value, before)
     versions = Version(measurement.model, before), Version(after, turned)
     scored_on = (residuals.smooth | touched) & ~changed & held_out
-    gap = _gap(there, versions, plain, scored_on, naming.reference_sigma, scale, random)
+    if losses and named and named[0].name == lost[0].name and plain.missing is not None:
+        share = np.full(len(losses[1]), float(plain.missing.lost.mean()))
+        gap = measure_losses(plain.missing, share if losses[0].covariate else losses[0].chance, losses[1])
+    else:
+        gap = _gap(there, versions, plain, scored_on, naming.reference_sigma, scale, random)
     clock.lap("verification")
     return Diagnosis(
         verdict=_verdict(named),
@@ -198,12 +204,18 @@ def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock)
     )  # fmt: skip
 
 
-def _missing(measurement: Measurement, residuals: Residuals, rough: FloatArray, changed: BoolArray) -> list[Named]:
-    if residuals.missing is None or believes(measurement, "precipitation") or believes(measurement, "detection_limit"):
-        return []
+def _missing(
+    measurement: Measurement, residuals: Residuals, rough: FloatArray, changed: BoolArray, side_m: float
+) -> tuple[MissingFound, BoolArray] | None:
+    """The effect on the returns, and the pulses that it was not fitted to."""
+    missing = residuals.missing
+    if missing is None or any(believes(measurement, name) for name in LOSSES):
+        return None
+    held_out = held_out_blocks(missing.at, side_m)
     early = residuals.smooth & ~changed & (rough < -np.maximum(_EARLY_SIGMAS * residuals.sigma, _EARLY_M))
-    found = find_missing(residuals.missing, isolated(residuals.at, early), len(residuals), measurement.cloud.intensity)
-    return [] if found is None else [from_missing(found, measurement.cloud.intensity)]
+    drops = isolated(residuals.at, early)
+    found = find_missing(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
+    return None if found is None else (found, held_out)
 
 
 def _gap(
