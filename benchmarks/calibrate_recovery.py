@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from pipeline.bundled import bundled_config
 from pipeline.config import load_config
@@ -85,14 +86,18 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
 
 
 def table(found: list[dict[str, Any]]) -> list[str]:
-    """Per parameter: intervals that hold the truth, median width and RMS error of the logarithm."""
-    rows = [f"| {len(found)} trials | in the interval of 95 % | RMS error | median half width |", "|" + "---|" * 4]
+    """Per parameter: intervals that hold the truth, with the binomial bounds (Clopper and Pearson 1934) of 95 % of their share,
+    median width and RMS error of the logarithm."""
+    rows = [f"| {len(found)} trials | in the interval of 95 % (bounds of the share) | RMS error | median half width |"]
+    rows.append("|" + "---|" * 4)
     for name in found[0]["parameters"]:
         each = [one["parameters"][name] for one in found]
         true, value, low, high = (np.array([one[key] for one in each]) for key in ("true", "value", "low", "high"))
         held = int(np.count_nonzero((low <= true) & (true <= high)))
         error, half = np.sqrt(np.mean(np.log(value / true) ** 2)), np.median(np.log(high / low)) / 2
-        rows.append(f"| {name} | {held} ({held / len(found):.0%}) | {error:.1%} | {half:.1%} |")
+        share = binomtest(held, len(found)).proportion_ci()
+        holds = f"{held}, {held / len(found):.0%} ({share.low:.0%} to {share.high:.0%})"
+        rows.append(f"| {name} | {holds} | {error:.1%} | {half:.1%} |")
     return rows
 
 
