@@ -5,7 +5,7 @@
 
 To reach: more than the baseline wherever the baseline has less than 95 %. Detections are kept under --out and not made again.
 Confidence 0.95 and an IoU of masks of 0.75, as in the thesis's tables 5-9 to 5-12; the baseline's score is no probability, so it
-counts with all that it finds. --write puts the table into docs/detector.md.
+gets the lowest score to count, of a few, that is best for it over all cells. --write puts the table into docs/detector.md.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pipeline.formats.atomic import write_text
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- table -->", "<!-- end of table -->"
 CONFIDENCE, IOU = 0.95, 0.75
+BASELINE_SCORES = (LOWEST_SCORE, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
 ENOUGH = 0.95
 SIZES = ("small", "medium", "large")
 THESIS = {
@@ -54,6 +55,12 @@ def scores(truth: Coco, found: list[dict[str, Any]], confidence: float, sensors:
     return {score.group: score for score in evaluate(truth, found, cells, (confidence,), (IOU,))}
 
 
+def best_scores(truth: Coco, found: list[dict[str, Any]], sensors: tuple[str, ...]) -> dict[str, Score]:
+    """As `scores`, at the one of BASELINE_SCORES with the largest mean F1."""
+    choices = [scores(truth, found, lowest, sensors) for lowest in BASELINE_SCORES]
+    return max(choices, key=_mean_f1)
+
+
 def table(network: dict[str, Score], baseline: dict[str, Score]) -> Iterator[str]:
     """Rows of Markdown: detector, baseline, thesis for each size, in %."""
     yield "| wall | noise | " + " | ".join(f"{size}: detector, baseline, thesis" for size in SIZES) + " |"
@@ -77,17 +84,23 @@ def lost(network: dict[str, Score], baseline: dict[str, Score]) -> list[str]:
 
 def summary(network: dict[str, Score], baseline: dict[str, Score]) -> str:
     """The comparison as a sentence, with the mean over the cells."""
-    means = [100 * sum(score.f1 for score in each.values()) / len(each) for each in (network, baseline)]
+    means = [100 * _mean_f1(each) for each in (network, baseline)]
+    lowest = next(iter(baseline.values())).confidence
     beaten = sum(score.f1 < ENOUGH for score in baseline.values())
     cells = lost(network, baseline)
     blocks = [score.true_positives + score.false_negatives for score in network.values()]
     spread = 100 * max(math.sqrt(0.25 / max(count, 1)) for count in blocks)
     worst = f"; it is not better in: {', '.join(cells)}" if cells else ""
     return (
-        f"Mean F1 over {len(network)} cells: detector {means[0]:.1f} %, baseline {means[1]:.1f} %. The detector is better in "
+        f"Mean F1 over {len(network)} cells: detector {means[0]:.1f} %, baseline {means[1]:.1f} % "
+        f"(scores of {lowest:g} or more). The detector is better in "
         f"{beaten - len(cells)} of the {beaten} cells in which the baseline has less than 95 %{worst}. "
         f"{min(blocks)} to {max(blocks)} blocks a cell; a cell's standard error is at most {spread:.1f} %."
     )
+
+
+def _mean_f1(cells: dict[str, Score]) -> float:
+    return sum(score.f1 for score in cells.values()) / len(cells)
 
 
 def _marked(score: Score, rival: Score) -> str:
@@ -107,7 +120,7 @@ def main() -> None:
     truth = json.loads((test / "annotations.json").read_text(encoding="utf-8"))
     sensors = tuple(arguments.sensors)
     network = scores(truth, detections(arguments.model, test, out / "network"), CONFIDENCE, sensors)
-    baseline = scores(truth, detections(BASELINE, test, out / BASELINE), LOWEST_SCORE, sensors)
+    baseline = best_scores(truth, detections(BASELINE, test, out / BASELINE), sensors)
     text = "\n".join([*table(network, baseline), "", summary(network, baseline)])
     print(text)
     if arguments.write:
