@@ -111,6 +111,15 @@ def _claim(out: Path, identity: dict[str, Any], resume: bool) -> None:
         raise InputError("holds no run to resume", where=f"--out {out}", remedy="start it without --resume")
     earlier = json.loads(path.read_text(encoding="utf-8"))
     changed = [key for key, value in identity.items() if earlier.get(key) != json.loads(json.dumps(value))]
+    if changed == ["inputs"]:
+        replaced = [
+            Path(path).name for path, digest in identity["inputs"].items() if earlier.get("inputs", {}).get(path) != digest
+        ]
+        raise InputError(
+            f"the run in the folder was begun with another {', '.join(replaced)}",
+            where=f"--out {out}",
+            remedy="put the file back as it was, or choose another --out",
+        )
     if changed:
         raise InputError(
             f"the run in the folder has another {' and '.join(changed)}",

@@ -116,7 +116,7 @@ def read_root(path: Path) -> ElementTree.Element:
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(f"is not valid XML ({error})", where=str(path)) from None
+        raise InputError(f"is not valid XML ({error})", where=str(path), remedy="export it again") from None
 
 
 def _chunk(path: Path) -> ElementTree.Element:

@@ -26,6 +26,7 @@ _POSTS = ((1, 2), (1, 3), (0, 3))
 _FLAT = {"ambient": 0.75, "diffuse": 0.45, "specular": 0.02, "roughness": 0.9, "fresnel": 0.05}
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
 _FACTS_SHOWN = 6
+_MARKER_PX, _FEW = 6.0, 80
 
 
 def wall_figure(
@@ -53,7 +54,7 @@ def wall_figure(
             "xaxis": {**axis, "title": "along the wall, m"},
             "yaxis": {**axis, "title": "up the wall, m"},
             "zaxis": {**axis, "title": "towards the sensor, m"},
-            "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": {"x": -0.3, "y": -0.2, "z": 1.6}},
+            "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": {"x": -0.3, "y": -0.2, "z": 1.85}},
         },
         uirevision="camera",
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
@@ -224,7 +225,7 @@ def _handles(chosen: Sequence[tuple[int, Item]], boxes: Sequence[Sequence[float]
         y=[(box[2] + box[3]) / 2 for box in boxes],
         z=[box[5] for box in boxes],
         mode="markers",
-        marker={"size": 5, "color": _COLOURS[kind], "line": {"color": "white", "width": 1}},
+        marker=_marker(kind, len(chosen)),
         **_labels(chosen),
     )
 
@@ -234,10 +235,16 @@ def _map_handles(chosen: Sequence[tuple[int, Item]], kind: str) -> go.Scatter:
         x=[(item.box[0] + item.box[1]) / 2 for _, item in chosen],
         y=[(item.box[2] + item.box[3]) / 2 for _, item in chosen],
         mode="markers",
-        marker={"size": 6, "color": _COLOURS[kind], "line": {"color": "white", "width": 1}},
+        marker=_marker(kind, len(chosen)),
         name=kind,
         **_labels(chosen),
     )
+
+
+def _marker(kind: str, count: int) -> dict[str, Any]:
+    """The more there are, the smaller, so that the wall shows between them."""
+    size = float(np.clip(_MARKER_PX * np.sqrt(_FEW / count), 2.0, _MARKER_PX))
+    return {"size": size, "color": _COLOURS[kind], "line": {"width": 0}}
 
 
 def _labels(chosen: Sequence[tuple[int, Item]]) -> dict[str, Any]:

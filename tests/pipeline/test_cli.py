@@ -296,3 +296,11 @@ def test_help_imports_nothing_heavy() -> None:
     loaded = {name.partition(".")[0] for name in shown.stdout.splitlines()[-1].split()}
     assert {"pipeline", "scene"} <= loaded
     assert loaded & {"numpy", "pydantic", "yaml", "scipy", "matplotlib", "mitsuba", "shtab", "dash", "plotly", "rich"} == set()
+
+
+def test_the_page_of_the_command_line_says_what_there_is() -> None:
+    page = (CONFIGS.parent / "docs/command_line.md").read_text()
+    for code in (cli.DONE, cli.FAILED, cli.WRONG_INPUT, cli.INTERRUPTED):
+        assert f"| {code} |" in page
+    for option in ("--json", "--quiet", "--debug", "completion", "init", "schema"):
+        assert option in page
