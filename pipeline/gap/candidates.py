@@ -53,7 +53,8 @@ class Candidate:
     """One explanation. matrix: (n, k) observable per unit of each coefficient; parameters: coefficients to the effect's values.
 
     names: the parameters that the coefficients stand for; fixed: searched or chosen values that belong to this variant, such as
-    the camera; form: of an empirical one; wave: of a searched sine, whose period is `period` (that of harmonics too).
+    the camera; form: of an empirical one; wave: of a searched sine, whose period is `period` (that of harmonics too);
+    precision: (k,) inverse variance of the coefficients by what is typical of the effect, None where nothing is known.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Candidate:
     form: str = ""
     wave: Wave | None = None
     period: float = 0.0
+    precision: FloatArray | None = None
 
     @cached_property
     def columns(self) -> FloatArray:

@@ -18,6 +18,7 @@ from pipeline.gap.spread import SpreadFound
 from scene.config import parse
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
 from sensors.model import StereoModel, TlsModel
 
 SPREADS = (
@@ -25,6 +26,7 @@ SPREADS = (
     *("parallax_noise", "regularization_noise"),
 )
 """Effects that make the residuals spread more."""
+_CATALOGUE = {effect.model_fields["name"].default: effect for effect in (*TLS_EFFECTS, *STEREO_EFFECTS)}
 _NODES = 65
 """Of the curve of an empirical term."""
 _BEYOND = 100.0
@@ -89,12 +91,18 @@ def is_possible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
         effect = with_effects(model, [entry]).effects[-1]
     except InputError:
         return False
-    for key, info in type(effect).model_fields.items():
-        known = info.json_schema_extra
-        typical = known.get("typical") if isinstance(known, dict) and known.get("null") == 0.0 else None
-        if isinstance(typical, float) and abs(getattr(effect, key)) > _BEYOND * abs(typical):
-            return False
-    return True
+    sizes = typical_sizes(effect.name) if effect.name in _CATALOGUE else {}
+    return all(abs(getattr(effect, key)) <= _BEYOND * abs(typical) for key, typical in sizes.items())
+
+
+def typical_sizes(name: str) -> dict[str, float]:
+    """Typical values of the parameters of an effect of the catalogue that are 0 where it is not there."""
+    found = {key: info.json_schema_extra for key, info in _CATALOGUE[name].model_fields.items()}
+    return {
+        key: float(known["typical"])  # type: ignore[arg-type]
+        for key, known in found.items()
+        if isinstance(known, dict) and known.get("null") == 0.0 and isinstance(known.get("typical"), float)
+    }
 
 
 def from_comb(comb: Comb, part: Residuals) -> Named:

@@ -20,6 +20,7 @@ _ABRUPT = 0.7
 _SCATTERED = 0.8
 _FREE_MARGIN, _FREE_RATIO = 6.0, 1.5
 """A free form must score as much more than the catalogue's effects."""
+_PATCH_SIGMAS = 5.0
 _DIRECTIONS = ("azimuth", "zenith")
 """What losses may depend on for no reason of the catalogue: range, incidence and power have theirs."""
 _BINS = 16
@@ -94,8 +95,7 @@ def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, inte
         limit = replace(limit, score=-np.inf)
     best, other = (limit, rain) if limit.score >= rain.score else (rain, limit)
     free = _free(losses, missing.covariates)
-    sureness = 1 / _clustering(lost[fit], free.chance[fit], missing.at[fit])
-    if free.score > _FREE_RATIO * best.score and (free.score - best.score) * sureness > _FREE_MARGIN:
+    if free.score > _FREE_RATIO * max(best.score, 0.0) + _FREE_MARGIN and _patches_agree(lost[fit], best, free, missing.at, fit):
         best = free
     sureness = 1 / _clustering(lost[fit], best.chance[fit], missing.at[fit])
     best = replace(best, gain=best.gain * sureness, score=best.score * sureness)
@@ -123,6 +123,14 @@ def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
     left = np.bincount(patch, lost - chance)
     expected = np.bincount(patch, chance * (1 - chance))
     return float(max(np.sum(left**2) / np.sum(expected), 1.0))
+
+
+def _patches_agree(lost: BoolArray, known: MissingFound, free: MissingFound, at: FloatArray, fit: BoolArray) -> bool:
+    """Whether many patches of the wall prefer a free form: a shrub before the wall takes all pulses of a few."""
+    p, q = (np.clip(each.chance[fit], 1e-9, 1 - 1e-9) for each in (known, free))
+    gain = np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p))
+    sums = np.bincount(patches(at[fit], _PULSES_PER_PATCH), gain)
+    return float(sums.sum()) > _PATCH_SIGMAS * float(np.linalg.norm(sums))
 
 
 def _is_cut(intensity: FloatArray) -> bool:

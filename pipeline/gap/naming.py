@@ -10,7 +10,17 @@ import numpy as np
 from pipeline.gap import stereo_signatures, tls_signatures
 from pipeline.gap.candidates import HARMONICS, PLACE, Candidate, Grid, free_forms, harmonics, places
 from pipeline.gap.cells import Cells
-from pipeline.gap.entries import Estimate, Named, from_comb, from_locking, from_mean, from_spread, is_possible, with_effects
+from pipeline.gap.entries import (
+    Estimate,
+    Named,
+    from_comb,
+    from_locking,
+    from_mean,
+    from_spread,
+    is_possible,
+    typical_sizes,
+    with_effects,
+)
 from pipeline.gap.locking import find_locking
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.quantization import find_comb
@@ -24,6 +34,8 @@ from scene.mesh import FloatArray
 from sensors.model import StereoModel
 
 _NOT_FREE = ("edge_step", "line", "disparity_fraction")
+_LARGEST = 20.0
+"""Standard deviation of an effect's size before there are data, in typical sizes."""
 _PERIODIC = {"range_cyclic": "range", "row_jitter": "image_y"}
 """Sines whose overtones are looked for: an error that repeats but is no sine is not theirs."""
 
@@ -52,7 +64,21 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | G
         if name not in _NOT_FREE and np.ptp(values) > 0
         for form in free_forms(name, values)
     ]
-    return [*named, *free, *places(part.at)]
+    return [*map(_with_precision, named), *free, *places(part.at)]
+
+
+def _with_precision(candidate: Candidate | Grid) -> Candidate | Grid:
+    """With what is typical of its effect: two effects that nearly cancel each other must not do so at any size."""
+    if isinstance(candidate, Grid):
+        return candidate
+    typical = typical_sizes(candidate.name)
+    units = np.eye(len(candidate.names))
+    first = next(iter(typical.values()))
+    sizes = [
+        typical.get(key, first) / max(abs(candidate.parameters(unit)[key]), 1e-300) if not key.startswith("phase") else first
+        for key, unit in zip(candidate.names, units, strict=True)
+    ]
+    return replace(candidate, precision=1 / (_LARGEST * np.array(sizes)) ** 2)
 
 
 def name_effects(

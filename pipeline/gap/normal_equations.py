@@ -70,6 +70,10 @@ class Equations:
     wave_own: FloatArray
     wave_right: FloatArray
 
+    def with_precision(self, precision: FloatArray) -> Equations:
+        """The same where the fixed columns' coefficients are known to lie about 0. precision: (k,) inverse variances."""
+        return replace(self, fixed=self.fixed + np.diag(precision))
+
     def of_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> Equations:
         """The same columns with other values."""
         return replace(self, right=right, constant=constant, wave_right=wave_right)

@@ -134,10 +134,20 @@ class MeanSearch:
         count = len(self._fixed.within[thin])
         noise = self._random.child("within").generator().standard_normal((count, DRAWS)) * np.sqrt(len(self.model) / count)
         self._waves = Waves.of(self.model, self._grids, self._fixed.within, self.value.within, noise, thin)
-        self.equations = assembled(self.model, covariances, self._fixed, self.value, self._waves)
+        self.equations = assembled(self.model, covariances, self._fixed, self.value, self._waves).with_precision(
+            self._precision()
+        )
         ranked = np.argsort(-self.equations.log_likelihood(pose)[:, 0], kind="stable")
         self.null = self.equations.at[ranked[0]]
         self._nulls = self._null_gains([int(index) for index in ranked[:_NEAR_NULL]], self._fixed.within[thin].T @ noise)
+
+    def _precision(self) -> FloatArray:
+        """(k,) of the fixed columns: none of the pose's and of free forms."""
+        known = [
+            np.zeros(candidate.columns.shape[1]) if candidate.precision is None else candidate.precision
+            for candidate in self._plain
+        ]
+        return np.concatenate([np.zeros(len(self._base)), *known])
 
     def _null_gains(self, chosen: list[int], within: FloatArray) -> dict[str, FloatArray]:
         """Gains of every family where there is nothing but pose, correlated error and noise, (DRAWS,) each."""

@@ -18,6 +18,7 @@ from pipeline.gap.cells import patches
 from pipeline.gap.directed import simulate_ranges
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.nominal_pair import NominalPair, project
+from pipeline.gap.registration import moved
 from pipeline.gap.residuals import BoolArray, Missing, Residuals
 from pipeline.rigid import rotation_matrix
 from scene.keyed_random import KeyedRandom
@@ -98,15 +99,18 @@ def simulated(measurement: Measurement, version: Version, residuals: Residuals, 
     if isinstance(version.model, TlsModel):
         assert measurement.station is not None
         position, rotation = measurement.station
-        moved = position + version.pose[:3], rotation_matrix(version.pose[3:]) @ rotation
-        there = replace(measurement, station=moved)
+        stood = position + version.pose[:3], rotation_matrix(version.pose[3:]) @ rotation
+        there = replace(measurement, station=stood)
         ranges = simulate_ranges(there, version.model, residuals.geometry, random, measurement.scene)
         return ranges - np.asarray(residuals.geometry.range_m)
-    return _simulated_disparities(measurement, version.model, residuals, random) + residuals.pose @ version.pose
+    return _simulated_disparities(moved(measurement, version.pose), version.model, residuals, random)
 
 
 def _simulated_disparities(measurement: Measurement, model: StereoModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
-    """Of the depth map's cell that holds each pixel; the finest depth map of whose grid the pixels are."""
+    """Of the depth map's cell that holds each pixel; the finest depth map of whose grid the pixels are.
+
+    measurement: with its cameras where they stood, against which `residuals` may be those of another place.
+    """
     nominal, g = NominalPair.of(measurement), residuals.geometry
     assert measurement.cameras is not None
     quality = min(REDUCTION, key=lambda name: float(np.mean(np.abs(np.mod(g.u, REDUCTION[name]) - REDUCTION[name] / 2))))

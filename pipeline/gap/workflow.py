@@ -70,9 +70,9 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     if residuals.smooth.sum() < FEWEST_POINTS:
         return _insufficient(measurement, residuals, clock)
     there, residuals, surveyed = settled(measurement)
-    shapes = _shapes(there, residuals)
-    plain, touched = residuals, np.logical_or.reduce([np.zeros(len(residuals), dtype=bool), *(each.touched for each in shapes)])
-    shaped, residuals = _shaped(there, residuals, shapes, touched)
+    plain = residuals
+    shapes, touched = _shapes(there, residuals)
+    shaped, residuals = _shaped(there, residuals, shapes, touched[residuals.index])
     rough, _, scale = registered(residuals)
     changes, changed = find_changes(replace(residuals, value=rough), there.cloud.points[residuals.index], residuals.smooth)
     rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
@@ -83,6 +83,10 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     chosen = np.flatnonzero(usable & ~held_out)
     chosen = chosen[:: max(len(chosen) // _MOST_POINTS, 1)]
     named, naming = name_effects(shaped, residuals.part(chosen), scale, random)
+    if named and not shapes:
+        # what moves the beam everywhere hides what it does at edges
+        beside = there.changed(model=with_effects(there.model, [item.entry for item in named]))
+        shapes, touched = _shapes(*settled(beside)[:2])
     losses = _missing(there, residuals, rough, changed, cells.side_m)
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
     named = sorted([*named, *map(from_shape, shapes), *lost], key=lambda item: -item.gain)
@@ -94,7 +98,7 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     value = plain.value - plain.pose @ before
     corrected, turned = _corrected(there, after, plain, chosen) if named else (value, before)
     versions = Version(measurement.model, before), Version(after, turned)
-    scored_on = (residuals.smooth | touched) & ~changed & held_out
+    scored_on = (residuals.smooth | touched[residuals.index]) & ~changed & held_out
     if losses and named and named[0].name == lost[0].name and plain.missing is not None:
         share = np.full(len(losses[1]), float(plain.missing.lost.mean()))
         gap = measure_losses(plain.missing, share if losses[0].covariate else losses[0].chance, losses[1])
@@ -120,12 +124,18 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     )
 
 
-def _shapes(measurement: Measurement, residuals: Residuals) -> list[ShapeFound]:
-    """Effects where the surface is not smooth that the model does not hold."""
+def _shapes(measurement: Measurement, residuals: Residuals) -> tuple[list[ShapeFound], BoolArray]:
+    """Effects where the surface is not smooth that the model does not hold, and which of the measurement's points they touch."""
     rough, _, scale = registered(residuals)
+    found: list[ShapeFound] = []
     if measurement.sensor == "stereo":
-        return find_shapes(measurement, residuals, rough)
-    return [] if believes(measurement, "beam_divergence") else find_footprint(measurement, residuals, rough, scale)
+        found = find_shapes(measurement, residuals, rough)
+    elif not believes(measurement, "beam_divergence"):
+        found = find_footprint(measurement, residuals, rough, scale)
+    touched = np.zeros(len(measurement.cloud.points), dtype=bool)
+    for each in found:
+        touched[residuals.index] |= each.touched
+    return found, touched
 
 
 def _shaped(
