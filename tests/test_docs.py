@@ -1,0 +1,111 @@
+"""The documentation: the site builds without a warning, and what its how-tos and notebooks tell a reader to do works."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import example_data
+import howtos
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+SMALL_WALL = ["--set", "wall.width_m=7", "--set", "wall.height_m=5", "--set", "wall.resolution_m=0.1"]
+FEW_POINTS = [
+    *("--set", "scanner.azimuth_step_rad=0.001", "--set", "scanner.zenith_step_rad=0.001"),
+    *("--set", "depth_map=low", "--set", "difference.gsd_m=0.05"),
+]
+FEW_BLOCKS = ["--set", "rockfall.count=3"]
+SMALL_SET = (
+    "[wall.width_m=9,wall.height_m=5,wall.resolution_m=0.1,cameras.distance_m=20,cameras.base_m=5,depth_map=low,station.distance_m=20,"
+    "scanner.azimuth_step_rad=0.004,scanner.zenith_step_rad=0.004,difference.gsd_m=0.05]"
+)
+FURTHER = {
+    "own_site": {
+        "scarpsim inspect": FEW_POINTS,
+        "simulate": [*FEW_POINTS, *FEW_BLOCKS, "--set", "epochs=1"],
+    },
+    "training_set": {
+        "scarpsim dataset my_set.yaml": [
+            *("--set", "tiles.size_px=48", "--set", f"walls.near.set={SMALL_SET}", "--set", f"walls.other.set={SMALL_SET}"),
+            *("--set", "parts.0.train=1"),
+        ],
+    },
+    "compare_sensors": {
+        "scarpsim compare": [*SMALL_WALL, *FEW_POINTS, "--epochs", "2", "--sizes-m", "0.3", "0.6"],
+        "scarpsim inspect": [*SMALL_WALL, *FEW_POINTS],
+    },
+    "calibrate": {
+        "simulate": [*SMALL_WALL, *FEW_POINTS, *FEW_BLOCKS],
+        "scarpsim calibrate": [
+            *SMALL_WALL,
+            *FEW_POINTS,
+            *("--set", "calibration.windows=6", "--set", "calibration.window_px=16", "--set", "calibration.simulations=60"),
+            "--no-greedy",
+        ],
+    },
+    "missing_effect": {},
+}
+"""What is added to the pages' commands, so that they are done in seconds."""
+
+
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    """Links, anchors, pages missing from the navigation: `strict` makes each of them an error. Nothing is fetched."""
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
+    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > 80
+    fetched = re.compile(r'<(?:script|img|iframe)[^>]* src="(?:https?:)?//|<link[^>]* rel="stylesheet"[^>]* href="(?:https?:)?//')
+    without_words = re.compile(r'<img(?![^>]* alt="[^"]+)[^>]*>')
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        assert not fetched.search(text), page
+        assert not without_words.search(text), f"{page}: a picture without alternative text"
+
+
+def test_every_how_to_has_its_picture() -> None:
+    assert {path.stem for path in (ROOT / "docs" / "howto").glob("*.md")} == set(howtos.PICTURES)
+    for page in howtos.PICTURES:
+        assert f"(../images/howto_{page}.png)" in (ROOT / "docs" / "howto" / f"{page}.md").read_text()
+        assert (ROOT / "docs" / "images" / f"howto_{page}.png").is_file()
+
+
+@pytest.mark.parametrize("page", howtos.PICTURES)
+def test_a_how_to_works_as_it_is_written(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    if page == "own_site":
+        example_data.site(Path(), resolution_m=0.2)
+    if page == "missing_effect":
+        example_data.measurement(Path("my_measurement"), step_rad=0.008)
+    howtos.carry_out(page, FURTHER[page])
+    assert Path(howtos.PICTURES[page]).is_file()
+
+
+def test_the_effect_of_the_page_on_adding_one_is_an_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its code is the same as the notebook's, which uses it."""
+    code = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "extend" / "effect.md").read_text(), re.DOTALL)[0]
+    (tmp_path / "warm_up.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    effect = importlib.import_module("warm_up").RangeWarmUp
+    assert effect().is_null
+    assert not effect(amplitude_m=0.005).is_null
+    cells = nbformat.read(ROOT / "docs" / "notebooks" / "own_effect.ipynb", as_version=4).cells
+    assert any(code[code.index("class ") :].strip() in cell.source for cell in cells)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(path: Path, tmp_path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    for cell in notebook.cells:
+        pictures = [output for output in cell.get("outputs", []) if "image/png" in output.get("data", {})]
+        assert not pictures or cell.metadata.get("alt"), f"a picture without words for it:\n{cell.source}"
