@@ -26,7 +26,7 @@ _POSTS = ((1, 2), (1, 3), (0, 3))
 _FLAT = {"ambient": 0.75, "diffuse": 0.45, "specular": 0.02, "roughness": 0.9, "fresnel": 0.05}
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
 _FACTS_SHOWN = 6
-_MARKER_PX, _FEW = 6.0, 80
+_MARKER_PX, _FEW = 4.5, 80
 
 
 def wall_figure(
