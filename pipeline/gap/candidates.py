@@ -18,7 +18,8 @@ _STEPS = 13
 _MOST_CYCLES = 12.0
 _CHUNK = 32
 PLACE = "place along"
-HARMONICS = "harmonics"
+HARMONICS, SURFACE = "harmonics", "surface"
+_DEGREE = 4
 _OVERTONES = range(2, 6)
 _DIRECTIONS = (30, 60, 120, 150)
 """Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
@@ -184,6 +185,14 @@ def harmonics(covariate: str, sine: Candidate) -> Candidate:
     assert wave is not None
     columns = np.concatenate([wave.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
     return replace(_free(covariate, HARMONICS, columns), period=sine.period)
+
+
+def surface_form(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:
+    """A polynomial of two covariates (n,) together, which stands for no effect."""
+    s, t = ((values - values.mean()) / (float(values.std()) or 1.0) for values in (x, y))
+    powers = [(a, degree - a) for degree in range(1, _DEGREE + 1) for a in range(degree + 1)]
+    columns = np.stack([s**a * t**b for a, b in powers], axis=1)
+    return _free(f"{first} and {second}", SURFACE, columns / columns.std(axis=0))
 
 
 def places(at: FloatArray) -> list[Candidate | Grid]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.candidates import HARMONICS, Candidate
+from pipeline.gap.candidates import HARMONICS, SURFACE, Candidate
 from pipeline.gap.locking import Locking
 from pipeline.gap.missing import MissingFound
 from pipeline.gap.quantization import Comb
@@ -27,8 +27,10 @@ SPREADS = (
 )
 """Effects that make the residuals spread more."""
 _CATALOGUE = {effect.model_fields["name"].default: effect for effect in (*TLS_EFFECTS, *STEREO_EFFECTS)}
-_NODES = 65
-"""Of the curve of an empirical term."""
+PLANES = {"tls": ("azimuth", "zenith"), "stereo": ("image_x", "image_y")}
+"""The two covariates by sensor that an error may depend on together."""
+_NODES, _GRID, _MOST_POINTS = 65, 17, 20_000
+"""Of the curve of an empirical term, and of each side of a surface."""
 _BEYOND = 100.0
 """Times its typical size, an effect explains nothing: no instrument is so far out."""
 _SPLITS = {
@@ -195,25 +197,47 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
 
 
 def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:
-    """A free form as a curve of its covariate: over one cycle of a periodic one, else over all values that occur."""
-    x = part.covariates[candidate.name]
+    """A free form by values: over one cycle of a periodic one, else over all of its covariate that occurs."""
     error = candidate.columns @ values[: candidate.columns.shape[1]]
+    unit, name = ("m", "range_empirical") if part.sensor == "tls" else ("px", "disparity_empirical")
+    found = _surface(candidate, error, part) if candidate.form == SURFACE else _curve(candidate, error, part)
+    rows = [[float(f"{value:.6g}") for value in row] for row in found.pop("values")]
+    entry = {"name": name, **found, f"values_{unit}": rows}
+    return Named(f"{part.sensor}.{name}", "empirical", entry, {}, (), item.p_value, item.gain)
+
+
+def _curve(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
+    x = part.covariates[candidate.name]
     cycle = candidate.period * (1.0 if candidate.form == HARMONICS else float(x.std()) or 1.0)
     turned = np.mod(x, cycle) if cycle else x
     order = np.argsort(turned)
     low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))
     curve = np.interp(np.linspace(low, high, _NODES), turned[order], error[order], period=cycle or None)
-    unit, name = ("m", "range_empirical") if part.sensor == "tls" else ("px", "disparity_empirical")
     shift = _shift(candidate.name, part)
-    entry = {
-        "name": name,
+    return {
         "covariate": candidate.name,
-        "low": low + shift,
-        "high": high + shift,
-        "period": cycle,
-        f"values_{unit}": [float(f"{value:.6g}") for value in curve],
+        "along": {"low": low + shift, "high": high + shift, "period": cycle},
+        "values": [curve],
     }
-    return Named(f"{part.sensor}.{name}", "empirical", entry, {}, (), item.p_value, item.gain)
+
+
+def _surface(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
+    """The polynomial again, at the nodes of a grid: it is found back from its values at the points."""
+    first, second = PLANES[part.sensor]
+    x, y = part.covariates[first], part.covariates[second]
+    axes = [np.linspace(values.min(), values.max(), _GRID) for values in (x, y)]
+    nodes = np.meshgrid(*axes)
+    thin = slice(None, None, max(len(x) // _MOST_POINTS, 1))
+    columns, there = (
+        np.stack(
+            [((s - x.mean()) / np.ptp(x)) ** a * ((t - y.mean()) / np.ptp(y)) ** b for a in range(5) for b in range(5 - a)],
+            axis=-1,
+        )
+        for s, t in ((x[thin], y[thin]), nodes)
+    )
+    values = there @ np.linalg.lstsq(columns, error[thin], rcond=None)[0]
+    along, across = ({"low": float(axis[0]), "high": float(axis[-1])} for axis in axes)
+    return {"covariate": first, "along": along, "second": second, "across": across, "values": values}
 
 
 def _shift(covariate: str, part: Residuals) -> float:

@@ -22,8 +22,9 @@ NOT_SCORED = (
 _POINTS_PER_PATCH = 30.0
 _LARGEST = 5.0
 """Deviations are cut off at so many sigmas: an outlier has no more to say."""
-_LOST = 0.0
-"""A score that does not rise speaks against an effect."""
+_LEAST, _LEAST_OF_SMOOTHING = 0.0, 5.0
+"""A score that does not rise speaks against an effect; a little low-pass also makes up for rays that are not quite where they are
+thought to be."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,12 @@ def score_effects(
         patch = patches(residuals.at[rows], _POINTS_PER_PATCH)
         scores = [_log_score(value[rows], sigma[rows], patch, reference_sigma) for value, sigma in (whole, without)]
         gains[item.name] = scores[0] - scores[1]
-    kept = [replace(item, gain=gains.get(item.name, item.gain)) for item in named if gains.get(item.name, 1.0) > _LOST]
-    return Scored(kept, [item for item in named if gains.get(item.name, 1.0) <= _LOST])
+    failed = [item for item in named if item.name in gains and gains[item.name] <= _least(item)]
+    return Scored([replace(item, gain=gains.get(item.name, item.gain)) for item in named if item not in failed], failed)
+
+
+def _least(item: Named) -> float:
+    return _LEAST_OF_SMOOTHING if item.name == "stereo.smoothing" else _LEAST
 
 
 def _value(

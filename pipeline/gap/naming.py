@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.gap import stereo_signatures, tls_signatures
-from pipeline.gap.candidates import HARMONICS, PLACE, Candidate, Grid, free_forms, harmonics, places
+from pipeline.gap.candidates import HARMONICS, PLACE, Candidate, Grid, free_forms, harmonics, places, surface_form
 from pipeline.gap.cells import Cells
 from pipeline.gap.entries import (
+    PLANES,
     Estimate,
     Named,
     from_comb,
@@ -64,7 +65,9 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | G
         if name not in _NOT_FREE and np.ptp(values) > 0
         for form in free_forms(name, values)
     ]
-    return [*map(_with_precision, named), *free, *places(part.at)]
+    first, second = PLANES[part.sensor]
+    both = surface_form(first, second, part.covariates[first], part.covariates[second])
+    return [*map(_with_precision, named), *free, both, *places(part.at)]
 
 
 def _with_precision(candidate: Candidate | Grid) -> Candidate | Grid:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.candidates import PLACE, Candidate, Grid
+from pipeline.gap.candidates import PLACE, SURFACE, Candidate, Grid
 from pipeline.gap.cells import Cells
 from pipeline.gap.mean_model import Fit, MeanModel, Projected, fitted
 from pipeline.gap.normal_equations import Waves, assembled, extended, wave_products
@@ -30,6 +30,8 @@ FREE_MARGIN = 5.0
 _LEAST_SCORE = 4.0
 _LEAST_FREE_SCORE = 12.0
 """Of a free form: the reference's error is not quite as its model says, and a flexible form takes that up first."""
+_LEAST_SURFACE_SCORE, _SURFACE_RATIO = 20.0, 1.15
+"""Of a form of two covariates, and how many times that of one covariate it has to score."""
 _WAVE_RATIO = 2.0
 """A wave along a covariate must score so many times what waves in slanting directions do: the reference's error has some too."""
 _MOST_EFFECTS = 3
@@ -90,13 +92,19 @@ class _Set:
         """The best free form; of a covariate that changes along the wall only where it does better than mere places do."""
         decoys = [item.score for item in self.tried if item.name.startswith(PLACE)]
         decoy = max([0.0, *decoys])
-        for item in self.tried:
-            if not item.empirical or item.name.startswith(PLACE):
-                continue
-            least = (_WAVE_RATIO if item.candidate.form == "wave" else 1.0) * decoy + FREE_MARGIN
-            if item.name in _NOT_PLACES or item.score > least:
-                return item
-        return None
+        found = [item for item in self.tried if item.empirical and not item.name.startswith(PLACE) and _stands_out(item, decoy)]
+        plain = next((item for item in found if item.candidate.form != SURFACE), None)
+        if plain is None or (found[0].score > plain.score + FREE_MARGIN and found[0].score > _SURFACE_RATIO * plain.score):
+            return found[0] if found else None
+        return plain
+
+
+def _stands_out(item: Tried, decoy: float) -> bool:
+    """Whether a free form does better than mere places, of which the best scores `decoy`."""
+    if item.candidate.form == SURFACE:
+        return item.score > max(decoy + FREE_MARGIN, _LEAST_SURFACE_SCORE)
+    least = (_WAVE_RATIO if item.candidate.form == "wave" else 1.0) * decoy + FREE_MARGIN
+    return item.name in _NOT_PLACES or item.score > least
 
 
 class MeanSearch:

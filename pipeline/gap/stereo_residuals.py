@@ -14,7 +14,7 @@ from pipeline.rigid import RigidTransform
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.camera import Camera
-from sensors.curve import curve_on_host
+from sensors.curve import surface_on_host
 from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.model import StereoModel
 
@@ -155,8 +155,8 @@ def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatAr
     total = np.zeros(len(covariates["depth"]))
     for effect in model.effects:
         if isinstance(effect, DisparityEmpirical):
-            x = covariates[effect.covariate]
-            total += curve_on_host(x, effect.low, effect.high, effect.values_px, effect.period)
+            x, y = (covariates[name] for name in (effect.covariate, effect.second or effect.covariate))
+            total += surface_on_host(x, y, effect.along, effect.across, effect.values_px)
     return total
 
 

@@ -69,46 +69,39 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
     clock.lap("residuals")
     if residuals.smooth.sum() < FEWEST_POINTS:
         return _insufficient(measurement, residuals, clock)
-    there, residuals, surveyed = settled(measurement)
-    plain = residuals
-    shapes, touched = _shapes(there, residuals)
-    shaped, residuals = _shaped(there, residuals, shapes, touched[residuals.index])
-    rough, _, scale = registered(residuals)
-    changes, changed = find_changes(replace(residuals, value=rough), there.cloud.points[residuals.index], residuals.smooth)
-    rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
+    there, plain, surveyed = settled(measurement)
+    state = _State.of(there, plain, *_shapes(there, plain))
     clock.lap("changes")
-    cells = Cells.over(residuals.at)
-    held_out = held_out_blocks(residuals.at, cells.side_m)
-    usable = residuals.smooth & ~changed & (np.abs(rough) < _CLIP * scale * residuals.sigma)
-    chosen = np.flatnonzero(usable & ~held_out)
-    chosen = chosen[:: max(len(chosen) // _MOST_POINTS, 1)]
-    named, naming = name_effects(shaped, residuals.part(chosen), scale, random)
-    if named and not shapes:
-        # what moves the beam everywhere hides what it does at edges
-        beside = there.changed(model=with_effects(there.model, [item.entry for item in named]))
-        shapes, touched = _shapes(*settled(beside)[:2])
-    losses = _missing(there, residuals, rough, changed, cells.side_m)
+    named, naming = name_effects(state.shaped, state.part, state.scale, random)
+    if named:
+        # what moves the beam everywhere hides, or feigns, what it does at edges
+        again = _shapes(*settled(there.changed(model=with_effects(there.model, [item.entry for item in named])))[:2])
+        if {each.name for each in again[0]} != {each.name for each in state.shapes}:
+            state = _State.of(there, plain, *again)
+            named, naming = name_effects(state.shaped, state.part, state.scale, random)
+    residuals, shapes, changed, held_out, chosen = state.residuals, state.shapes, state.changed, state.held_out, state.chosen
+    losses = _missing(there, residuals, state.rough, changed, state.cells.side_m)
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
     named = sorted([*named, *map(from_shape, shapes), *lost], key=lambda item: -item.gain)
     clock.lap("naming")
     scored = score_effects(there, named, residuals, chosen, residuals.smooth & ~changed & held_out, naming.reference_sigma)
-    named = _with_tails(there, scored.named, residuals, np.flatnonzero(residuals.smooth & ~changed & ~held_out), cells)
+    named = _with_tails(there, scored.named, residuals, np.flatnonzero(residuals.smooth & ~changed & ~held_out), state.cells)
     after = with_effects(measurement.model, [item.entry for item in named])
     before = pose_of(plain.part(chosen))
     value = plain.value - plain.pose @ before
     corrected, turned = _corrected(there, after, plain, chosen) if named else (value, before)
     versions = Version(measurement.model, before), Version(after, turned)
-    scored_on = (residuals.smooth | touched[residuals.index]) & ~changed & held_out
+    scored_on = (residuals.smooth | state.touched) & ~changed & held_out
     if losses and named and named[0].name == lost[0].name and plain.missing is not None:
         share = np.full(len(losses[1]), float(plain.missing.lost.mean()))
         gap = measure_losses(plain.missing, share if losses[0].covariate else losses[0].chance, losses[1])
     else:
-        gap = _gap(there, versions, plain, scored_on, naming.reference_sigma, scale, random)
+        gap = _gap(there, versions, plain, scored_on, naming.reference_sigma, state.scale, random)
     clock.lap("verification")
     return Diagnosis(
         verdict=_verdict(named),
         effects=tuple(named),
-        changes=tuple(changes),
+        changes=tuple(state.changes),
         residuals=replace(plain, smooth=residuals.smooth),
         held_out=held_out,
         before=value,
@@ -122,6 +115,49 @@ def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
         seconds=clock.total,
         timings=clock.laps,
     )
+
+
+@dataclass(frozen=True)
+class _State:
+    """What naming starts from, once effects where the surface is not smooth are known.
+
+    shaped: the measurement with them in its model; residuals: against that; touched, changed, held_out: (n,) points that they
+    touch, that lie in changes of the scene, and that no step before the last may look at; rough: (n,) registered residuals, which
+    spread `scale` predicted sigmas; chosen: rows that selection may look at.
+    """
+
+    shapes: list[ShapeFound]
+    shaped: Measurement
+    residuals: Residuals
+    touched: BoolArray
+    changes: list[SceneChange]
+    changed: BoolArray
+    rough: FloatArray
+    scale: float
+    cells: Cells
+    held_out: BoolArray
+    chosen: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, there: Measurement, plain: Residuals, shapes: list[ShapeFound], touched_points: BoolArray) -> _State:
+        """touched_points: of the measurement."""
+        touched = touched_points[plain.index]
+        shaped, residuals = _shaped(there, plain, shapes, touched)
+        rough, _, scale = registered(residuals)
+        at_points = there.cloud.points[residuals.index]
+        changes, changed = find_changes(replace(residuals, value=rough), at_points, residuals.smooth)
+        rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
+        cells = Cells.over(residuals.at)
+        held_out = held_out_blocks(residuals.at, cells.side_m)
+        usable = residuals.smooth & ~changed & (np.abs(rough) < _CLIP * scale * residuals.sigma)
+        chosen = np.flatnonzero(usable & ~held_out)
+        chosen = chosen[:: max(len(chosen) // _MOST_POINTS, 1)]
+        return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
+
+    @property
+    def part(self) -> Residuals:
+        """The residuals that selection may look at."""
+        return self.residuals.part(self.chosen)
 
 
 def _shapes(measurement: Measurement, residuals: Residuals) -> tuple[list[ShapeFound], BoolArray]:

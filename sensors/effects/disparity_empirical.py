@@ -9,40 +9,41 @@ from pydantic import Field
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.curve import curve
+from sensors.curve import Axis, Table, surface
 from sensors.effects.base import Effect, Stage
 from sensors.matches import Matches
 
+Covariate = Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"]
+
 
 class DisparityEmpirical(Effect):
-    """dd = c(x), c linear between values at even distances from low to high: empirical, found by `scarpsim gap`; not in the
-    shared catalogue.
+    """dd = c(x) or c(x, y), linear between values at even distances: empirical, found by `scarpsim gap`; not in the shared
+    catalogue.
 
-    x: column, row or distance from the centre of the left image (px), disparity or its fraction (px), or depth (m).
+    x, y: column, row or distance from the centre of the left image (px), disparity or its fraction (px), or depth (m).
     """
 
     name: Literal["disparity_empirical"] = "disparity_empirical"
     sensor = "stereo"
     stage = Stage.MATCH
     order = 25
-    covariate: Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"] = Field(
-        "image_x", description="x"
-    )
-    low: float = Field(0.0, description="x of the first value, in its unit; held below")
-    high: float = Field(1.0, description="x of the last value, in its unit; held above")
-    period: float = Field(0.0, ge=0, description="of x, which then counts modulo it; 0: none")
-    values_px: tuple[float, ...] = Field((0.0, 0.0), min_length=2, max_length=1025, description="c from low to high [px]")
+    covariate: Covariate = Field("image_x", description="x")
+    along: Axis = Field(Axis(), description="where the values stand on x")
+    second: Covariate | None = Field(None, description="y, for a surface")
+    across: Axis = Field(Axis(), description="where the rows of values stand on y")
+    values_px: Table = Field(((0.0, 0.0),), description="c: rows along y, each from low to high of x [px]")
 
     @property
     def is_null(self) -> bool:
-        return not any(self.values_px)
+        return not any(map(any, self.values_px))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        error = curve(self._covariate(state), self.low, self.high, self.values_px, self.period)
-        return replace(state, disparity=state.disparity + error)
+        x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
+        return replace(state, disparity=state.disparity + surface(x, y, self.along, self.across, self.values_px))
 
-    def _covariate(self, matches: Matches) -> mi.Float64:
-        match self.covariate:
+    @staticmethod
+    def _of(matches: Matches, covariate: Covariate) -> mi.Float64:
+        match covariate:
             case "image_x":
                 return matches.u
             case "image_y":

@@ -8,37 +8,41 @@ from pydantic import Field
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.curve import curve
+from sensors.curve import Axis, Table, surface
 from sensors.device import bounded
 from sensors.effects.base import Effect, Stage
 from sensors.pulses import Pulses
 
+Covariate = Literal["range", "azimuth", "zenith", "incidence", "intensity", "time"]
+
 
 class RangeEmpirical(Effect):
-    """dR = c(x), c linear between values at even distances from low to high: empirical, found by `scarpsim gap`; not in the
-    shared catalogue.
+    """dR = c(x) or c(x, y), linear between values at even distances: empirical, found by `scarpsim gap`; not in the shared
+    catalogue.
 
-    x: range (m), azimuth, zenith or incidence (rad), the logarithm of the received power, or the share of the scan's duration.
+    x, y: range (m), azimuth, zenith or incidence (rad), the logarithm of the received power, or the share of the scan's duration.
     """
 
     name: Literal["range_empirical"] = "range_empirical"
     sensor = "tls"
     stage = Stage.RANGE
-    covariate: Literal["range", "azimuth", "zenith", "incidence", "intensity", "time"] = Field("range", description="x")
-    low: float = Field(0.0, description="x of the first value, in its unit; held below")
-    high: float = Field(1.0, description="x of the last value, in its unit; held above")
-    period: float = Field(0.0, ge=0, description="of x, which then counts modulo it; 0: none")
-    values_m: tuple[float, ...] = Field((0.0, 0.0), min_length=2, max_length=1025, description="c from low to high [m]")
+    covariate: Covariate = Field("range", description="x")
+    along: Axis = Field(Axis(), description="where the values stand on x")
+    second: Covariate | None = Field(None, description="y, for a surface")
+    across: Axis = Field(Axis(), description="where the rows of values stand on y")
+    values_m: Table = Field(((0.0, 0.0),), description="c: rows along y, each from low to high of x [m]")
 
     @property
     def is_null(self) -> bool:
-        return not any(self.values_m)
+        return not any(map(any, self.values_m))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        return state.with_range_error(curve(self._covariate(state), self.low, self.high, self.values_m, self.period))
+        x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
+        return state.with_range_error(surface(x, y, self.along, self.across, self.values_m))
 
-    def _covariate(self, pulses: Pulses) -> mi.Float64:
-        match self.covariate:
+    @staticmethod
+    def _of(pulses: Pulses, covariate: Covariate) -> mi.Float64:
+        match covariate:
             case "range":
                 return pulses.true_range
             case "azimuth":
