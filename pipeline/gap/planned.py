@@ -122,7 +122,8 @@ def measured_survey(measurement: Measurement) -> Survey:
     if measurement.station is None:
         return Survey(measurement.sensor, (view,), measurement.reference.bounds.mean(axis=0), _pair_observer("medium"))
     reach = float(np.median(found.geometry.range_m)) if measurement.sensor == "tls" else 1.0
-    scanner = ScannerConfig(azimuth_step_rad=step / reach, zenith_step_rad=step / reach, zenith_limits_rad=(0.05, 3.09))
+    steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than a scan where the wall is near
+    scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
     return Survey(measurement.sensor, (view,), measurement.reference.bounds.mean(axis=0), _scan_observer(scanner))
 
 

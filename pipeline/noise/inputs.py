@@ -22,7 +22,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel
 from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner, Pattern, ScannerConfig
+from sensors.tls import LaserScanner, Pattern
 
 BoolArray = NDArray[np.bool_]
 _REACH_PX = 2
@@ -125,7 +125,7 @@ def _measured_site(measurement: Measurement, config: SimulationConfig) -> Site:
         scanner = LaserScanner.aimed(world, frame, mesh.vertices, config.scanner, model)
     else:
         azimuth, zenith = measurement.pattern.azimuth_rad, measurement.pattern.zenith_rad
-        steps = ScannerConfig(**config.scanner.model_dump() | {"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})
+        steps = config.scanner.model_copy(update={"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})  # of any size
         pattern = Pattern.over(azimuth[:2], zenith[:2], steps)
         scanner = LaserScanner(position, rotation, pattern, steps, model)
     return Site("measured", (), mesh, frame, scanner, {"scanner": position})
