@@ -56,7 +56,6 @@ def bare(pyramid: Any, image: np.ndarray, *, backward: bool) -> Callable[[], obj
     """The backbone with its pyramid alone, compiled."""
     import tensorflow as tf
 
-    @tf.function(reduce_retracing=True)
     def work(values: Any) -> Any:
         if not backward:
             return pyramid(values, training=False)
@@ -64,8 +63,8 @@ def bare(pyramid: Any, image: np.ndarray, *, backward: bool) -> Callable[[], obj
             total = sum(tf.reduce_mean(tf.square(level)) for level in pyramid(values, training=True))
         return tape.gradient(total, pyramid.trainable_variables)
 
-    values = tf.constant(image)
-    return lambda: work(values)
+    values, compiled = tf.constant(image), tf.function(work)
+    return lambda: compiled(values)
 
 
 def main() -> None:
