@@ -59,6 +59,11 @@ class DisparityRaster:
         disparity[matched] = nominal.disparity((u[matched], v[matched]), project(right, point[matched]))
         return cls(step, disparity.reshape(shape), (seen & hidden).reshape(shape), row, column)
 
+    @property
+    def jump_px(self) -> float:
+        """Difference of neighbouring cells beyond which they lie on both sides of a depth step."""
+        return max(_STEEP * self.step, 1.0)
+
     def at_points(self, raster: NDArray[Any]) -> NDArray[Any]:
         """(n,) what a raster holds at the points."""
         return np.asarray(raster[self.row, self.column])
@@ -70,7 +75,7 @@ class DisparityRaster:
         for values in sorted(effects, key=lambda effect: (effect.stage, effect.order)):
             match values.name:
                 case "edge_fattening":
-                    found = fattened(found, int(values.radius_px / self.step + 1e-9), max(_STEEP * self.step, 1.0))
+                    found = fattened(found, int(values.radius_px / self.step + 1e-9), self.jump_px)
                 case "smoothing":
                     found = smoothed(found, values.sigma_px / self.step)
                 case "occlusion_fill":

@@ -57,7 +57,7 @@ class Blocks:
 
     def tested(self, gains: FloatArray) -> tuple[float, float] | None:
         """Total gain and p-value of gains (n,), None where they do not convince: blocks all over the wall have to agree."""
-        total, sums = float(gains.sum()), self.sums(np.minimum(gains, _MOST))
+        total, sums = float(gains.sum()), self.sums(np.clip(gains, -_MOST, _MOST))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
         if total < _LEAST_GAIN or sigmas < _BLOCK_SIGMAS:
             return None

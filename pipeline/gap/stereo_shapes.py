@@ -27,6 +27,8 @@ _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 _FINER = (1.1, 1.03)
 _CLEAR = 3.0
 """Predicted sigmas by which an effect at depth steps must move a point for it to bear witness."""
+_CLEAR_STEP = 1.3
+"""How many times the least depth step it must be: what counts as one, matchers do not agree."""
 _FEWEST_FILLED, _LEAST_FILLED_GAIN = 8, 10.0
 _LEAST_HELD, _HELD_BY_CHANCE = 0.6, 0.3
 _FILLED, _STRAY_FILLED = 0.9, 0.02
@@ -49,7 +51,8 @@ class _Witnesses:
         without = self.raster.moved(beside, self.disparity)
         moved = self.raster.moved([*beside, effect], self.disparity)
         if isinstance(effect, EdgeFattening):
-            moved = np.where(np.abs(moved - without) > _CLEAR * self.sigma, moved, without)
+            clear = np.maximum(_CLEAR * self.sigma, _CLEAR_STEP * self.raster.jump_px)
+            moved = np.where(np.abs(moved - without) > clear, moved, without)
         more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
         return np.where(moved == without, 0.0, more)
 

@@ -1,0 +1,101 @@
+"""Lost returns: chances drawn in closed form, and what must not be taken for an effect."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from pipeline.gap.missing import MissingFound, find_missing, isolated
+from pipeline.gap.residuals import Missing
+from pipeline.gap.verify import measure_losses
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
+COUNT = 30_000
+
+
+def pulses() -> tuple[Array, Array, dict[str, Array]]:
+    """A wall 40 m wide and 30 m high, seen from 50 m: places x and y, and the covariates of pulses to them."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(-20, 20, COUNT), rng.uniform(0, 30, COUNT)
+    distance = np.sqrt(x**2 + y**2 + 50**2)
+    cosine = 50 / distance
+    covariates = {
+        "range": distance,
+        "incidence": np.arccos(cosine),
+        "log_power": np.log(cosine * (100 / distance) ** 2),
+        "azimuth": np.arctan2(x, 50.0),
+        "zenith": np.pi / 2 - np.arcsin(y / distance),
+    }
+    return x, y, covariates
+
+
+def found(chance: Array, early: int = 0, seed: int = 6) -> MissingFound | None:
+    """What is found where pulses are lost with a chance (n,)."""
+    x, y, covariates = pulses()
+    lost = np.random.default_rng(seed).uniform(size=COUNT) < chance
+    every = np.arange(COUNT) % 5 != 0
+    return find_missing(Missing(lost, covariates, np.stack([x, y], axis=1)), every, early, COUNT, None)
+
+
+def test_a_limit_is_found_with_its_spread_of_albedo() -> None:
+    _, _, covariates = pulses()
+    level = float(np.quantile(covariates["log_power"], 0.5))
+    effect = found(0.01 + 0.99 * norm.cdf((level - covariates["log_power"]) / 0.3))
+    assert effect is not None
+    assert effect.name == "detection_limit"
+    # with albedos about 0.5, the limit lies at half of what a white wall sends back there; 3 % is 5 sigma of 30,000 pulses
+    assert effect.parameters["minimum_power"] == pytest.approx(0.5 * np.exp(level), rel=0.03)
+
+
+def test_a_rate_of_precipitation_lies_in_its_interval() -> None:
+    distance = pulses()[2]["range"]
+    rate = 1.5e-3
+    effect = found(1 - 0.99 * np.exp(-2 * rate * distance), early=40)
+    assert effect is not None
+    assert effect.name == "precipitation"
+    assert effect.parameters["rate_per_m"] == pytest.approx(rate, abs=3.3 * effect.std["rate_per_m"] + 0.05 * rate)
+
+
+def test_losses_in_a_sector_are_no_effect_of_the_catalogue() -> None:
+    azimuth = pulses()[2]["azimuth"]
+    effect = found(np.where(np.abs(azimuth - 0.1) < 0.08, 0.4, 0.02))
+    assert effect is not None
+    assert effect.covariate == "azimuth"
+
+
+def test_losses_alike_everywhere_are_none() -> None:
+    """20 draws; a score of 9 has a chance of some 1e-4 in each."""
+    assert all(found(np.full(COUNT, 0.03), seed=seed) is None for seed in range(20))
+
+
+def test_a_shrub_before_the_wall_is_none() -> None:
+    x, y, _ = pulses()
+    assert found(np.where(np.hypot(x - 8, y - 10) < 1.5, 1.0, 0.01)) is None
+
+
+def test_drops_scatter_and_what_stands_before_the_wall_does_not() -> None:
+    x, y, _ = pulses()
+    at = np.stack([x, y], axis=1)
+    drops = np.random.default_rng(7).uniform(size=COUNT) < 0.003
+    assert isolated(at, drops) == drops.sum()
+    assert isolated(at, np.hypot(x - 8, y - 10) < 1.0) == 0
+
+
+def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:
+    """The Brier score of a chance p is p (1 - p) on average: what is left is nothing, within 3.3 standard errors."""
+    x, y, covariates = pulses()
+    chance = np.where(covariates["zenith"] < 1.2, 0.62, 0.02)
+    lost = np.random.default_rng(8).uniform(size=COUNT) < chance
+    held_out = np.arange(COUNT) % 5 == 0
+    gap = measure_losses(Missing(lost, covariates, np.stack([x, y], axis=1)), chance, held_out)
+    assert gap is not None
+    assert gap.unit == "1"
+    floor = chance[held_out] * (1 - chance[held_out])
+    # patches of the wall count alike, however many pulses they hold: up to a tenth beside the mean of all pulses
+    error = 3.3 * float(np.std((lost - chance)[held_out] ** 2)) / np.sqrt(held_out.sum()) + 0.1 * floor.mean()
+    assert gap.after == pytest.approx(floor.mean(), abs=error)
+    assert gap.before > 1.2 * gap.after
+    assert gap.closed == pytest.approx(1.0, abs=0.1)

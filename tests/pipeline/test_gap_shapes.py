@@ -1,0 +1,95 @@
+"""Effects where the surface is not smooth, and noise on a grid: measurements of the challenge's own generator."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.gap_challenge.cases import Case, make
+from pipeline.gap.cells import Cells
+from pipeline.gap.footprint import find_footprint
+from pipeline.gap.measurement import Measurement, read_measurement
+from pipeline.gap.registration import registered, settled
+from pipeline.gap.residuals import Residuals
+from pipeline.gap.spread import find_spread
+from pipeline.gap.stereo_noise import told_apart
+from pipeline.gap.stereo_shapes import find_shapes
+from scene.keyed_random import KeyedRandom
+from sensors.effects import BeamDivergence
+from sensors.model import StereoModel
+
+Made = tuple[Measurement, Residuals, dict[str, Any]]
+
+
+def made(tmp_path: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made:
+    """A measurement with the effects `kinds`, its residuals, and the true parameters of the first of them."""
+    stratum = "one" if kinds else "none"
+    make(Case(0, (seed, 1), stratum, sensor, kinds, 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    effects = json.loads((tmp_path / "truth.json").read_text())["effects"]
+    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    return there, residuals, effects[0]["parameters"] if effects else {}
+
+
+def shapes_of(case: Made) -> dict[str, Any]:
+    """The effects on the shape of disparities, by name."""
+    there, residuals, _ = case
+    return {each.name: each for each in find_shapes(there, residuals, registered(residuals)[0])}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_low_pass_is_found_with_its_width(tmp_path: Path, seed: int) -> None:
+    case = made(tmp_path, "stereo", ("smoothing",), seed)
+    found = shapes_of(case)
+    assert set(found) == {"smoothing"}
+    # the generator filters its own cells, the diagnosis those of the reference, whose error is some millimetres
+    assert found["smoothing"].effect.sigma_px == pytest.approx(case[2]["sigma_px"], rel=0.1)
+
+
+def test_outlines_that_grow_are_found_with_their_reach(tmp_path: Path) -> None:
+    case = made(tmp_path, "stereo", ("edge_fattening",), 1)
+    found = shapes_of(case)["edge_fattening"]
+    assert found.effect.radius_px == pytest.approx(case[2]["radius_px"], abs=2 * np.sqrt(3) * found.std["radius_px"])
+
+
+def test_strips_that_are_filled_are_found(tmp_path: Path) -> None:
+    found = shapes_of(made(tmp_path, "stereo", ("occlusion_fill",), 6))
+    assert set(found) == {"occlusion_fill"}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_wall_without_effects_shows_no_shape(tmp_path: Path, seed: int) -> None:
+    assert not shapes_of(made(tmp_path, "stereo", (), seed))
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int) -> None:
+    there, residuals, truth = made(tmp_path, "tls", ("beam_divergence",), seed)
+    rough, _, scale = registered(residuals)
+    (found,) = find_footprint(there, residuals, rough, scale)
+    assert isinstance(found.effect, BeamDivergence)
+    # the generator's beam has other sub-rays: 15 %
+    assert found.effect.divergence_rad == pytest.approx(truth["divergence_rad"], rel=0.15)
+    assert found.effect.mode == truth["mode"]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
+    there, residuals, _ = made(tmp_path, "tls", (), seed)
+    rough, _, scale = registered(residuals)
+    assert not find_footprint(there, residuals, rough, scale)
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("parallax_noise", 2), ("regularization_noise", 4)])
+def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: str, seed: int) -> None:
+    there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
+    part = residuals.part(residuals.smooth)
+    value = registered(part)[0]
+    spread = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    assert isinstance(there.model, StereoModel)
+    (found,) = told_apart(spread, part, value, there.model)
+    assert found.name == kind
+    assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.1)
