@@ -73,10 +73,8 @@ def _named(white: SpreadFound, part: Residuals, value: FloatArray, model: Stereo
     plain, variance, error = variogram.fitted(np.ones(len(variogram.value)))
     if variance > 0:
         both = _with_variance(both, variance, error, 1.0)
-    if _FINEST * variogram.step <= _STEPS_PX[0]:  # else a grid may be too fine for this raster to tell
-        white = replace(both, alike=white.alike)
-    else:
-        white = both
+    resolved = _FINEST * variogram.step <= _STEPS_PX[0]  # else a grid may be too fine for this raster to tell
+    white = replace(both, alike=white.alike) if resolved else both
     trials = [(variogram.fitted(_nodes(variogram.lag, step)), step) for step in _STEPS_PX if step >= _FINEST * variogram.step]
     (square, variance, error), step = min(trials, key=lambda trial: trial[0][0], default=((np.inf, 0.0, 0.0), 0.0))
     if plain < square - _MARGIN:
