@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Union
 
-from pydantic import BeforeValidator, Discriminator
+from pydantic import AfterValidator, BeforeValidator, Discriminator
 
 from scene.errors import nearest
 from sensors.effects.affinity_skew import AffinitySkew
@@ -114,7 +114,16 @@ def _named(effects: tuple[type[Effect], ...]) -> Any:
             return {**value, "name": name}
         return value
 
-    return Annotated[Union[effects], Discriminator("name"), BeforeValidator(check)]  # noqa: UP007 (built at run time)
+    known = Annotated[Union[effects], Discriminator("name")]  # noqa: UP007 (built at run time)
+    return Annotated[known, BeforeValidator(check), AfterValidator(_doing_something)]
+
+
+def _doing_something(effect: Effect) -> Effect:
+    """Refuse an effect that was named without the parameter that switches it on; one that is set to null by name stays."""
+    switches = list(effect.nulls()) or ["values_m" if effect.sensor == "tls" else "values_px"]
+    if effect.is_null and not effect.model_fields_set.intersection(switches):
+        raise ValueError(f"{effect.name} does nothing without {' or '.join(switches)}; give a value")
+    return effect
 
 
 TlsEffect = _named((*TLS_EFFECTS, RangeEmpirical))

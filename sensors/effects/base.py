@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar, cast
 
 from pydantic import Field
 
@@ -46,8 +46,15 @@ class Effect(Config, ABC):
     @property
     def is_null(self) -> bool:
         """Whether every parameter has the value at which the effect does nothing."""
-        values = ((getattr(self, key), info.json_schema_extra) for key, info in type(self).model_fields.items())
-        return all(value == extra["null"] for value, extra in values if isinstance(extra, dict) and extra.get("null") is not None)
+        return all(getattr(self, key) == null for key, null in self.nulls().items())
+
+    @classmethod
+    def nulls(cls) -> dict[str, float]:
+        """The value at which the effect does nothing, by parameter; a period or a phase has none."""
+        extras = ((key, info.json_schema_extra) for key, info in cls.model_fields.items())
+        return {
+            key: cast(float, extra["null"]) for key, extra in extras if isinstance(extra, dict) and extra.get("null") is not None
+        }
 
     def apply(self, state: StateT, random: KeyedRandom) -> StateT:
         """The state (`Pulses`, `Beam`, `CameraPair` or `Matches`) after this effect; `random` is the effect's own source."""

@@ -302,13 +302,23 @@ def test_an_effect_acts_at_a_step_edge_with_the_range_that_is_hit() -> None:
 @pytest.mark.parametrize(
     ("effects", "message"),
     [
-        ([{"name": "beam_divergence"}, {"name": "beam_divergence"}], "one beam"),
+        (2 * [{"name": "beam_divergence", "divergence_rad": 3e-4}], "one beam"),
         ([{"name": "beam_divergence", "sub_rays": 18}], "input should be 1, 7, 19"),
         ([{"name": "range_noise_intensity", "sigma_m": 0.1}], "unknown key"),
         ([{"name": "range_cyclic", "period_m": 0}], "period_m"),
         ([{"name": "precipitation", "early_share": 1.5}], "less than or equal to 1"),
+        ([{"name": "range_offset"}], "does nothing without offset_m"),
+        ([{"name": "tilt_drift"}], "without rate_x_rad or rate_y_rad"),
+        ([{"name": "range_cyclic", "period_m": 4.0}], "without amplitude_m"),
+        ([{"name": "range_empirical", "covariate": "zenith"}], "without values_m"),
     ],
 )
 def test_wrong_effects_are_named(effects: list[dict[str, Any]], message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse(TlsModel, {"noise": QUIET, "effects": effects}, "config")
+
+
+def test_an_effect_may_be_set_to_null() -> None:
+    """As a run's own record has it, and a config that is to be varied."""
+    entry = {"name": "range_offset", "offset_m": 0}
+    assert parse(TlsModel, {"effects": [entry]}, "config").effects[0].is_null
