@@ -114,8 +114,8 @@ def _named(effects: tuple[type[Effect], ...]) -> Any:
             return {**value, "name": name}
         return value
 
-    known = Annotated[Union[effects], Discriminator("name")]  # noqa: UP007 (built at run time)
-    return Annotated[known, BeforeValidator(check), AfterValidator(_doing_something)]
+    union = Union[effects]  # noqa: UP007 (built at run time)
+    return Annotated[union, Discriminator("name"), BeforeValidator(check), AfterValidator(_doing_something)]
 
 
 def _doing_something(effect: Effect) -> Effect:

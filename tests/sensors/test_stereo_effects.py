@@ -231,7 +231,7 @@ def typical(effect: type[Effect]) -> dict[str, Any]:
 def test_an_effect_is_the_identity_at_null_bit_for_bit_and_acts_at_its_typical_value(effect: type[Effect]) -> None:
     mesh = steps_with_texture()
     without = observe(mesh, [], "medium")
-    null = observe(mesh, [{"name": typical(effect)["name"]}], "medium")
+    null = observe(mesh, [{"name": typical(effect)["name"], **effect.nulls()}], "medium")
     acting = observe(mesh, [typical(effect)], "medium")
     for channel in ("points", "depth", "block"):
         assert getattr(null, channel).tobytes() == getattr(without, channel).tobytes()

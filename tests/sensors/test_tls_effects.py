@@ -258,9 +258,9 @@ def test_the_order_of_a_config_changes_nothing() -> None:
 
 
 def test_all_effects_at_their_null_leave_the_bytes_alone() -> None:
-    names = [{"name": effect.model_fields["name"].default} for effect in TLS_EFFECTS]
+    entries = [{"name": effect.model_fields["name"].default, **effect.nulls()} for effect in TLS_EFFECTS]
     bare, _ = look([], NOISY)
-    nulls, _ = look(names, NOISY)
+    nulls, _ = look(entries, NOISY)
     assert nulls.points.tobytes() == bare.points.tobytes()
 
 
@@ -304,7 +304,7 @@ def test_an_effect_acts_at_a_step_edge_with_the_range_that_is_hit() -> None:
     [
         (2 * [{"name": "beam_divergence", "divergence_rad": 3e-4}], "one beam"),
         ([{"name": "beam_divergence", "sub_rays": 18}], "input should be 1, 7, 19"),
-        ([{"name": "range_noise_intensity", "sigma_m": 0.1}], "unknown key"),
+        ([{"name": "range_noise_intensity", "sigma_m": 0.1}], "does not go with"),
         ([{"name": "range_cyclic", "period_m": 0}], "period_m"),
         ([{"name": "precipitation", "early_share": 1.5}], "less than or equal to 1"),
         ([{"name": "range_offset"}], "does nothing without offset_m"),
