@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 
 from pipeline.cli.answer import Answer, recorded
@@ -50,11 +51,22 @@ def run(arguments: argparse.Namespace) -> Answer:
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
     from pipeline.gap.measurement import read_measurement
     from pipeline.gap.report import summary, write
-    from pipeline.gap.workflow import diagnose
+    from pipeline.gap.workflow import STEPS, diagnose
+    from pipeline.progress import shown_progress
 
-    measurement = read_measurement(arguments.measurement)
-    found = diagnose(measurement, arguments.seed)
-    report = write(out, found, measurement)
+    weights = {**STEPS, "report": 2.0}
+    steps = iter(weights)
+    with shown_progress(quiet=arguments.quiet) as progress, ExitStack() as stage:
+
+        def begin_next(_done: str = "") -> None:
+            stage.close()
+            stage.enter_context(progress.stage(next(steps)))
+
+        progress.plan(weights)
+        begin_next()
+        measurement = read_measurement(arguments.measurement)
+        found = diagnose(measurement, arguments.seed, begin_next)
+        report = write(out, found, measurement)
     return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "gap.json"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +29,8 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
+STEPS = {"residuals": 3.0, "changes": 4.0, "naming": 10.0, "verification": 2.0}
+"""The steps of `diagnose` and about what each takes, s."""
 FEWEST_POINTS = 800
 _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
@@ -62,9 +65,12 @@ class Diagnosis:
     timings: dict[str, float]
 
 
-def diagnose(measurement: Measurement, seed: int = 1) -> Diagnosis:
-    """Find what separates the measurement from its model, name it, add it and measure the gap again."""
-    clock, random = _Clock(), KeyedRandom(seed, ("gap",))
+def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], None] | None = None) -> Diagnosis:
+    """Find what separates the measurement from its model, name it, add it and measure the gap again.
+
+    progress: called with the name of each step of `STEPS` that is done.
+    """
+    clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     residuals = residuals_of(measurement)
     clock.lap("residuals")
     if residuals.smooth.sum() < FEWEST_POINTS:
@@ -228,13 +234,16 @@ def _remaining(remaining: dict[str, Any], failed: list[Named]) -> dict[str, Any]
 
 
 class _Clock:
-    def __init__(self) -> None:
+    def __init__(self, told: Callable[[str], None] | None) -> None:
         self._start = self._last = time.perf_counter()
+        self._told = told
         self.laps: dict[str, float] = {}
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
         self.laps[name], self._last = now - self._last, now
+        if self._told is not None:
+            self._told(name)
 
     @property
     def total(self) -> float:
