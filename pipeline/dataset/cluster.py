@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from pipeline.dataset.worker import Order, fill_run
 from scene.errors import InputError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, LocalCluster
 
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _CONNECT_S = 20
@@ -80,7 +80,14 @@ def _local(stack: ExitStack, count: int) -> Client:
         dashboard_address=None,
         silence_logs=logging.CRITICAL,
     )
-    return stack.enter_context(Client(stack.enter_context(cluster)))
+    stack.callback(_closed, cluster)
+    return stack.enter_context(Client(cluster))
+
+
+def _closed(cluster: LocalCluster) -> None:
+    """Stop the workers. One that does not end in time (a busy machine) is Dask's to end with this process: its epochs are made."""
+    with suppress(TimeoutError):
+        cluster.close()
 
 
 def _remote(stack: ExitStack, address: str) -> Client:
