@@ -114,8 +114,8 @@ def _named(effects: tuple[type[Effect], ...]) -> Any:
             return {**value, "name": name}
         return value
 
-    union = Union[effects]  # noqa: UP007 (built at run time)
-    return Annotated[union, Discriminator("name"), BeforeValidator(check), AfterValidator(_doing_something)]
+    checks = BeforeValidator(check), AfterValidator(_doing_something)
+    return Annotated[Union[effects], Discriminator("name"), *checks]  # noqa: UP007 (built at run time)
 
 
 def _doing_something(effect: Effect) -> Effect:
