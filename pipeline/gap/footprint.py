@@ -19,7 +19,7 @@ from sensors.model import TlsModel
 _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
 _FINER = (1.12, 1.03)
-_MOST_POINTS = 60_000
+_MOST_POINTS = 30_000
 _FEWEST = 20
 _PROFILE = 0.08
 """Share by which a divergence is off where the beam's energy is not distributed as the model's is."""

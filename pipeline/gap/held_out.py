@@ -36,23 +36,18 @@ class Scored:
 
 
 def score_effects(
-    measurement: Measurement,
-    named: list[Named],
-    residuals: Residuals,
-    train: NDArray[np.int64],
-    test: BoolArray,
-    reference_sigma: float,
+    measurement: Measurement, residuals: Residuals, named: list[Named], trained: BoolArray, reference_sigma: float
 ) -> Scored:
-    """Score each effect with all others in the model. train: rows by which to register; test: (n,) where to score."""
+    """Score each effect with all others in the model. trained: (n,) points by which to register; the others are scored."""
     scored = [item for item in named if item.name.partition(".")[2] not in NOT_SCORED]
-    if not scored or test.sum() < 100:
+    if not scored or (~trained).sum() < 100:
         return Scored(named, [])
-    whole = _value(measurement, named, residuals, train)
+    whole = _value(measurement, named, residuals, trained)
     gains = {}
     for item in scored:
         others = [each for each in named if each is not item]
-        without = _value(measurement, others, residuals, train)
-        rows = test & np.isfinite(whole[0]) & np.isfinite(without[0])
+        without = _value(measurement, others, residuals, trained)
+        rows = ~trained & np.isfinite(whole[0]) & np.isfinite(without[0])
         patch = patches(residuals.at[rows], _POINTS_PER_PATCH)
         scores = [_log_score(value[rows], sigma[rows], patch, reference_sigma) for value, sigma in (whole, without)]
         gains[item.name] = scores[0] - scores[1]
@@ -65,18 +60,18 @@ def _least(item: Named) -> float:
 
 
 def _value(
-    measurement: Measurement, named: list[Named], residuals: Residuals, train: NDArray[np.int64]
+    measurement: Measurement, named: list[Named], residuals: Residuals, trained: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """(n,) residuals, registered by the rows `train`, and predicted sigma against the model with some effects."""
+    """(n,) residuals, registered by the points `trained`, and predicted sigma against the model with some effects."""
     model = with_effects(measurement.model, [item.entry for item in named])
-    found = settled(measurement.changed(model=model), residuals.index[train])[1]
+    found = settled(measurement.changed(model=model), residuals.index[trained])[1]
     count = len(measurement.cloud.points)
     place = np.full(count, -1)
     place[found.index[found.smooth]] = np.flatnonzero(found.smooth)  # an edge where the beam goes by this model says nothing
     rows = place[residuals.index]
     known = rows >= 0
     value, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    pose = pose_of(found.part(rows[train][known[train]]))
+    pose = pose_of(found.part(rows[trained & known]))
     value[known], sigma[known] = (found.value - found.pose @ pose)[rows[known]], found.sigma[rows[known]]
     return value, sigma
 

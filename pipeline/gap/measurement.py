@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, field_validator
 
 from pipeline.formats.camera_files import read_oriented, stereo_pair
@@ -81,7 +82,8 @@ class Measurement:
     """What was measured, with everything that predicts it.
 
     cloud: points in the wall frame; reference: wall frame; station: position (3,) and rotation (3, 3) scanner to wall frame, TLS
-    only; cameras: world frame, stereo only; frame: the wall frame.
+    only; cameras: world frame, stereo only; frame: the wall frame; order: each point's scan line and share of the scan's duration
+    (n,), None where not known, once they were counted (see `with_order`).
     """
 
     sensor: Literal["tls", "stereo"]
@@ -92,6 +94,7 @@ class Measurement:
     pattern: ScanPattern | None = None
     station: tuple[FloatArray, FloatArray] | None = None
     cameras: CameraPair | None = None
+    order: tuple[FloatArray | None, FloatArray | None] | None = None
 
     @cached_property
     def scene(self) -> RayCaster:
@@ -102,6 +105,18 @@ class Measurement:
         other = replace(self, **values)
         other.__dict__["scene"] = self.scene  # where cached_property keeps it
         return other
+
+    def part(self, rows: NDArray[np.int64]) -> Measurement:
+        """Some of the points."""
+        cloud = self.cloud
+        few = PointCloud(
+            points=cloud.points[rows],
+            intensity=None if cloud.intensity is None else cloud.intensity[rows],
+            gps_time=None if cloud.gps_time is None else cloud.gps_time[rows],
+            extra={name: values[rows] for name, values in cloud.extra.items()},
+        )
+        line, share = (None if values is None else values[rows] for values in self.order or (None, None))
+        return self.changed(cloud=few, order=self.order and (line, share))
 
 
 def read_model(path: Path) -> TlsModel | StereoModel:

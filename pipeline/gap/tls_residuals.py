@@ -67,11 +67,8 @@ def tls_residuals(measurement: Measurement) -> Residuals:
     position, rotation = _station(measurement)
     model = measurement.model
     assert isinstance(model, TlsModel)
-    local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
-    measured = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
-    azimuth, zenith = np.arctan2(local[:, 1], local[:, 0]), np.arccos(np.clip(local[:, 2] / measured, -1, 1))
-    azimuth = azimuth.mean() + np.angle(np.exp(1j * (azimuth - azimuth.mean())))
-    line, share = _order(measurement, azimuth)
+    azimuth, zenith, measured = _recorded(measurement)
+    line, share = measurement.order or _order(measurement, azimuth)
     intensity = measurement.cloud.intensity
     real = azimuth, zenith
     if any(effect.stage == Stage.AIM for effect in model.effects):
@@ -107,9 +104,22 @@ def tls_residuals(measurement: Measurement) -> Residuals:
         index=np.arange(len(measured)),
         geometry=geometry,
         notes=_notes(measurement),
-        missing=_missing(measurement, geometry),
     )
     return whole.part(hit)
+
+
+def with_order(measurement: Measurement) -> Measurement:
+    """With scan lines and times of all points, so that a part of them keeps them."""
+    return measurement.changed(order=_order(measurement, _recorded(measurement)[0]))
+
+
+def _recorded(measurement: Measurement) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(n,) azimuth, without jumps, and zenith (rad), and range (m)."""
+    position, rotation = _station(measurement)
+    local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
+    measured = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
+    azimuth, zenith = np.arctan2(local[:, 1], local[:, 0]), np.arccos(np.clip(local[:, 2] / measured, -1, 1))
+    return azimuth.mean() + np.angle(np.exp(1j * (azimuth - azimuth.mean()))), zenith, measured
 
 
 def _station(measurement: Measurement) -> tuple[FloatArray, FloatArray]:
@@ -201,9 +211,12 @@ def _notes(measurement: Measurement) -> tuple[str, ...]:
     return tuple(note for note, true in absent.items() if true)
 
 
-def _missing(measurement: Measurement, geometry: TlsGeometry) -> Missing | None:
-    """Every pulse of the pattern that should meet the wall, and whether it came back."""
-    pattern = measurement.pattern
+def missing_returns(measurement: Measurement, residuals: Residuals) -> Missing | None:
+    """Every pulse of the pattern that should meet the wall, and whether it came back; None without a pattern.
+
+    residuals: of all points of the measurement.
+    """
+    pattern, geometry = measurement.pattern, residuals.geometry
     if pattern is None:
         return None
     position, rotation = _station(measurement)

@@ -24,6 +24,7 @@ from pipeline.gap.selection import Tried
 from pipeline.gap.shapes import ShapeFound
 from pipeline.gap.spread import find_tails
 from pipeline.gap.stereo_shapes import find_shapes
+from pipeline.gap.tls_residuals import missing_returns, with_order
 from pipeline.gap.verify import Gap, Version, measure_gap, measure_losses, thinned
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -71,27 +72,33 @@ def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], 
     progress: called with the name of each step of `STEPS` that is done.
     """
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
-    residuals = residuals_of(measurement)
-    clock.lap("residuals")
-    if residuals.smooth.sum() < FEWEST_POINTS:
-        return _insufficient(measurement, residuals, clock)
+    measurement = with_order(measurement) if measurement.sensor == "tls" else measurement
     there, plain, surveyed = settled(measurement)
+    if measurement.sensor == "tls":
+        plain = replace(plain, missing=missing_returns(there, plain))
+    clock.lap("residuals")
+    if plain.smooth.sum() < FEWEST_POINTS:
+        return _insufficient(measurement, plain, clock)
     state = _State.of(there, plain, *_shapes(there, plain))
     clock.lap("changes")
-    named, naming = name_effects(state.shaped, state.part, state.scale, random)
+    named, naming = name_effects(*state.part, state.scale, random)
     if named:
         # what moves the beam everywhere hides, or feigns, what it does at edges
         again = _shapes(*settled(there.changed(model=with_effects(there.model, [item.entry for item in named])))[:2])
         if {each.name for each in again[0]} != {each.name for each in state.shapes}:
             state = _State.of(there, plain, *again)
-            named, naming = name_effects(state.shaped, state.part, state.scale, random)
+            named, naming = name_effects(*state.part, state.scale, random)
     residuals, shapes, changed, held_out, chosen = state.residuals, state.shapes, state.changed, state.held_out, state.chosen
     losses = _missing(there, residuals, state.rough, changed, state.cells.side_m)
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
     named = sorted([*named, *map(from_shape, shapes), *lost], key=lambda item: -item.gain)
     clock.lap("naming")
-    scored = score_effects(there, named, residuals, chosen, residuals.smooth & ~changed & held_out, naming.reference_sigma)
-    named = _with_tails(there, scored.named, residuals, np.flatnonzero(residuals.smooth & ~changed & ~held_out), state.cells)
+    tested = np.flatnonzero(residuals.smooth & ~changed & held_out)
+    rows = np.concatenate([chosen, tested[:: max(len(tested) // _MOST_POINTS, 1)]])
+    trained = np.arange(len(rows)) < len(chosen)
+    scored = score_effects(*few(there, residuals, rows), named, trained, naming.reference_sigma)
+    steady = np.flatnonzero(residuals.smooth & ~changed & ~held_out)
+    named = _with_tails(*few(there, residuals, steady[:: max(len(steady) // _MOST_POINTS, 1)]), scored.named, state.cells.side_m)
     after = with_effects(measurement.model, [item.entry for item in named])
     before = pose_of(plain.part(chosen))
     value = plain.value - plain.pose @ before
@@ -161,9 +168,9 @@ class _State:
         return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
 
     @property
-    def part(self) -> Residuals:
-        """The residuals that selection may look at."""
-        return self.residuals.part(self.chosen)
+    def part(self) -> tuple[Measurement, Residuals]:
+        """What selection may look at."""
+        return few(self.shaped, self.residuals, self.chosen)
 
 
 def _shapes(measurement: Measurement, residuals: Residuals) -> tuple[list[ShapeFound], BoolArray]:
@@ -196,19 +203,22 @@ def _shaped(
     return shaped, replace(residuals, value=np.where(np.isfinite(there), there, residuals.value), smooth=smooth)
 
 
-def _with_tails(
-    measurement: Measurement, named: list[Named], residuals: Residuals, rows: NDArray[np.int64], cells: Cells
-) -> list[Named]:
+def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
+    """The measurement with the points of some rows of its residuals alone, and their residuals."""
+    part = residuals.part(rows)
+    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)
+
+
+def _with_tails(measurement: Measurement, residuals: Residuals, named: list[Named], side_m: float) -> list[Named]:
     """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes but two: strips that
     are filled are also cells that had no match by chance, and drops return early."""
     if any(item.name == "stereo.occlusion_fill" or item.entry.get("early_share") for item in named):
         return named
     model = with_effects(measurement.model, [item.entry for item in named])
-    _, found, _ = settled(measurement.changed(model=model), residuals.index[rows])
-    trusted = np.flatnonzero(found.smooth & np.isin(found.index, residuals.index[rows]))
-    part = found.part(trusted)
+    found = settled(measurement.changed(model=model))[1]
+    part = found.part(np.flatnonzero(found.smooth))
     value, _, scale = registered(part)
-    tails = find_tails(value / part.sigma / scale, block_numbers(part.at, cells.side_m))
+    tails = find_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
     if tails is None:
         return named
     kept = [item for item in named if item.name.partition(".")[2] not in SPREADS]
