@@ -34,6 +34,8 @@ _LEAST_SURFACE_SCORE, _SURFACE_RATIO = 20.0, 1.15
 """Of a form of two covariates, and how many times that of one covariate it has to score."""
 _WAVE_RATIO = 2.0
 """A wave along a covariate must score so many times what waves in slanting directions do: the reference's error has some too."""
+_WAVE_SIGMAS = 1.0
+"""Standard deviations of the reference's error that a wave without a name has to have at least."""
 _MOST_EFFECTS = 3
 _WIDTH = 5
 """Sets of one size that are grown further."""
@@ -259,12 +261,21 @@ class MeanSearch:
             levels.append(grown)
         best = levels[-1][0]
         free = self._free(levels)
-        if free is not None:
+        if free is not None and not self._may_be_the_reference(*free):
             members, form = free
             chosen = [self._chosen(_Set(members, 0.0, ()), item) for item in members]
             chosen.append(Chosen(form.candidate, (), self.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.tried(members)
         return [self._chosen(best, item) for item in best.members], best.tried
+
+    def _may_be_the_reference(self, members: tuple[Tried, ...], form: Tried) -> bool:
+        """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave."""
+        if form.candidate.form != "wave":
+            return False
+        candidates, fit = self.refined([form.candidate, *(member.candidate for member in members)])
+        values = self.split(fit.coefficients, candidates)[0][:2]
+        error = float(np.sqrt(fit.at.ratio)) * self.model.typical_sigma
+        return float(np.std(candidates[0].columns @ values)) < _WAVE_SIGMAS * error
 
     def _grown(self, level: list[_Set]) -> list[_Set]:
         """The best sets of one effect more, best first."""
