@@ -85,7 +85,7 @@ def _local(stack: ExitStack, count: int) -> Client:
 
 
 def _closed(cluster: LocalCluster) -> None:
-    """Stop the workers. One that does not end in time (a busy machine) is Dask's to end with this process: its epochs are made."""
+    """Stop the workers. One that does not end in time, on a busy machine, ends with this process; its epochs are made."""
     with suppress(TimeoutError):
         cluster.close()
 

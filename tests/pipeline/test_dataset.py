@@ -522,6 +522,20 @@ def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
         make_dataset(tiny(), tmp_path / "set", Workers(scheduler="tcp://127.0.0.1:9"))
 
 
+def test_a_worker_that_does_not_end_in_time_spoils_nothing(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Dask's nanny on a busy machine: the set is finished, and so is the command."""
+    distributed = pytest.importorskip("distributed")
+
+    class Slow(distributed.LocalCluster):  # type: ignore[misc, name-defined]
+        def close(self, timeout: float | None = None) -> None:
+            super().close(timeout)
+            raise TimeoutError
+
+    monkeypatch.setattr(distributed, "LocalCluster", Slow)
+    make_dataset(tiny(), tmp_path / "set", Workers(1), command="scarpsim dataset tiny.yaml --out DIR")
+    assert digests(tmp_path / "set") == digests(made)
+
+
 def test_a_full_disk_stops_the_job_and_the_next_goes_on(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from pipeline.dataset import worker
 

@@ -14,7 +14,7 @@ from gap_cases import Scan, write_scan
 
 from pipeline.cli.main import main
 from pipeline.gap.measurement import read_measurement
-from pipeline.gap.workflow import Diagnosis, diagnose
+from pipeline.gap.workflow import STEPS, Diagnosis, diagnose
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,7 +32,10 @@ def test_the_generator_shares_no_code_with_what_it_tests() -> None:
 
 
 def test_nothing_is_found_where_there_is_nothing(tmp_path: Path) -> None:
-    assert found_in(tmp_path, 1).verdict == "no_gap"
+    write_scan(tmp_path, 1)
+    told: list[str] = []
+    assert diagnose(read_measurement(tmp_path), progress=told.append).verdict == "no_gap"
+    assert told == list(STEPS)
 
 
 def test_a_rockfall_is_a_change_of_the_scene(tmp_path: Path) -> None:
