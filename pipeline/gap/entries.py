@@ -33,21 +33,12 @@ _NODES, _GRID, _MOST_POINTS = 65, 17, 20_000
 """Of the curve of an empirical term, and of each side of a surface."""
 _BEYOND = 100.0
 """Times its typical size, an effect explains nothing: no instrument is so far out."""
-_SPLITS = {
-    frozenset({"range_offset", "range_scale"}): "a second station at another range",
-    frozenset({"collimation", "trunnion_tilt"}): "a scan with steeper lines of sight, or in two faces",
-    frozenset({"principal_point_x", "camera_phi"}): "a surface with more relief, or a second distance",
-    frozenset(
-        {"focal_length", "affinity_skew"}
-    ): "one of the cameras turned by 90 degrees, or check points across the whole frame",
-}
-_SPLIT_TLS = "a second station at another range and azimuth, or targets of known position"
-_SPLIT_STEREO = "a second distance, or check points of known position across the whole frame"
 
 
 @dataclass(frozen=True)
 class Named:
-    """One effect of gap.json. name: with the sensor's prefix; entry: of a model's `effects`; std: of the parameters."""
+    """One effect of gap.json. name: with the sensor's prefix; entry: of a model's `effects`; std: of the parameters; split_by:
+    the measurement that would split the class, "" for a class of one."""
 
     name: str
     kind: str
@@ -56,16 +47,7 @@ class Named:
     alike: tuple[str, ...]
     p_value: float
     gain: float
-
-    @property
-    def split_by(self) -> str:
-        """The measurement that would split the class; "" for a class of one."""
-        if not self.alike:
-            return ""
-        sensor, _, name = self.name.partition(".")
-        others = {each.partition(".")[2] for each in self.alike}
-        found = [text for pair, text in _SPLITS.items() if name in pair and pair & others]
-        return found[0] if found else (_SPLIT_TLS if sensor == "tls" else _SPLIT_STEREO)
+    split_by: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """As gap.json holds it."""

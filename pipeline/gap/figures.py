@@ -115,7 +115,8 @@ def gap_figure(gap: Gap) -> bytes:
     panel.barh(0, before - after, left=after, color="#56B4E9", height=0.5, label="closed")
     panel.barh(0, max(after - floor, 0.0), left=floor, color=_BEFORE, height=0.5, label="left")
     errors = {"before": factor * gap.error, "after": factor * gap.floor_error}
-    for name, value, level in (("floor", floor, -0.42), ("after", after, 0.34), ("before", before, -0.42)):
+    close = abs(before - floor) < 0.25 * max(abs(after - floor), abs(before - after), 4 * factor * gap.error)
+    for name, value, level in (("floor", floor, -0.42), ("after", after, 0.34), ("before", before, -0.62 if close else -0.42)):
         panel.plot([value, value], [-0.33, 0.33], color="black", linewidth=1.2)
         panel.text(value, level, f"{name} {value:.3f}", ha="center", va="bottom" if level > 0 else "top", fontsize=8)
         if name in errors:

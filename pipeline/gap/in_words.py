@@ -81,7 +81,7 @@ def _effect(effect: Named) -> str:
         what = f"depends on {covariate}" if covariate else "is larger than the model says"
         return f"The disagreement {what}; it is described, not explained, by {effect.name}."
     said = f"It is {effect.name} ({values(effect)})."
-    return f"{said} It looks like {', '.join(effect.alike)}; {effect.split_by} would split them." if effect.alike else said
+    return f"{said} It looks like {', '.join(effect.alike)}; what would split them: {effect.split_by}." if effect.alike else said
 
 
 def _gap(gap: Gap, named: bool) -> str:

@@ -112,11 +112,12 @@ def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
     return Survey(sensor, views, site.mesh.bounds.mean(axis=0), observe)
 
 
-def measured_survey(measurement: Measurement) -> Survey:
-    """The survey of a measurement: its own points, of which only the places count, not what they measured."""
+def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
+    """The survey of a measurement: its own points, of which only the places count, not what they measured. most: points of the
+    thinned grid."""
     found = tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
     rows = np.flatnonzero(found.smooth)
-    some = rows[:: max(len(rows) // _MOST_PULSES, 1)]
+    some = rows[:: max(len(rows) // most, 1)]
     view = View(found.part(some), len(rows), 0, measurement)
     step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(len(rows), 1)))
     if measurement.station is None:

@@ -22,6 +22,7 @@ from pipeline.gap.registration import pose_of, registered, residuals_of, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Tried
 from pipeline.gap.shapes import ShapeFound
+from pipeline.gap.splitting import with_splits
 from pipeline.gap.spread import find_tails
 from pipeline.gap.stereo_shapes import find_shapes
 from pipeline.gap.tls_residuals import missing_returns, with_order
@@ -99,6 +100,7 @@ def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], 
     scored = score_effects(*few(there, residuals, rows), named, trained, naming.reference_sigma)
     steady = np.flatnonzero(residuals.smooth & ~changed & ~held_out)
     named = _with_tails(*few(there, residuals, steady[:: max(len(steady) // _MOST_POINTS, 1)]), scored.named, state.cells.side_m)
+    named = with_splits(there, named)
     after = with_effects(measurement.model, [item.entry for item in named])
     before = pose_of(plain.part(chosen))
     value = plain.value - plain.pose @ before
