@@ -17,7 +17,7 @@ from pipeline.difference import statistics
 from pipeline.formats.atomic import write_text
 from pipeline.noise.calibrate import Calibration
 from pipeline.report.figures import difference_figure, png_bytes
-from pipeline.report.page import template
+from pipeline.report.page import p_value_in_words, template
 from scene.mesh import FloatArray
 
 Pictures = Sequence[tuple[str, str, bytes]]
@@ -37,7 +37,7 @@ class _Table:
 def summary(result: Calibration) -> str:
     """The result in a few lines of text."""
     found = result.found
-    lines = [f"{len(result.epochs)} difference map(s) of a {_INSTRUMENTS[result.sensor]}"]
+    lines = [f"{_maps(len(result.epochs))} of a {_INSTRUMENTS[result.sensor]}"]
     lines += [f"  {name:<26}{text}" for name, text in _values(result)]
     lines += [f"  {warning}" for warning in warnings(result)]
     lines.append(f"  {found.maps:,} simulated maps, {result.rate:.1f} observations a second, {result.seconds:.0f} s in all")
@@ -107,11 +107,15 @@ def write_calibration_report(path: Path, result: Calibration, shown: Pictures, c
     write_text(path, page)
 
 
+def _maps(count: int) -> str:
+    return f"{count} difference map{'' if count == 1 else 's'}"
+
+
 def _sentence(result: Calibration) -> str:
     deviations = [each.size.standard_deviation * 1e3 for each in result.epochs]
     ground = "drawn by the user" if result.material.drawn else "found by the program"
     return (
-        f"{len(deviations)} difference map(s), standard deviation {np.mean(deviations):.1f} mm on average over stable ground "
+        f"{_maps(len(deviations))}, standard deviation {np.mean(deviations):.1f} mm on average over stable ground "
         f"{ground} ({np.mean(result.material.stable):.0%} of the map). Noise that gives the like was sought with "
         f"{result.found.maps:,} simulated maps in {result.seconds:.0f} s."
     )
@@ -176,7 +180,7 @@ def _epochs(result: Calibration) -> _Table:
         lengths = (size.median, size.standard_deviation, size.rmse, size.nmad)
         rows.append(
             [each.name, *(f"{1e3 * value:.1f}" for value in lengths), f"{tail.skewness:.2f}", f"{tail.excess_kurtosis:.1f}",
-             "\N{EN DASH}" if p is None else f"{p:.2g}", f"{each.independent:,.0f}", each.model.summary()]
+             p_value_in_words(p), f"{each.independent:,.0f}", each.model.summary()]
         )  # fmt: skip
     sizes = [each.size for each in result.epochs]
     mean = (np.mean([getattr(one, name) for one in sizes]) for name in ("median", "standard_deviation", "rmse", "nmad"))
@@ -188,7 +192,7 @@ def _epochs(result: Calibration) -> _Table:
     ]
     caption = "The measured epochs over stable ground, mm (tables 4-6 and 4-7); normality of as many values as are independent. "
     caption += "Trend: " + ("; ".join(trends) if trends else "needs four epochs") + "."
-    head = ["epoch", "median", "StD", "RMSE", "NMAD", "skewness", "kurtosis", "p normal", "independent", "variogram"]
+    head = ["epoch", "median", "StD", "RMSE", "NMAD", "skewness", "excess kurtosis", "normal, p", "independent", "variogram"]
     return _Table(caption, head, rows)
 
 

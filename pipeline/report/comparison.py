@@ -29,7 +29,7 @@ from pipeline.report.comparison_figures import (
     side_by_side,
     table_figure,
 )
-from pipeline.report.page import template
+from pipeline.report.page import p_value_in_words, template
 
 COMPARISON_FILE = "comparison.json"
 _NOTHING = "\N{EN DASH}"
@@ -164,7 +164,10 @@ def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> lis
         ("Stable ground: NMAD", [_mm(each.stable.nmad) for each in noises]),
         ("Beyond 3 NMAD (normal: 0.27 %)", [f"{each.tails.beyond_3_nmad:.2%}" for each in noises]),
         ("Excess kurtosis", [f"{each.tails.excess_kurtosis:.1f}" for each in noises]),
-        ("Normality, p", [_NOTHING if each.normality.p_value is None else f"{each.normality.p_value:.2g}" for each in noises]),
+        (
+            "Test of a normal distribution on independent pixels: p",
+            [p_value_in_words(each.normality.p_value) for each in noises],
+        ),
         ("Variogram (StD and range)", [each.model.summary() for each in noises]),
         ("Independent pixels of an epoch", [f"{each.effective:,.0f} of {each.pixels:,}" for each in noises]),
         ("Level of detection of a pixel, 95 %: median", [_mm(each.median_level_m) for each in noises]),

@@ -120,7 +120,10 @@ def covariate_figure(found: Sequence[Assessment]) -> bytes:
 
 
 def detection_figure(found: Sequence[Assessment]) -> bytes:
-    """Share of blocks seen against size and depth (points: classes with 95 % intervals; lines: the curve), and volume error."""
+    """Share of blocks seen against size and depth (points: classes with 95 % intervals; lines: the curve), and error of their volume.
+
+    The latter for classes of which at least half are seen: below, noise is as large as the volume.
+    """
     figure = Figure(figsize=(_WIDTH_IN, 4.4), dpi=DPI, layout="constrained")
     by_size, by_depth, volume = figure.subplots(1, 3)
     for number, (colour, each) in enumerate(zip(_colours(len(found)), found, strict=True)):
@@ -128,7 +131,7 @@ def detection_figure(found: Sequence[Assessment]) -> bytes:
         detection = each.detection
         _shares(by_size, detection.size_classes, detection.by_size, colour, shift, each.name)
         _shares(by_depth, detection.depth_classes, detection.by_depth, colour, shift, each.name)
-        shown = [item for item in detection.size_classes if item.volume_error is not None]
+        shown = [item for item in detection.size_classes if item.volume_error is not None and 2 * item.seen >= item.blocks]
         middle = [np.sqrt(item.low_m * item.high_m) * shift for item in shown]
         error = [100 * (item.volume_error or 0.0) for item in shown]
         spread = [100 * (item.volume_spread or 0.0) for item in shown]

@@ -28,6 +28,8 @@ SCALE_SIGMAS = 6.0
 _WIDEST_PX = 2000
 DPI = 150
 _MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.6, 9.0
+_PAIRED = 0.55
+"""Size of a picture that stands beside another one; its text is larger in proportion, its pixels are as many."""
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.7, 1.25, 0.6, 0.4
 _OUTSIDE, _INSIDE = "#0072B2", "#D55E00"
 FAMILY = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -71,7 +73,7 @@ def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "")
     shade = (-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / np.sqrt(
         1 + right**2 + down**2
     )  # the normal is (-dz/dx, -dz/dy, 1)
-    figure, axes = _map_figure(grid, title, right_in=0.2)
+    figure, axes = _map_figure(grid, title, right_in=0.2, size=_PAIRED)
     axes.set_facecolor(_NO_DATA_HILLSHADE)
     axes.imshow(shade, cmap=_GREYS, vmin=-0.1, vmax=1.0, extent=raster_extent(grid, shade.shape), interpolation="nearest")
     _no_data_legend(axes, heights, _NO_DATA_HILLSHADE)
@@ -101,7 +103,7 @@ def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str 
     known = pooled[np.isfinite(pooled)]
     low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
     margin = max(1e-3 * abs(low), 1e-12) if high - low <= 1e-6 * abs(high) else 0.0
-    figure, axes = _map_figure(grid, title)
+    figure, axes = _map_figure(grid, title, size=_PAIRED)
     axes.set_facecolor(NO_DATA)
     extent = raster_extent(grid, pooled.shape)
     image = axes.imshow(pooled, cmap=SEQUENTIAL, vmin=low - margin, vmax=high + margin, extent=extent, interpolation="nearest")
@@ -207,13 +209,13 @@ def _in_words(found: DifferenceStatistics) -> str:
     )
 
 
-def _map_figure(grid: Grid, title: str, right_in: float = _RIGHT_IN) -> tuple[Figure, Axes]:
-    """A figure whose axes have the aspect of the grid, in wall-frame metres."""
+def _map_figure(grid: Grid, title: str, right_in: float = _RIGHT_IN, size: float = 1.0) -> tuple[Figure, Axes]:
+    """A figure whose axes have the aspect of the grid, in wall-frame metres; size: of the map, its pixels stay as many."""
     aspect = grid.height / grid.width
-    width = min(_MAP_WIDTH_IN, _MAP_HEIGHT_IN / aspect)
+    width = min(_MAP_WIDTH_IN, _MAP_HEIGHT_IN / aspect) * size
     height = width * aspect
     full_width, full_height = _LEFT_IN + width + right_in, _BOTTOM_IN + height + _TOP_IN
-    figure = Figure(figsize=(full_width, full_height), dpi=DPI)
+    figure = Figure(figsize=(full_width, full_height), dpi=DPI / size)
     axes = figure.add_axes((_LEFT_IN / full_width, _BOTTOM_IN / full_height, width / full_width, height / full_height))
     axes.set_title(title, fontsize=11, loc="left")
     dress(axes, "x along the wall, m", "y up the wall, m")

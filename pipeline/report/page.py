@@ -17,6 +17,7 @@ from pipeline.report.figures import SCALE_SIGMAS
 
 _SENSORS = {"stereo": "stereo pair", "tls": "terrestrial laser scanner"}
 _NOTHING = "\N{EN DASH}"
+_LEAST_P = 0.001
 _UNFOLDED_ROWS = 60
 """A longer table of blocks comes folded."""
 
@@ -128,6 +129,13 @@ def template(name: str) -> jinja2.Template:
     )
     environment.filters |= {"mm": _mm, "metres": _metres, "volume": _volume, "percent": _percent, "picture": _picture}
     return environment.get_template(name)
+
+
+def p_value_in_words(p: float | None) -> str:
+    """A p-value as far as it means something: tests of many pixels give powers of ten that do not."""
+    if p is None:
+        return _NOTHING
+    return f"{p:.2g}" if p >= _LEAST_P else f"< {_LEAST_P:g}"
 
 
 def _picture(png: bytes) -> str:
