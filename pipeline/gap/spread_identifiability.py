@@ -47,6 +47,7 @@ def others(survey: Survey) -> tuple[OtherEffect, ...]:
     effects = TLS_EFFECTS if survey.sensor == "tls" else STEREO_EFFECTS
     names = [f"{survey.sensor}.{effect.model_fields['name'].default}" for effect in effects]
     mean = _mean_names(view)
+    found["stereo.texture_noise"] = OtherEffect("stereo.texture_noise", "", np.nan, "needs images: the diagnosis does not try it")
     return tuple(found.get(name, OtherEffect(name, "", np.nan, _NO_NUMBER)) for name in names if name not in mean)
 
 

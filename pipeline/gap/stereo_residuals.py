@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.disparity_raster import RASTER_EFFECTS, DisparityRaster
+from pipeline.gap.disparity_raster import RASTER_EFFECTS, DisparityRaster, spacing
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, is_hidden, moved_pair, project, rays, real_pair, seen_disparity
 from pipeline.gap.residuals import Residuals
@@ -85,9 +85,19 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
         index=np.arange(len(u)),
         geometry=geometry,
         shared_noise=(model.noise.regularization_sigma_px**2, _width(nominal, model, depth)),
-        notes=() if given else ("no pixel_x, pixel_y: pixels were found by projecting the points",),
+        notes=_notes(given, u),
     )
     return whole.part(hit)
+
+
+def _notes(given: bool, u: FloatArray) -> tuple[str, ...]:
+    """What cannot be looked into for want of a field. given: whether the pixels are recorded."""
+    absent = {
+        "no pixel_x, pixel_y: pixels were found by projecting the points": not given,
+        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tried": spacing(u) is None,
+        "no images: texture_noise was not tried": True,
+    }
+    return tuple(note for note, true in absent.items() if true)
 
 
 def _reference(
