@@ -120,7 +120,7 @@ def covariate_figure(found: Sequence[Assessment]) -> bytes:
 
 
 def detection_figure(found: Sequence[Assessment]) -> bytes:
-    """Share of blocks seen against size and depth (points: classes with 95 % intervals; lines: the curve), and error of their volume.
+    """Share of blocks seen against size and depth (points: classes with 95 % intervals; lines: the curve), and volume errors.
 
     The latter for classes of which at least half are seen: below, noise is as large as the volume.
     """
