@@ -19,7 +19,7 @@ class InputError(ValueError):
             parts.append(f"allowed: {allowed}")
         if remedy:
             parts.append(remedy)
-        super().__init__("; ".join(parts))
+        super().__init__(" ".join("; ".join(parts).splitlines()))
 
 
 def nearest(word: str, words: Iterable[str]) -> str:

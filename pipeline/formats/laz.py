@@ -31,6 +31,11 @@ EXACT_INTENSITY = "intensity_relative"
 """An extra dimension of this name is read as the intensity, in place of the 16-bit field."""
 
 
+_HEADER_BYTES = 375
+_CHUNK_SIZE_AT, _LARGEST_CHUNK, _VARIABLE_CHUNKS = 12, 10_000_000, 2**32 - 1
+"""Of a LAZ file: place of the chunks' size in LASzip's record, the largest that is believed, points, and what stands for any."""
+
+
 def write_laz(
     path: Path,
     points: FloatArray,
@@ -118,11 +123,14 @@ def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
 def _check_extent(path: Path) -> None:
     """Raise ValueError for a file cut off in its header, or whose table of LAZ chunks is absurd (lazrs would abort on it)."""
     with path.open("rb") as file:
+        _check_records(file.read(_HEADER_BYTES), path.stat().st_size)
+        file.seek(0)
         header = laspy.LasHeader.read_from(file)
         if path.stat().st_size < header.offset_to_point_data:
             raise ValueError("cut off within the header")
         if not header.are_points_compressed:
             return
+        _check_chunk_size(header)
         file.seek(header.offset_to_point_data)
         (table,) = struct.unpack("<q", file.read(8))
         if table < 0:  # written as a stream: the place of the table stands at the end
@@ -132,6 +140,22 @@ def _check_extent(path: Path) -> None:
         (chunks,) = struct.unpack("<I", file.read(4))
         if chunks > header.point_count:
             raise ValueError(f"{chunks:,} chunks for {header.point_count:,} points")
+
+
+def _check_records(start: bytes, size: int) -> None:
+    """Raise ValueError for more variable-length records than the file has room for: laspy would look for each of them."""
+    (count,) = struct.unpack_from("<I", start, 100)
+    (extended,) = struct.unpack_from("<I", start, 243) if start[25] >= 4 and len(start) == _HEADER_BYTES else (0,)
+    if 54 * count + 60 * extended > size:
+        raise ValueError(f"{count + extended:,} records in {size:,} bytes")
+
+
+def _check_chunk_size(header: laspy.LasHeader) -> None:
+    """Raise ValueError for chunks far larger than any program makes: lazrs takes the memory of a whole one, or aborts."""
+    for record in header.vlrs.get("LasZipVlr"):
+        (size,) = struct.unpack_from("<I", record.record_data, _CHUNK_SIZE_AT)
+        if max(header.point_count, _LARGEST_CHUNK) < size < _VARIABLE_CHUNKS:
+            raise ValueError(f"chunks of {size:,} points for {header.point_count:,} points")
 
 
 def _header(points: FloatArray, extra: Mapping[str, NDArray[Any]], scale_m: float, date: datetime.date) -> laspy.LasHeader:
