@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from pipeline.gap.cells import Cells, block_numbers, held_out_blocks
 from pipeline.gap.changes import SceneChange, find_changes
@@ -72,7 +73,11 @@ def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], 
 
     progress: called with the name of each step of `STEPS` that is done.
     """
-    clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
+    with threadpool_limits(1, "blas"):  # the same sums on any number of threads, and none that wait for each other
+        return _diagnose(measurement, _Clock(progress), KeyedRandom(seed, ("gap",)))
+
+
+def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> Diagnosis:
     measurement = with_order(measurement) if measurement.sensor == "tls" else measurement
     there, plain, surveyed = settled(measurement)
     if measurement.sensor == "tls":
