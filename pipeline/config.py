@@ -77,7 +77,7 @@ StationChoice = Annotated[
 
 
 def _model_kind(values: Any) -> str:
-    return str(values.get("sensor") if isinstance(values, dict) else values.sensor)
+    return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
 
 
 SensorModel = Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_model_kind)]

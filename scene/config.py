@@ -100,7 +100,7 @@ def _shown(value: Any) -> str:
     short = reprlib.Repr()
     short.maxstring = short.maxother = 80
     short.maxdict = short.maxlist = 6
-    short.maxlevel = 3
+    short.maxlevel = 2
     return short.repr(value)
 
 

@@ -125,6 +125,27 @@ def test_an_odd_override(override: str | tuple[str, Any]) -> None:
     answered(lambda: apply_overrides({"wall": {"style": "glendale"}, "a": [1]}, [text]))
 
 
+@pytest.mark.parametrize("kind", LOADERS)
+def test_a_bomb_of_aliases(kind: str, tmp_path: Path) -> None:
+    """Eleven lines that stand for 31 thousand million values."""
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]" for level in range(1, 11)]
+    first = next(iter(load_yaml(CONFIGS / f"{kind}.yaml")))
+    file = tmp_path / f"{kind}.yaml"
+    file.write_text("\n".join([*lines, f"{first}: *a10", "seed: *a10"]))
+    with pytest.raises(InputError) as caught:
+        LOADERS[kind](file)
+    assert len(str(caught.value)) < 3000
+
+
+def test_an_archive_is_no_wall(tmp_path: Path) -> None:
+    """Nothing is unpacked, so an archive cannot fill memory or disk."""
+    for name in ("wall.zip", "wall.tar.gz", "wall.bz2"):
+        (tmp_path / name).write_bytes(b"PK")
+        with pytest.raises(InputError, match="is no mesh format"):
+            ImportedWall(mesh=tmp_path / name).load()
+
+
 def damaged(whole: bytes, data: st.DataObject) -> bytes:
     """`whole` cut, with bytes changed, or with some put in."""
     at = data.draw(st.integers(0, len(whole) - 1) | st.integers(0, min(len(whole), 400) - 1), label="at")

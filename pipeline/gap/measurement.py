@@ -70,7 +70,7 @@ class MeasurementConfig(Config):
 
 
 def _kind(values: Any) -> str:
-    return str(values.get("sensor") if isinstance(values, dict) else values.sensor)
+    return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
 
 
 class _ModelFile(Config):

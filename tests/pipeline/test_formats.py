@@ -279,6 +279,18 @@ def test_laz_absurd_chunk_table_is_an_input_error(tmp_path: Path, cloud: PointCl
         read_laz(path)
 
 
+def test_laz_absurd_chunk_size_and_records_are_input_errors(tmp_path: Path, cloud: PointCloud) -> None:
+    """lazrs alone would abort the process, laspy look for four billion records."""
+    path = tmp_path / "a.laz"
+    write_laz(path, cloud.points[:1000])
+    data = path.read_bytes()
+    record = data.find(b"laszip encoded") - 2 + 54
+    for at, problem in ((record + 12, "chunks of 4,294,967,280 points"), (100, "records in"), (243, "records in")):
+        path.write_bytes(data[:at] + (2**32 - 16).to_bytes(4, "little") + data[at + 4 :])
+        with pytest.raises(InputError, match=problem):
+            read_laz(path)
+
+
 # --- PLY
 
 
