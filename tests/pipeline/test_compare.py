@@ -15,6 +15,7 @@ from pipeline.cli.main import main
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.noise.assess import assess
 from pipeline.noise.compare import Trial, compare, rockfalls
+from pipeline.noise.comparison import compare_sensors
 from pipeline.noise.contestants import contestants
 from pipeline.noise.covariates import edge_distance
 from scene.blocks import RockfallConfig
@@ -89,7 +90,7 @@ def test_sizes_grow_and_leave_room() -> None:
     assert [plan.count for plan in plans] == [100, 24, 3]  # 15 % of 50 m2 over (1.5 s + 0.1)^2
     assert rockfalls(RockfallConfig(), bounds, 2, None) == [RockfallConfig()] * 2
     with pytest.raises(InputError, match="smallest <= largest"):
-        rockfalls(RockfallConfig(), bounds, 2, (0.5, 0.1))
+        compare_sensors((), sizes_m=(0.5, 0.1))
 
 
 def test_all_see_the_same_wall_and_blocks(trial: Trial) -> None:
