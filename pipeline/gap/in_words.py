@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.gap.entries import Named
+from pipeline.gap.missing import LOSSES
 from pipeline.gap.selection import Tried
 from pipeline.gap.verify import Gap
 from pipeline.gap.workflow import Diagnosis
@@ -68,8 +69,12 @@ def values(effect: Named) -> str:
 
 
 def _value(key: str, value: Any, std: float | None) -> str:
+    if isinstance(value, dict):
+        cycle = f", repeated every {value['period']:.4g}" if value.get("period") else ""
+        return f"{key} {value['low']:.4g} to {value['high']:.4g}{cycle}"
     if isinstance(value, list):
-        return f"{key} {', '.join(f'{each:.3g}' for each in value)}"
+        flat = [each for row in value for each in row]
+        return f"{key} {len(value)} x {len(value[0])} from {min(flat):.3g} to {max(flat):.3g}"
     if not isinstance(value, float):
         return f"{key} {value}"
     return f"{key} {value:.4g}" + ("" if not std else f" \N{PLUS-MINUS SIGN} {std:.1g}")
@@ -77,11 +82,17 @@ def _value(key: str, value: Any, std: float | None) -> str:
 
 def _effect(effect: Named) -> str:
     if effect.kind == "empirical":
-        covariate = effect.entry.get("covariate")
-        what = f"depends on {covariate}" if covariate else "is larger than the model says"
-        return f"The disagreement {what}; it is described, not explained, by {effect.name}."
+        return f"The disagreement {_described(effect)}; it is described, not explained, by {effect.name}."
     said = f"It is {effect.name} ({values(effect)})."
     return f"{said} It looks like {', '.join(effect.alike)}; what would split them: {effect.split_by}." if effect.alike else said
+
+
+def _described(effect: Named) -> str:
+    covariates = [effect.entry[key] for key in ("covariate", "second") if effect.entry.get(key)]
+    if covariates:
+        return f"depends on {listed(covariates)}"
+    lost = effect.name.partition(".")[2] in LOSSES
+    return "is in the directions from which nothing returns" if lost else "is larger than the model says"
 
 
 def _gap(gap: Gap, named: bool) -> str:

@@ -13,7 +13,10 @@ import yaml
 from gap_cases import Scan, write_scan
 
 from pipeline.cli.main import main
+from pipeline.gap.in_words import paragraph
 from pipeline.gap.measurement import read_measurement
+from pipeline.gap.report import summary
+from pipeline.gap.where import where
 from pipeline.gap.workflow import STEPS, Diagnosis, diagnose
 
 ROOT = Path(__file__).parents[2]
@@ -74,6 +77,8 @@ def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
     found = found_in(tmp_path, 18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0))
     assert found.verdict == "unknown"
     assert found.effects[0].kind == "empirical"
+    assert "depends on" in paragraph(found, where(found))
+    assert "_empirical (covariate" in summary(found)
 
 
 def test_steps_of_the_range_are_found_to_a_micrometre(tmp_path: Path) -> None:
