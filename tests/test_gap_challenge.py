@@ -257,7 +257,7 @@ def test_powers_and_slopes_are_part_of_a_ray() -> None:
 @pytest.mark.slow
 def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
     """24 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names)
-    each fails in less than 2 % of draws; the seed is fixed. The rate of right names is short of GAP.md's 95 %, see below."""
+    each fails in less than 4 % of draws; the seed is fixed."""
     found = run(24, 20, 1, tmp_path, small=True)
     rows = found["rows"]
     assert {row["stratum"] for row in rows} == set(cases.STRATA)
@@ -269,5 +269,4 @@ def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> N
     assert len(committed) >= 5
     assert sum(bool(row["wrong_names"]) for row in committed) <= 1
     clear = [row for row in rows if row["stratum"] == "one" and row["true"][0]["snr_sin_angle"] >= 8]
-    # Two of the six are answered `unknown` today: a principal point (S/N 56) and white noise of the parallax (S/N 10).
-    assert sum(row["hits"][0] for row in clear) >= len(clear) - 2
+    assert sum(row["hits"][0] for row in clear) >= len(clear) - 1

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.measurement import Measurement
-from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, is_hidden, project, rays
+from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, is_hidden, project, rays, real_pair
 from pipeline.gap.residuals import BoolArray
 from scene.mesh import FloatArray
 from sensors.effects.base import Effect
@@ -50,7 +50,8 @@ class DisparityRaster:
             return None
         rows, columns = np.indices(shape)
         u, v = low[0] + step * columns.ravel(), low[1] + step * rows.ravel()
-        left, right = nominal.pair.left, nominal.pair.right
+        real = real_pair(nominal, measurement.model.effects, measurement)
+        left, right = real.left, real.right
         ray = rays(left, u, v)
         point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
         seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)

@@ -19,7 +19,7 @@ from sensors.camera import Camera, CameraPair
 _ROUNDS = 6
 _OUTLIER = 3.5
 _FEWEST = 100
-_FAR_M = 0.002
+_FAR_M, _MOST_MOVES = 0.002, 3
 
 
 def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
@@ -52,14 +52,16 @@ def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None) 
     """The measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there.
 
     trusted: rows of the measurement's points by which to register; all where None. A pose that moves the rays by more than some
-    millimetres on the wall is gone along with once, since slopes at the first place no longer serve.
+    millimetres on the wall is gone along with, a few times at the most, since slopes at the first place no longer serve.
     """
-    found = residuals_of(measurement)
-    pose = registered(_only(found, trusted))[1]
-    if not _is_far(pose, found):
-        return measurement, found, np.zeros(6)
-    there = moved(measurement, pose)
-    return there, residuals_of(there), pose
+    found, total = residuals_of(measurement), np.zeros(6)
+    for _ in range(_MOST_MOVES):
+        pose = registered(_only(found, trusted))[1]
+        if not _is_far(pose, found):
+            break
+        measurement, total = moved(measurement, pose), total + pose
+        found = residuals_of(measurement)
+    return measurement, found, total
 
 
 def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:

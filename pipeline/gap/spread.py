@@ -25,7 +25,7 @@ _CLIP = 4.5
 _LEAST_LEFT = 0.3
 """Share of a point's variance that its cell's plane must leave."""
 _CLASS_MARGIN = 3.0
-_FREE_MARGIN = 6.0
+_FREE_MARGIN, _FREE_GAIN, _FREE_BLOCK_SIGMAS = 6.0, 15.0, 2.0
 _SECOND_GAIN = 3.0
 _BINS = 8
 _FAR, _MOST_FAR, _CUT = 4.0, 0.004, 12.0
@@ -153,7 +153,7 @@ def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: K
     needed = _SECOND_GAIN if free_score > best.score + _FREE_MARGIN else _LEAST_GAIN
     agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    empirical = free_score > chosen.score + _FREE_MARGIN and _blocks_agree(squared, chosen.added(forms), free, block)
+    empirical = free_score > chosen.score + _FREE_MARGIN and _blocks_prefer(squared, chosen.added(forms), free, block)
     if empirical:
         chosen = best
     tried = tuple(sorted(((c.name, fit.score) for c, fit in zip(candidates, singles, strict=True)), key=lambda item: -item[1]))
@@ -232,9 +232,21 @@ def _differ_by(fit: _Joint, chosen: _Joint, number: int) -> bool:
 
 def _blocks_agree(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether the gain of one variance over another is common to the blocks and not due to a few."""
+    gain, sigmas = _gain_over(squared, first, second, block)
+    return gain > 0 and sigmas > _BLOCK_SIGMAS
+
+
+def _blocks_prefer(squared: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
+    """The same of a free form, which only has to say that the named one does not fit."""
+    gain, sigmas = _gain_over(squared, first, free, block)
+    return gain > _FREE_GAIN and sigmas > _FREE_BLOCK_SIGMAS
+
+
+def _gain_over(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
+    """Gain in log-likelihood of one variance over another, and how many times it is that of blocks with signs drawn at random."""
     terms = 0.5 * (squared * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
     sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
-    return bool(sums.sum() > _BLOCK_SIGMAS * np.linalg.norm(sums))
+    return float(sums.sum()), float(sums.sum() / max(float(np.linalg.norm(sums)), 1e-300))
 
 
 def _gain(squared: FloatArray, added: FloatArray) -> float:

@@ -13,7 +13,7 @@ from pipeline.gap.residuals import Residuals
 from pipeline.rigid import RigidTransform
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
-from sensors.camera import Camera
+from sensors.camera import Camera, CameraPair
 from sensors.curve import surface_on_host
 from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.model import StereoModel
@@ -67,12 +67,13 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
     else:
         u, v = project(nominal.pair.left, points)
     measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
-    geometry, curvature, depth = _reference(nominal, measurement.scene, u, v, measured)
-    hidden = is_hidden(measurement.scene, nominal.pair.right.position, geometry.point)
+    real = real_pair(nominal, model.effects, measurement)
+    geometry, curvature, depth = _reference(nominal, real, measurement.scene, u, v, measured)
+    hidden = is_hidden(measurement.scene, real.right.position, geometry.point)
     hit = np.isfinite(geometry.disparity)
     slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
     covariates = _covariates(nominal, geometry, depth, curvature)
-    mean = _mean_error(nominal, model, geometry, measurement) + _empirical(model, covariates)
+    mean = _mean_error(model, geometry, measurement) + _empirical(model, covariates)
     whole = Residuals(
         sensor="stereo",
         value=measured - geometry.disparity - mean,
@@ -101,17 +102,18 @@ def _notes(given: bool, u: FloatArray) -> tuple[str, ...]:
 
 
 def _reference(
-    nominal: NominalPair, scene: RayCaster, u: FloatArray, v: FloatArray, measured: FloatArray
+    nominal: NominalPair, real: CameraPair, scene: RayCaster, u: FloatArray, v: FloatArray, measured: FloatArray
 ) -> tuple[StereoGeometry, FloatArray, FloatArray]:
-    """What the left pixels see on the reference, the departure from the tangent plane beside it (px), and the depth (m)."""
-    left = nominal.pair.left
+    """What the pixels of the cameras as the model has them (`real`) see on the reference, its disparity in the nominal pair, the
+    departure from the tangent plane beside it (px), and the depth (m)."""
+    left = real.left
     ray = rays(left, u, v)
     distance, face = scene.cast(left.position, ray)
     corners = scene.mesh.vertices[scene.mesh.faces[np.maximum(face, 0)]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     point = left.position + distance[:, None] * ray
-    right = project(nominal.pair.right, point)
+    right = project(real.right, point)
     disparity = nominal.disparity((u, v), right)
     curvature = np.zeros(len(u))
     for du, dv in ((_PROBE_PX, 0.0), (-_PROBE_PX, 0.0), (0.0, _PROBE_PX), (0.0, -_PROBE_PX)):
@@ -120,7 +122,7 @@ def _reference(
         flat = np.einsum("ni,ni->n", point - left.position, normal) / np.einsum("ni,ni->n", beside, normal)
         step = nominal.geometry.f * nominal.geometry.base_m * (1 / seen - 1 / flat)
         curvature = np.maximum(curvature, np.nan_to_num(np.abs(step), nan=np.inf))
-    camera = nominal.pair.right
+    camera = real.right
     geometry = StereoGeometry(
         u=u,
         v=v,
@@ -148,13 +150,11 @@ def _pose(nominal: NominalPair, geometry: StereoGeometry) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def _mean_error(nominal: NominalPair, model: StereoModel, geometry: StereoGeometry, measurement: Measurement) -> FloatArray:
-    """(n,) what the model's effects add to the disparity, px."""
+def _mean_error(model: StereoModel, geometry: StereoGeometry, measurement: Measurement) -> FloatArray:
+    """(n,) what those of the model's effects that are not in the cameras add to the disparity, px."""
     from pipeline.gap.stereo_signatures import exposure_and_locking
 
-    real = real_pair(nominal, model.effects, measurement)
-    plain = seen_disparity(nominal, nominal.pair, geometry)
-    found = seen_disparity(nominal, real, geometry) - plain + exposure_and_locking(model.effects, geometry)
+    found = exposure_and_locking(model.effects, geometry)
     shapes = [effect for effect in model.effects if effect.name in RASTER_EFFECTS]
     raster = DisparityRaster.of(measurement, geometry) if shapes else None
     return found if raster is None else found + raster.moved(shapes, geometry.disparity)

@@ -110,7 +110,12 @@ def test_killed_in_the_middle_leaves_no_file(tmp_path: Path, number: signal.Sign
         "with writing(Path(sys.argv[1])) as t:\n t.write_bytes(b'half'); print('ready', flush=True); time.sleep(60)"
     )
     path = tmp_path / "a.bin"
-    process = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # jobs in the background of a shell ignore it
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == b"ready\n"
     process.send_signal(number)

@@ -260,7 +260,7 @@ def test_a_run_is_not_resumed_with_another_config(finished: tuple[SensorName, Pa
         ("tls", {"station": {"position_m": [4.0, 30.0, 2.0]}}, "stands in or behind it"),
         ("stereo", {"cameras": {"left": {**FACING_AWAY, "position_m": [5.0, -20.0, 2.0]}, "right": FACING_AWAY}}, "both cameras"),
         ("tls", {"rockfall": {"count": 5, "size_m": 20.0}}, "larger than the wall"),
-        ("tls", {"rockfall": {"count": 3000, "size_m": 0.5}}, "no room"),
+        ("tls", {"rockfall": {"count": 3000, "size_m": 0.5}}, "take 1,236 m2"),
         ("tls", {"difference": {"gsd_m": 1e-5}}, "GB"),
         ("tls", {"scanner": {"azimuth_step_rad": 1e-7, "zenith_step_rad": 1e-7}}, "pulses"),
         ("tls", {"wall": {"mesh": "nowhere.ply"}}, "no such file"),
