@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from config_loaders import LOADERS
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from pipeline.config import load_config
-from pipeline.dataset.config import load_dataset_config
-from pipeline.detect.config import load_train_config
 from pipeline.formats.camera_files import read_lens, read_oriented
 from pipeline.formats.cameras import read_cameras_yaml, write_cameras_yaml
 from pipeline.formats.colmap import read_map, write_map
@@ -31,10 +29,8 @@ from pipeline.formats.opencv import write_opencv
 from pipeline.formats.ply import read_ply, read_ply_points, write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import read_xyz, write_xyz
-from pipeline.gap.measurement import MeasurementConfig
 from pipeline.overrides import apply_overrides
-from pipeline.presets import read_preset
-from scene.config import load_yaml, parse
+from scene.config import load_yaml
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.imported import ImportedWall
@@ -52,14 +48,6 @@ QUICK = settings(
 )
 """The deadline is for hangs only; what fails is not made smaller, which would take long where it is slow."""
 
-LOADERS: dict[str, Callable[[Path], Any]] = {
-    "simulation": lambda path: load_config(path, [], None, None),
-    "model": lambda path: load_config(path, [], None, None),
-    "dataset": load_dataset_config,
-    "detector": load_train_config,
-    "scanner": lambda path: read_preset(str(path)),
-    "measurement": lambda path: parse(MeasurementConfig, load_yaml(path), str(path)),
-}
 ODD = st.one_of(
     st.none(),
     st.booleans(),

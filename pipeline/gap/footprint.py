@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.gap.directed import mean_model, simulate_ranges
 from pipeline.gap.measurement import Measurement
-from pipeline.gap.residuals import Residuals
+from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.shapes import Blocks, ShapeFound, log_density, refined
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -25,11 +25,14 @@ _PROFILE = 0.08
 """Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
 
 
-def find_footprint(measurement: Measurement, residuals: Residuals, rough: FloatArray, scale: float) -> list[ShapeFound]:
-    """The divergence that points at edges ask for, if any. rough: (n,) registered residuals, m; scale: sigmas they spread."""
+def find_footprint(
+    measurement: Measurement, residuals: Residuals, rough: FloatArray, scale: float, held_out: BoolArray
+) -> list[ShapeFound]:
+    """The divergence that points at edges ask for, if any. rough: (n,) registered residuals, m; scale: sigmas they spread;
+    held_out: (n,) points that have no say."""
     sigma = scale * residuals.sigma
     thin = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
-    some = np.arange(len(residuals))[thin]
+    some = np.flatnonzero(~held_out)[thin]
     wide = _moved(measurement, residuals, some, "mean", _DIVERGENCES_RAD[-1])
     some = some[np.abs(wide) > sigma[some]]
     if len(some) < _FEWEST:

@@ -19,6 +19,7 @@ from pipeline.gap.cells import patches
 from pipeline.gap.disparity_raster import spacing
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.spread import SpreadFound
+from pipeline.robust import nmad
 from scene.mesh import FloatArray
 from sensors.model import StereoModel
 
@@ -110,7 +111,7 @@ def _variogram(part: Residuals, value: FloatArray, model: StereoModel) -> _Vario
     if step is None:
         return None
     column, row = (np.rint((x - x.min()) / step).astype(np.int64) for x in (g.u, g.v))
-    bound = _CLIP * 1.4826 * float(np.median(np.abs(value - np.median(value))))
+    bound = _CLIP * nmad(value)
     raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
     raster[row, column] = np.where(np.abs(value) < bound, value, np.nan)
     block = np.zeros(raster.shape, dtype=np.int64)

@@ -17,6 +17,7 @@ from pipeline.gap.disparity_raster import RASTER_EFFECTS, DisparityRaster
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.shapes import Blocks, ShapeFound, log_density, refined
+from pipeline.robust import nmad
 from scene.mesh import FloatArray
 from sensors.effects import EdgeFattening, OcclusionFill, Smoothing
 from sensors.effects.base import Effect
@@ -38,13 +39,15 @@ _NEAR_STEPS = 2
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px; sigma: (n,) their spread; blocks."""
+    """raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px; sigma: (n,) their spread; blocks; held_out:
+    (n,) points that have no say."""
 
     raster: DisparityRaster
     disparity: FloatArray
     rough: FloatArray
     sigma: FloatArray
     blocks: Blocks
+    held_out: BoolArray
 
     def gains(self, beside: list[Effect], effect: Effect) -> FloatArray:
         """(n,) log-likelihood with an effect beside others less that of the others alone."""
@@ -54,18 +57,19 @@ class _Witnesses:
             clear = np.maximum(_CLEAR * self.sigma, _CLEAR_STEP * self.raster.jump_px)
             moved = np.where(np.abs(moved - without) > clear, moved, without)
         more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
-        return np.where(moved == without, 0.0, more)
+        return np.where((moved == without) | self.held_out, 0.0, more)
 
 
-def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArray) -> list[ShapeFound]:
-    """The effects on the shape that the points ask for, one after another. rough: (n,) registered residuals, px.
+def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArray, held_out: BoolArray) -> list[ShapeFound]:
+    """The effects on the shape that the points ask for, one after another. rough: (n,) registered residuals, px; held_out: (n,)
+    points that have no say.
 
     None where the points are on no raster, or where the model holds the effect already.
     """
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:
         return []
-    scale = 1.4826 * float(np.median(np.abs(rough / residuals.sigma)[residuals.smooth]))
+    scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
     believed = [effect for effect in measurement.model.effects if effect.name in RASTER_EFFECTS]
     witnesses = _Witnesses(
         raster,
@@ -73,6 +77,7 @@ def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArra
         rough + raster.moved(believed, residuals.geometry.disparity),
         scale * residuals.sigma,
         Blocks.over(residuals.at),
+        held_out,
     )
     found: list[ShapeFound] = []
     trials: dict[str, Callable[[_Witnesses, list[Effect]], ShapeFound | None]] = {

@@ -85,12 +85,15 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     clock.lap("residuals")
     if plain.smooth.sum() < FEWEST_POINTS:
         return _insufficient(measurement, plain, clock)
-    state = _State.of(there, plain, *_shapes(there, plain))
+    held_points = np.zeros(len(there.cloud.points), dtype=bool)
+    held_points[plain.index] = held_out_blocks(plain.at, Cells.over(plain.at).side_m)
+    state = _State.of(there, plain, *_shapes(there, plain, held_points))
     clock.lap("changes")
     named, naming = name_effects(*state.part, state.scale, random)
     if named:
         # what moves the beam everywhere hides, or feigns, what it does at edges
-        again = _shapes(*settled(there.changed(model=with_effects(there.model, [item.entry for item in named])))[:2])
+        beside = settled(there.changed(model=with_effects(there.model, [item.entry for item in named])))
+        again = _shapes(beside[0], beside[1], held_points)
         names, had = ({each.name for each in found} for found in (again[0], state.shapes))
         # rays that are not quite where they are thought to be look like a low-pass
         if names != had and ("smoothing" in had or "smoothing" not in names):
@@ -182,14 +185,17 @@ class _State:
         return few(self.shaped, self.residuals, self.chosen)
 
 
-def _shapes(measurement: Measurement, residuals: Residuals) -> tuple[list[ShapeFound], BoolArray]:
-    """Effects where the surface is not smooth that the model does not hold, and which of the measurement's points they touch."""
+def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> tuple[list[ShapeFound], BoolArray]:
+    """Effects where the surface is not smooth that the model does not hold, and which of the measurement's points they touch.
+
+    held_points: of the measurement's points those that have no say.
+    """
     rough, _, scale = registered(residuals)
     found: list[ShapeFound] = []
     if measurement.sensor == "stereo":
-        found = find_shapes(measurement, residuals, rough)
+        found = find_shapes(measurement, residuals, rough, held_points[residuals.index])
     elif not believes(measurement, "beam_divergence"):
-        found = find_footprint(measurement, residuals, rough, scale)
+        found = find_footprint(measurement, residuals, rough, scale, held_points[residuals.index])
     touched = np.zeros(len(measurement.cloud.points), dtype=bool)
     for each in found:
         touched[residuals.index] |= each.touched

@@ -37,7 +37,9 @@ def made(tmp_path: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made
 def shapes_of(case: Made) -> dict[str, Any]:
     """The effects on the shape of disparities, by name."""
     there, residuals, _ = case
-    return {each.name: each for each in find_shapes(there, residuals, registered(residuals)[0])}
+    return {
+        each.name: each for each in find_shapes(there, residuals, registered(residuals)[0], np.zeros(len(residuals), dtype=bool))
+    }
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -65,11 +67,16 @@ def test_a_wall_without_effects_shows_no_shape(tmp_path: Path, seed: int) -> Non
     assert not shapes_of(made(tmp_path, "stereo", (), seed))
 
 
+def test_points_that_are_held_out_have_no_say(tmp_path: Path) -> None:
+    there, residuals, _ = made(tmp_path, "stereo", ("smoothing",), 1)
+    assert not find_shapes(there, residuals, registered(residuals)[0], np.ones(len(residuals), dtype=bool))
+
+
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int) -> None:
     there, residuals, truth = made(tmp_path, "tls", ("beam_divergence",), seed)
     rough, _, scale = registered(residuals)
-    (found,) = find_footprint(there, residuals, rough, scale)
+    (found,) = find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
     assert isinstance(found.effect, BeamDivergence)
     # the generator's beam has other sub-rays: 15 %
     assert found.effect.divergence_rad == pytest.approx(truth["divergence_rad"], rel=0.15)
@@ -80,7 +87,7 @@ def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int
 def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
     there, residuals, _ = made(tmp_path, "tls", (), seed)
     rough, _, scale = registered(residuals)
-    assert not find_footprint(there, residuals, rough, scale)
+    assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("parallax_noise", 2), ("regularization_noise", 4)])

@@ -6,27 +6,13 @@ A key that is renamed keeps its old name as an alias; when a minor version comes
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from config_loaders import LOADERS
 
 from pipeline.config import load_config
-from pipeline.dataset.config import load_dataset_config
-from pipeline.detect.config import load_train_config
-from pipeline.gap.measurement import MeasurementConfig
-from pipeline.presets import read_preset
-from scene.config import load_yaml, parse
 
-LOADERS: dict[str, Callable[[Path], Any]] = {
-    "simulation": lambda path: load_config(path, [], None, None),
-    "model": lambda path: load_config(path, [], None, None),
-    "dataset": load_dataset_config,
-    "detector": load_train_config,
-    "scanner": lambda path: read_preset(str(path)),
-    "measurement": lambda path: parse(MeasurementConfig, load_yaml(path), str(path)),
-}
 FILES = sorted((Path(__file__).parents[1] / "configs_of_versions").glob("*/*.yaml"))
 
 
