@@ -19,21 +19,22 @@ _LOADING = """## Loading
 The folder of a split is the folder of its images; `file_name` is relative to it.
 
     from pycocotools.coco import COCO                       # pycocotools
-    coco = COCO("train/annotations.json")
+    coco = COCO("{split}/annotations.json")
 
+    import os, tifffile, torch
     from torchvision.datasets import CocoDetection          # torchvision; its own loader makes 8-bit RGB, which loses the metres:
     class Tiles(CocoDetection):
         def _load_image(self, id):
             path = os.path.join(self.root, self.coco.loadImgs(id)[0]["file_name"])
             return torch.from_numpy(tifffile.imread(path))[None]
-    tiles = Tiles("train", "train/annotations.json")
+    tiles = Tiles("{split}", "{split}/annotations.json")
 
     import fiftyone as fo                                   # FiftyOne
-    fo.Dataset.from_dir(dataset_type=fo.types.COCODetectionDataset, data_path="train", labels_path="train/annotations.json")
+    fo.Dataset.from_dir(dataset_type=fo.types.COCODetectionDataset, data_path="{split}", labels_path="{split}/annotations.json")
 
     from pipeline.dataset.loaders import Tiles              # scarpsim: NumPy and tf.data
-    for sample in Tiles("train", noise="low"): ...          # sample.image (h, w), sample.valid, sample.boxes, sample.masks
-    Tiles("train").tf_dataset().shuffle(100).prefetch(2)
+    for sample in Tiles("{split}", noise="{noise}"): ...    # sample.image (h, w), sample.valid, sample.boxes, sample.masks
+    Tiles("{split}").tf_dataset().shuffle(100).prefetch(2)
 """
 _TILES = """## A tile
 
@@ -77,9 +78,10 @@ def _readme(
     yield f"Simulated difference maps of rock walls with annotated rockfalls: {tiles:,} tiles, {annotations:,} annotations.\n"
     yield from _table(statistics)
     yield "Noise: mean over the epochs of the StD of the difference map outside the blocks.\n"
-    yield from (f"![{Path(name).stem}]({name})\n" for name in pictures)
-    yield "In the samples the colours end at six times the noise; black outlines are the annotated masks, grey is no data.\n"
-    yield from (_split_rules(dataset), _TILES, _LOADING)
+    yield from (f"![{_in_words(name)}]({name})\n" for name in pictures)
+    yield "In the samples red is missing rock, blue a surface that stands further out; the colours end at six times the noise."
+    yield "Black outlines are the annotated masks, grey is no data.\n"
+    yield from (_split_rules(dataset), _TILES, _loading(statistics))
     yield from _making(dataset, statistics, digests)
 
 
@@ -94,14 +96,30 @@ def _table(statistics: SetStatistics) -> Iterator[str]:
     yield ""
 
 
+def _in_words(picture: str) -> str:
+    """What a picture shows, for those who cannot see it."""
+    name = Path(picture).stem
+    words = {"sizes": "Histograms of the blocks' sizes", "noise": "Histograms of the epochs' noise"}
+    return words.get(name) or f"Sample tiles ({name.removeprefix('samples_')}) with their annotations outlined"
+
+
+def _loading(statistics: SetStatistics) -> str:
+    """How to load what is there: its first split, at one level of its noise."""
+    filled = (key for key, found in statistics.cells.items() if found.tiles)
+    first = min(filled, key=lambda key: SPLITS.index(key[0]), default=("train", "", "", "usual", ""))
+    return _LOADING.format(split=first[0], noise=first[3])
+
+
 def _split_rules(dataset: dict[str, Any]) -> str:
-    shares = {source["config"]["validation_region"] for source in dataset["sources"].values()}
-    told = ", ".join(f"{share:.0%}" for share in sorted(shares))
-    return (
-        "## Splits\n\nTraining and validation tiles come from different epochs, and from different parts of a wall: the right\n"
-        f"end of each wall ({told} of its columns of tiles) is for validation alone (0%: told by epoch only). No tile of one\n"
-        "overlaps a tile of the other. Test tiles come from epochs of their own, from the whole wall.\n"
+    shares = sorted({source["config"]["validation_region"] for source in dataset["sources"].values()})
+    told = ", ".join(f"{100 * share:.0f} %" for share in shares)
+    apart = (
+        "Training and validation tiles come from different epochs, and from different parts of a wall: the right\n"
+        f"end of each wall ({told} of its columns of tiles) is for validation alone. No tile of one overlaps a tile of the other."
     )
+    together = "Training and validation tiles come from different epochs, but not everywhere from different parts of a wall."
+    rest = "Test tiles come from\nepochs of their own, from the whole wall."
+    return f"## Splits\n\n{apart if all(shares) else together} {rest}\n"
 
 
 def _making(dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str]) -> Iterator[str]:

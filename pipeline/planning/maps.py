@@ -275,7 +275,7 @@ def _if_any(found: PlanMap) -> list[PlanMap]:
 
 
 def _detection_maps(sampling: Sampling, seen: BoolArray, config: PlanningConfig) -> list[PlanMap]:
-    title = f"Smallest block seen in {config.probability:.0%} of cases"
+    title = f"Smallest block seen in {100 * config.probability:g} % of cases"
     maps = [_map("smallest_block_m", title, smallest_block(sampling, config), seen, "cm", 100.0)]
     for size in config.block_size_m:
         probability = np.where(seen, detection_probability(sampling, size, config), 0.0)

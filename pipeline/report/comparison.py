@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from pipeline.formats.atomic import write_bytes, write_json, write_text
@@ -29,7 +28,7 @@ from pipeline.report.comparison_figures import (
     side_by_side,
     table_figure,
 )
-from pipeline.report.page import p_value_in_words, template
+from pipeline.report.page import millimetres, p_value_in_words, percent, template
 
 COMPARISON_FILE = "comparison.json"
 _NOTHING = "\N{EN DASH}"
@@ -77,16 +76,22 @@ def answer(found: Assessment) -> str:
     if curve is None:
         return f"{found.name}: too few blocks fell in its view to say which are seen."
     if curve.smallest_95_m is None:
-        return f"{found.name}: no size is seen in 95 % of cases; {curve.lapse:.0%} of those in view stay unseen."
+        return f"{found.name}: no size is seen in 95 % of cases; {percent(curve.lapse, 0)} of those in view stay unseen."
     if curve.smallest_95_m < curve.smallest_m:
         return f"{found.name}: sees 95 % of the smallest blocks that fell in its view, {100 * curve.smallest_m:.1f} cm."
     if curve.smallest_95_m > curve.largest_m:
         return f"{found.name}: sees less than 95 % of the largest blocks that fell in its view, {100 * curve.largest_m:.0f} cm."
-    low, high = (_NOTHING if end is None else f"{100 * end:.1f}" for end in curve.interval_m)
     return (
         f"{found.name}: the smallest block seen in 95 % of cases, of those in view, has a size of "
-        f"{100 * curve.smallest_95_m:.1f} cm (95 % interval {low} to {high} cm)."
+        f"{100 * curve.smallest_95_m:.1f} cm ({_interval(*curve.interval_m)})."
     )
+
+
+def _interval(low_m: float | None, high_m: float | None) -> str:
+    """The interval of 95 % of a size; None: these blocks do not bound it."""
+    low = "no lower bound" if low_m is None else f"from {100 * low_m:.1f} cm"
+    high = "no upper bound" if high_m is None else f"to {100 * high_m:.1f} cm"
+    return f"95 % interval {low} {high}" if low_m is not None and high_m is not None else f"95 % interval: {low}, {high}"
 
 
 def summary(comparison: Comparison) -> str:
@@ -158,11 +163,11 @@ def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> lis
 
     measured_points = [f"{maps.points[0]:,}" if maps.points else _NOTHING for maps, _ in comparison.measured]
     return [
-        ("Stable ground: median", [_mm(each.stable.median) for each in noises]),
-        ("Stable ground: StD", [_mm(each.stable.standard_deviation) for each in noises]),
-        ("Stable ground: RMSE", [_mm(each.stable.rmse) for each in noises]),
-        ("Stable ground: NMAD", [_mm(each.stable.nmad) for each in noises]),
-        ("Beyond 3 NMAD (normal: 0.27 %)", [f"{each.tails.beyond_3_nmad:.2%}" for each in noises]),
+        ("Stable ground: median", [millimetres(each.stable.median) for each in noises]),
+        ("Stable ground: StD", [millimetres(each.stable.standard_deviation) for each in noises]),
+        ("Stable ground: RMSE", [millimetres(each.stable.rmse) for each in noises]),
+        ("Stable ground: NMAD", [millimetres(each.stable.nmad) for each in noises]),
+        ("Beyond 3 NMAD (normal: 0.27 %)", [percent(each.tails.beyond_3_nmad, 2) for each in noises]),
         ("Excess kurtosis", [f"{each.tails.excess_kurtosis:.1f}" for each in noises]),
         (
             "Test of a normal distribution on independent pixels: p",
@@ -170,19 +175,19 @@ def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> lis
         ),
         ("Variogram (StD and range)", [each.model.summary() for each in noises]),
         ("Independent pixels of an epoch", [f"{each.effective:,.0f} of {each.pixels:,}" for each in noises]),
-        ("Level of detection of a pixel, 95 %: median", [_mm(each.median_level_m) for each in noises]),
-        ("Whole wall, against the truth: RMSE", simulated([_mm(each.wall.rmse) for each in found])),
-        ("Whole wall, against the truth: NMAD", simulated([_mm(each.wall.nmad) for each in found])),
+        ("Level of detection of a pixel, 95 %: median", [millimetres(each.median_level_m) for each in noises]),
+        ("Whole wall, against the truth: RMSE", simulated([millimetres(each.wall.rmse) for each in found])),
+        ("Whole wall, against the truth: NMAD", simulated([millimetres(each.wall.nmad) for each in found])),
         ("Blocks that fell in view", simulated([_share(each, "in_view") for each in found])),
         ("Blocks seen", simulated([_share(each, "seen") for each in found])),
         (
             "Stable ground taken for a block (2.5 % expected)",
             simulated([f"{each.detection.alarms} of {each.detection.trials:,}" for each in found]),
         ),
-        ("Wall that the sensor can see", simulated([f"{each.visible:.1%}" for each in found])),
-        ("Hidden (occlusion)", simulated([f"{1 - each.visible:.1%}" for each in found])),
-        ("Wall with data (completeness)", simulated([f"{each.complete:.1%}" for each in found])),
-        ("Visible wall with data", simulated([f"{each.complete_of_visible:.1%}" for each in found])),
+        ("Wall that the sensor can see", simulated([percent(each.visible) for each in found])),
+        ("Hidden (occlusion)", simulated([percent(1 - each.visible) for each in found])),
+        ("Wall with data (completeness)", simulated([percent(each.complete) for each in found])),
+        ("Visible wall with data", simulated([percent(each.complete_of_visible) for each in found])),
         ("Points of the reference", [f"{each.points:,}" for each in found] + measured_points),
         ("Time to measure", simulated([_seconds(each.scan_seconds) for each in found])),
         ("Time to simulate an epoch", simulated([_seconds(each.seconds) for each in found])),
@@ -190,7 +195,7 @@ def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> lis
         ("Size of a difference map", simulated([_megabytes(sizes[each.name]["difference_001.tif"]) for each in found])),
         (
             "Registration: RMS of the inliers",
-            simulated([_NOTHING if each.registration_rms_m is None else _mm(each.registration_rms_m) for each in found]),
+            simulated([millimetres(each.registration_rms_m) for each in found]),
         ),
     ]
 
@@ -223,10 +228,6 @@ def _class_rows(found: Sequence[Assessment]) -> Iterable[dict[str, Any]]:
     for each in found:
         for name, classes in (("size", each.detection.size_classes), ("depth", each.detection.depth_classes)):
             yield from ({"sensor": each.name, "by": name, **item.to_dict()} for item in classes)
-
-
-def _mm(metres: float | None) -> str:
-    return _NOTHING if metres is None or np.isnan(metres) else f"{metres * 1e3:.1f} mm"
 
 
 def _seconds(seconds: float | None) -> str:

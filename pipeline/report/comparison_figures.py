@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from pipeline.noise.assess import Assessment, Noise, SizeClass
@@ -22,6 +21,7 @@ from pipeline.report.figures import (
     SEQUENTIAL,
     dress,
     mean_pooled,
+    plain_numbers,
     png_bytes,
     pooling,
     raster_extent,
@@ -199,9 +199,7 @@ def _metric(axes: Axes, *, both: bool = False) -> None:
     """A logarithmic axis of metres, or two, with plain numbers."""
     axes.set_xscale("log")
     for axis in (axes.xaxis, axes.yaxis) if both else (axes.xaxis,):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.set_minor_formatter(NullFormatter())
+        plain_numbers(axis)
 
 
 def _grid_and_legend(figure: Figure, panels: Sequence[Axes]) -> None:

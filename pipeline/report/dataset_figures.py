@@ -9,15 +9,13 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from pipeline.report.figures import SCALE_SIGMAS, png_bytes
+from pipeline.report.figures import FAMILY, NO_DATA, SCALE_SIGMAS, png_bytes
 
 _DPI = 110
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-"""Okabe and Ito's."""
 _STYLES = ("-", "--", ":", "-.")
-_NO_DATA = "#b5b5b5"
 _BINS = 40
 
 
@@ -35,11 +33,12 @@ def sizes_figure(counts: Mapping[str, NDArray[np.integer]], edges: NDArray[np.fl
     """Histograms of block sizes by class, counts per bin between `edges`, m, which grow by equal factors."""
     figure, axes = _axes()
     for number, (name, values) in enumerate(counts.items()):
-        axes.stairs(values, edges, fill=True, alpha=0.35, color=_COLOURS[number % len(_COLOURS)], label=name)
+        axes.stairs(values, edges, fill=True, alpha=0.35, color=FAMILY[number % len(FAMILY)], label=name)
     axes.set_xscale("log")
     ticks = [tick for tick in (0.05, 0.1, 0.2, 0.5, 1, 2, 5) if edges[0] <= tick <= edges[-1]]
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     _dress(axes, "size of a block (mean of its three axes), m", "annotations")
     return png_bytes(figure)
 
@@ -51,9 +50,10 @@ def noise_figure(noise: Mapping[str, Sequence[float]]) -> bytes:
     high = max((float(each.max()) for each in values.values() if each.size), default=1.0)
     edges = np.linspace(0, 1.05 * high, _BINS + 1)
     for number, (name, each) in enumerate(values.items()):
-        style = _STYLES[number // len(_COLOURS) % len(_STYLES)]
-        colour = _COLOURS[number % len(_COLOURS)]
+        style = _STYLES[number // len(FAMILY) % len(_STYLES)]
+        colour = FAMILY[number % len(FAMILY)]
         axes.stairs(np.histogram(each, edges)[0], edges, linewidth=1.5, linestyle=style, color=colour, label=name)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     _dress(axes, "StD of the difference map outside the blocks, mm", "epochs")
     return png_bytes(figure)
 
@@ -69,7 +69,7 @@ def samples_figure(rows: Sequence[Sequence[SampleTile]]) -> bytes:
         for axes, sample in zip(line, row, strict=False):
             limit = SCALE_SIGMAS * max(sample.sigma_m, 1e-4)
             shown = np.ma.masked_invalid(sample.values)
-            colours = colormaps["RdBu_r"].with_extremes(bad=_NO_DATA)
+            colours = colormaps["RdBu_r"].with_extremes(bad=NO_DATA)
             axes.imshow(shown, cmap=colours, vmin=-limit, vmax=limit, interpolation="nearest")
             if sample.blocks.any() and not sample.blocks.all():
                 axes.contour(sample.blocks, levels=[0.5], colors="black", linewidths=0.5)

@@ -13,10 +13,12 @@ from typing import Any, Protocol
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from pipeline.difference import DifferenceStatistics, statistics
@@ -42,6 +44,8 @@ COLOURS = colormaps["RdBu_r"].resampled(49)
 """In steps of a quarter of a sigma, which cannot be told apart by eye and make a smaller file."""
 _GREYS = colormaps["gray"].resampled(64)
 SEQUENTIAL = colormaps["viridis"].resampled(48)
+_CROWDED = 0.15
+"""A map whose median lies within this share of its range from the low end would be of one colour."""
 
 
 class Iteration(Protocol):
@@ -98,22 +102,43 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
 
 
 def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str = "") -> bytes:
-    """Any quantity (h, w) over the wall, NaN without data, in the unit of `label`; colours span its 1 to 99 % quantiles."""
+    """Any quantity (h, w) over the wall, NaN without data, in the unit of `label`; colours span its 1 to 99 % quantiles.
+
+    They grow by equal factors where the wall would be nearly all of one colour otherwise.
+    """
     pooled = mean_pooled(values, pooling(grid))
     known = pooled[np.isfinite(pooled)]
-    low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
-    margin = max(1e-3 * abs(low), 1e-12) if high - low <= 1e-6 * abs(high) else 0.0
+    scale = _scale(known)
     figure, axes = _map_figure(grid, title, size=_PAIRED)
     axes.set_facecolor(NO_DATA)
-    extent = raster_extent(grid, pooled.shape)
-    image = axes.imshow(pooled, cmap=SEQUENTIAL, vmin=low - margin, vmax=high + margin, extent=extent, interpolation="nearest")
-    bar = figure.colorbar(
-        image, cax=_beside(figure, axes), extend="both" if known.size and np.ptp(known) > high - low else "neither"
-    )
+    image = axes.imshow(pooled, cmap=SEQUENTIAL, norm=scale, extent=raster_extent(grid, pooled.shape), interpolation="nearest")
+    beyond = known.size and (known.min() < scale.vmin or known.max() > scale.vmax)
+    bar = figure.colorbar(image, cax=_beside(figure, axes), extend="both" if beyond else "neither")
+    if isinstance(scale, LogNorm):
+        plain_numbers(bar.ax.yaxis)
+    elif np.array_equal(known, np.round(known)):
+        bar.locator = MaxNLocator(integer=True)
     bar.ax.tick_params(labelsize=8)
     bar.set_label(label, fontsize=9)
     _no_data_legend(axes, pooled, NO_DATA)
     return png_bytes(figure)
+
+
+def _scale(known: NDArray[np.floating]) -> Normalize:
+    """The colour scale of a map's values (n,): their 1 to 99 % quantiles, logarithmic where half of them crowd at its low end."""
+    low, middle, high = np.quantile(known, [0.01, 0.5, 0.99]).tolist() if known.size else (0.0, 0.5, 1.0)
+    if high - low <= 1e-6 * abs(high):
+        margin = max(1e-3 * abs(low), 1e-12)
+        return Normalize(low - margin, high + margin)
+    crowded = low > 0 and middle - low < _CROWDED * (high - low)
+    return LogNorm(low, high) if crowded else Normalize(low, high)
+
+
+def plain_numbers(axis: Axis) -> None:
+    """Ticks at 1, 2, 5, 10, ... of a logarithmic axis, as people write numbers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -> bytes:
@@ -127,9 +152,7 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
         axes.axvline(panel.at, color="0.3", linewidth=0.8, linestyle="--", label="this set-up")
         if panel.logarithmic:
             axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            plain_numbers(axes.xaxis)
         axes.set_ylim(-2, 102)
         dress(axes, panel.label, y_label)
         axes.label_outer()

@@ -14,8 +14,8 @@ from pipeline.formats.atomic import write_bytes, write_json, write_text
 from pipeline.noise.icp_study import IcpStudy, Parameter, Recommendation, StudyRow
 from pipeline.provenance import versions
 from pipeline.report.comparison import write_csv
-from pipeline.report.figures import DPI, FAMILY, dress, png_bytes
-from pipeline.report.page import template
+from pipeline.report.figures import DPI, FAMILY, dress, plain_numbers, png_bytes
+from pipeline.report.page import millimetres, template
 
 _TITLES: dict[Parameter, str] = {
     "subsample_ratio": "share of the points left out",
@@ -40,11 +40,13 @@ def write_icp_study(out: Path, study: IcpStudy) -> Path:
 
 def in_words(found: Recommendation) -> str:
     """A recommendation as a sentence."""
-    low, high, error = found.good[0], found.good[1], found.normal_error_m * 1e3
+    low, high = found.good
+    error = f"{millimetres(found.normal_error_m, 2)} of error along the surface's normal remain"
     if found.parameter == "subsample_ratio":
-        return f"icp.subsample_ratio {found.value:g}: as good as all points (up to {high:g}); it leaves {error:.2f} mm of error."
-    good = f"good from {low:.3f} to {high:.3f} m"
-    return f"icp.outlier_distance_threshold {found.value:.3f} m: {good}; it leaves {error:.2f} mm of error."
+        good = f"up to {high:g} of the points may be left out"
+        return f"icp.subsample_ratio: {found.value:g}. With the run's other settings {good}; {error}."
+    good = f"{low:.3f} to {high:.3f} m are as good"
+    return f"icp.outlier_distance_threshold: {found.value:.3f} m. With the run's other settings {good}; {error}."
 
 
 def summary(study: IcpStudy) -> str:
@@ -79,6 +81,7 @@ def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
         axes.grid(color="0.9", linewidth=0.6)
         _scale(axes, parameter, rows)
     panels[1].set_yscale("log")
+    plain_numbers(panels[1].yaxis)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return png_bytes(figure)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -73,7 +74,7 @@ class EpochReport:
         carved = f"Epoch {self.number}: {_count(len(self.blocks), 'block')} carved, {self.annotated} annotated"
         if self.outside.get("nmad_m") is None:
             return f"{carved}; the difference map has no data outside the blocks."
-        noise = f"NMAD {_mm(self.outside['nmad_m'])} and median {_mm(self.outside['median_m'])}"
+        noise = f"NMAD {millimetres(self.outside['nmad_m'])} and median {millimetres(self.outside['median_m'])}"
         return f"{carved}; outside the blocks the difference map has {noise}."
 
 
@@ -127,7 +128,7 @@ def template(name: str) -> jinja2.Template:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters |= {"mm": _mm, "metres": _metres, "volume": _volume, "percent": _percent, "picture": _picture}
+    environment.filters |= {"mm": millimetres, "numbers": _numbers, "volume": _volume, "percent": percent, "picture": _picture}
     return environment.get_template(name)
 
 
@@ -138,32 +139,38 @@ def p_value_in_words(p: float | None) -> str:
     return f"{p:.2g}" if p >= _LEAST_P else f"< {_LEAST_P:g}"
 
 
+def millimetres(metres: float | None, digits: int = 1) -> str:
+    """Metres as millimetres; a dash where there is no value."""
+    return _NOTHING if metres is None or math.isnan(metres) else f"{true_minus(metres * 1e3, digits)} mm"
+
+
+def percent(ratio: float | None, digits: int = 1, *, signed: bool = False) -> str:
+    """A share as per cent; a dash where there is no value."""
+    if ratio is None or math.isnan(ratio):
+        return _NOTHING
+    plus = "+" if signed and ratio >= 0 else ""
+    return f"{plus}{true_minus(100 * ratio, digits)} %"
+
+
+def true_minus(value: float, digits: int) -> str:
+    """A number with a minus sign that is as wide as a plus, and none on a zero."""
+    return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}" if round(value, digits) else "")
+
+
 def _picture(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
-def _mm(metres: float | None) -> str:
-    """Metres as millimetres to a tenth."""
-    return _NOTHING if metres is None else f"{_true_minus(metres * 1e3, 1)} mm"
-
-
-def _metres(values: Sequence[float], digits: int = 2) -> str:
-    return ", ".join(_true_minus(value, digits) for value in values)
+def _numbers(values: Sequence[float], digits: int = 2, factor: float = 1.0) -> str:
+    return ", ".join(true_minus(factor * value, digits) for value in values)
 
 
 def _volume(cubic_metres: float | None) -> str:
-    """Cubic metres to three significant digits, so that a fist and a house both show."""
+    """Cubic metres to three significant digits, so that a pebble and a house both show."""
     if cubic_metres is None:
         return _NOTHING
-    return f"{cubic_metres:#.3g}".rstrip(".").replace("-", "\N{MINUS SIGN}")
-
-
-def _percent(ratio: float | None) -> str:
-    return _NOTHING if ratio is None else f"{ratio:+.1%}".replace("-", "\N{MINUS SIGN}")
-
-
-def _true_minus(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}" if round(value, digits) else "")
+    leading = math.floor(math.log10(abs(cubic_metres))) if cubic_metres else 0
+    return true_minus(cubic_metres, max(2 - leading, 0))
 
 
 def _count(number: int, noun: str) -> str:

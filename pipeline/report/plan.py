@@ -12,7 +12,7 @@ import yaml
 from pipeline.formats.atomic import write_text
 from pipeline.planning.maps import Plan, PlanMap
 from pipeline.report.figures import CurvePanel, curves_figure, map_figure
-from pipeline.report.page import template
+from pipeline.report.page import percent, template
 
 _NOTHING = "\N{EN DASH}"
 _FIGURES: dict[str, tuple[str, str, float]] = {
@@ -26,7 +26,7 @@ _FIGURES: dict[str, tuple[str, str, float]] = {
     "overlap": ("Overlap: wall in both frames over wall in either", "%", 100.0),
     "base_m": ("Base", "m", 1.0),
     "disparity_sigma_px": ("Standard deviation of the disparity", "px", 1.0),
-    "normal_case_sigma_z_m": ("Rule of thumb Z\N{SUPERSCRIPT TWO}/(cB) \N{MIDDLE DOT} disparity's", "mm", 1e3),
+    "normal_case_sigma_z_m": ("Standard deviation in depth, by Z\N{SUPERSCRIPT TWO}/(cB)", "mm", 1e3),
     "pulses": ("Pulses", "million", 1e-6),
     "seconds_to_scan": ("Time to scan", "s", 1.0),
 }
@@ -42,8 +42,11 @@ class _Row:
 
 @dataclass(frozen=True)
 class _Picture:
+    """grey: what the places without a value are."""
+
     title: str
     png: bytes
+    grey: str
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ def summary(plan: Plan) -> str:
 
 def answer(plan: Plan) -> str:
     """The sentence that planners ask for: the smallest block that is seen."""
-    share = f"{plan.config.probability:.0%}"
+    share = percent(plan.config.probability, 0)
     middle = next(found for found in plan.maps if found.name == "smallest_block_m").summary(plan.middle())["middle"]
     name = plan.instrument
     if middle is None:
@@ -117,7 +120,9 @@ def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:
 
 def _picture(plan: Plan, found: PlanMap) -> _Picture:
     unit = found.unit or "ratio"
-    return _Picture(found.title, map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, unit, found.title))
+    png = map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, unit, found.title)
+    none = found.name == "smallest_block_m"
+    return _Picture(found.title, png, "not seen, or no block is, however large" if none else "not seen")
 
 
 def _curves(plan: Plan) -> bytes | None:

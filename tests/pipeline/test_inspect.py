@@ -260,7 +260,7 @@ def test_the_command_says_which_block_is_seen(config: Path, tmp_path: Path, caps
     words = ["inspect", str(config), "--sensor", "tls", "--set", "station.distance_m=100"]
     assert cli.main([*words, "--out", str(tmp_path / "plan")]) == 0
     printed = capsys.readouterr().out
-    assert "the smallest block seen in 95% of cases in the middle of the wall has sides of" in printed
+    assert "the smallest block seen in 95 % of cases in the middle of the wall has sides of" in printed
     assert "Stereo" not in printed
 
 
