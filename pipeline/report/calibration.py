@@ -1,4 +1,4 @@
-"""A calibration's report: the tables of the thesis (4-6 to 4-8), the fitted noise, and measured beside simulated maps."""
+"""A calibration's report: the fitted noise, the measured epochs, and measured beside simulated maps."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from scipy import stats
 
 from pipeline.difference import statistics
 from pipeline.formats.atomic import write_text
 from pipeline.noise.calibrate import Calibration
-from pipeline.report.figures import difference_figure, png_bytes
-from pipeline.report.page import p_value_in_words, template
+from pipeline.report.figures import DPI, FAMILY, difference_figure, dress, plain_numbers, png_bytes
+from pipeline.report.page import p_value_in_words, percent, template, true_minus
 from scene.mesh import FloatArray
 
 Pictures = Sequence[tuple[str, str, bytes]]
 """Name of the file, caption, PNG."""
-_MEASURED, _SIMULATED = "#0072B2", "#D55E00"
+_MEASURED, _SIMULATED = FAMILY[:2]
+_COLOURS = "Red: rock is missing; blue: the surface stands further out; grey: no data; axes in m, wall frame."
 _SIGMAS = 3.0
 _INSTRUMENTS = {"stereo": "stereo pair", "tls": "laser scanner"}
 
@@ -71,24 +71,36 @@ def pictures(result: Calibration, simulated: FloatArray | None) -> Pictures:
     material, sigma = result.material, max(statistics(result.windows.cut(result.material.maps[-1])).nmad, 1e-6)
     none = np.zeros(material.grid.shape, dtype=np.int32)
     shown: list[tuple[str, str, bytes]] = [
-        ("windows", "The last measured map and a simulated one in the windows that are compared: which is which stands above.",
+        ("windows", "The last measured map and a simulated one in the windows that are compared, on one scale; white: no data.",
          _mosaics(result, sigma)),
-        ("measured", f"Measured: {material.names[-1]}, the whole map.",
+        ("measured", f"Measured: {material.names[-1]}, the whole map. {_COLOURS}",
          difference_figure(material.maps[-1], material.grid, none, sigma, "Measured")),
     ]  # fmt: skip
     if simulated is not None:
-        caption = "Simulated with the calibrated noise by the whole simulation, on the same scale."
+        caption = "Simulated with the calibrated noise by the whole simulation, on the same scale; no block falls in it."
         shown.append(("simulated", caption, difference_figure(simulated, material.grid, none, sigma, "Simulated")))
     mean = difference_figure(result.systematic, material.grid, none, sigma, "Mean over the epochs")
-    shown.append(("systematic", "The systematic part: the mean of the measured maps. It holds the reference's own errors.", mean))
+    shown.append(
+        (
+            "systematic",
+            "The systematic part: the mean of the measured maps over stable ground. It holds the reference's own errors.",
+            mean,
+        )
+    )
     further = (
-        ("distribution", "Distribution in the windows and variograms, measured and simulated.", _size_and_variogram),
+        (
+            "distribution",
+            "Left: distribution of the differences in the windows. Right: their variogram, how much two pixels at a "
+            "distance differ.",
+            _size_and_variogram,
+        ),
         (
             "statistics",
-            "All that is compared: measured over expected; bars: two standard deviations of a simulated set.",
+            "All that is compared, measured (dots) over expected: size of the noise, variogram by distance, bending of the whole "
+            "wall, noise at edges and elsewhere, and by angle of incidence. Bars: two standard deviations of a simulated set.",
             _statistics,
         ),
-        ("epochs", "Median and standard deviation over the epochs; the line is their mean (figures 4-24 and 4-25).", _over_time),
+        ("epochs", "Median and standard deviation over the epochs; the line is their mean.", _over_time),
     )
     shown += [(name, caption, picture(result)) for name, caption, picture in further]
     return shown
@@ -116,7 +128,7 @@ def _sentence(result: Calibration) -> str:
     ground = "drawn by the user" if result.material.drawn else "found by the program"
     return (
         f"{_maps(len(deviations))}, standard deviation {np.mean(deviations):.1f} mm on average over stable ground "
-        f"{ground} ({np.mean(result.material.stable):.0%} of the map). Noise that gives the like was sought with "
+        f"{ground} ({percent(float(np.mean(result.material.stable)), 0)} of the map). Noise that gives the like was sought with "
         f"{result.found.maps:,} simulated maps in {result.seconds:.0f} s."
     )
 
@@ -132,7 +144,7 @@ def _values(result: Calibration) -> list[tuple[str, str]]:
 
 def _tables(result: Calibration) -> list[_Table]:
     names = list(result.parameters.names)
-    share = f"{result.confidence:.0%}"
+    share = percent(result.confidence, 0)
     tables = [
         _Table(f"Fitted values with intervals of {share}.", ["parameter", "value"], [list(row) for row in _values(result)]),
         _Table(
@@ -145,7 +157,7 @@ def _tables(result: Calibration) -> list[_Table]:
     if result.patterns is not None:
         caption = (
             "Orientation: RMS of the map of one sigma in the left camera, mm, and cosines between the maps of two parameters "
-            "after registration (compare the thesis's table 4-8): beyond 0.9 two parameters make the same pattern."
+            "after registration: beyond 0.9 two parameters make the same pattern."
         )
         rows = _matrix(list(result.patterns.names), result.patterns.cosines)
         sized = [[row[0], f"{1e3 * size:.2f}", *row[1:]] for row, size in zip(rows, result.patterns.size_m, strict=True)]
@@ -158,18 +170,22 @@ def _tables(result: Calibration) -> list[_Table]:
 def _greedy(result: Calibration) -> _Table:
     baseline = result.baseline
     assert baseline is not None
-    rows = [["the thesis's: one at a time, by StD", str(baseline.result.tests), f"{baseline.cost:.0f}"]]
+    rows = [["one parameter at a time, by StD", str(baseline.result.tests), f"{baseline.cost:.0f}"]]
     rows += [
         [f"this search, after round {number}", str(maps), f"{cost:.0f}"] for number, (maps, cost) in enumerate(baseline.costs, 1)
     ]
     caption = f"Two searches: cost of fresh simulations ({len(result.statistics)} statistics: that many is a perfect fit)."
     if baseline.overtaken is not None:
-        caption += f" The first simulated set that was nearer than the greedy search's end came after {baseline.overtaken} maps."
+        caption += f" This search was nearer than the other's end after {_maps(baseline.overtaken)}."
     return _Table(caption, ["search", "simulated maps", "cost"], rows)
 
 
 def _matrix(names: list[str], values: FloatArray) -> list[list[str]]:
-    return [[name, *(f"{value:+.2f}" for value in row)] for name, row in zip(names, values, strict=True)]
+    return [[name, *(_signed(value) for value in row)] for name, row in zip(names, values, strict=True)]
+
+
+def _signed(value: float) -> str:
+    return ("+" if value >= 0 else "") + true_minus(value, 2)
 
 
 def _epochs(result: Calibration) -> _Table:
@@ -179,18 +195,19 @@ def _epochs(result: Calibration) -> _Table:
         size, tail = each.size, each.tails
         lengths = (size.median, size.standard_deviation, size.rmse, size.nmad)
         rows.append(
-            [each.name, *(f"{1e3 * value:.1f}" for value in lengths), f"{tail.skewness:.2f}", f"{tail.excess_kurtosis:.1f}",
+            [each.name, *(true_minus(1e3 * value, 1) for value in lengths), true_minus(tail.skewness, 2),
+             true_minus(tail.excess_kurtosis, 1),
              p_value_in_words(p), f"{each.independent:,.0f}", each.model.summary()]
         )  # fmt: skip
     sizes = [each.size for each in result.epochs]
     mean = (np.mean([getattr(one, name) for one in sizes]) for name in ("median", "standard_deviation", "rmse", "nmad"))
-    rows.append(["mean", *(f"{1e3 * value:.1f}" for value in mean), *[""] * 5])
+    rows.append(["mean", *(true_minus(1e3 * value, 1) for value in mean), *[""] * 5])
     trends = [
-        f"{name} {1e3 * found.per_epoch_m:+.2f} mm per epoch (p = {found.p_value:.2g})"
+        f"{name} {_signed(1e3 * found.per_epoch_m)} mm per epoch (p: {p_value_in_words(found.p_value)})"
         for name, found in (("median", result.median_trend), ("StD", result.std_trend))
         if found.per_epoch_m is not None and found.p_value is not None
     ]
-    caption = "The measured epochs over stable ground, mm (tables 4-6 and 4-7); normality of as many values as are independent. "
+    caption = "The measured epochs over stable ground, mm; p: of a test for a normal distribution, of independent values alone. "
     caption += "Trend: " + ("; ".join(trends) if trends else "needs four epochs") + "."
     head = ["epoch", "median", "StD", "RMSE", "NMAD", "skewness", "excess kurtosis", "normal, p", "independent", "variogram"]
     return _Table(caption, head, rows)
@@ -198,12 +215,14 @@ def _epochs(result: Calibration) -> _Table:
 
 def _mosaics(result: Calibration, sigma: float) -> bytes:
     measured = result.windows.cut(result.material.maps[-1])
-    figure = Figure(figsize=(11.0, 5.6), dpi=150, layout="constrained")
+    figure = Figure(figsize=(11.0, 5.6), dpi=DPI, layout="constrained")
     for axes, windows, title in zip(figure.subplots(1, 2), (measured, result.predicted), ("Measured", "Simulated"), strict=True):
         image = axes.imshow(1e3 * _mosaic(windows), cmap="RdBu_r", vmin=-1e3 * _SIGMAS * sigma, vmax=1e3 * _SIGMAS * sigma)
         axes.set_title(title, fontsize=11)
         axes.set_axis_off()
-    figure.colorbar(image, ax=figure.axes, label="reference minus epoch, mm", shrink=0.7)
+    bar = figure.colorbar(image, ax=figure.axes, shrink=0.7, extend="both")
+    bar.ax.tick_params(labelsize=8)
+    bar.set_label("reference minus epoch, mm", fontsize=9)
     return png_bytes(figure)
 
 
@@ -220,7 +239,7 @@ def _mosaic(windows: FloatArray) -> FloatArray:
 
 
 def _size_and_variogram(result: Calibration) -> bytes:
-    figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
+    figure = Figure(figsize=(11.0, 4.2), dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
     measured = np.concatenate([result.windows.cut(values).ravel() for values in result.material.maps])
     sigma = 1e3 * statistics(measured).nmad
@@ -232,8 +251,7 @@ def _size_and_variogram(result: Calibration) -> bytes:
     left.plot(edges, stats.norm.pdf(edges, 0, sigma), color="0.5", linestyle="--", linewidth=1, label="normal of the same NMAD")
     left.set_yscale("log")
     left.set_ylim(1e-5 / sigma)
-    left.set_xlabel("difference less its median, mm")
-    left.set_ylabel("density, 1/mm")
+    dress(left, "difference less its median, mm", "density, 1/mm")
     left.legend(frameon=False, fontsize=9)
     lags = [name for name in result.statistics if name.startswith("variogram.")]
     place = [result.statistics.index(name) for name in lags]
@@ -249,12 +267,9 @@ def _size_and_variogram(result: Calibration) -> bytes:
     right.plot(distance, 1e3 * np.exp(expected[place]), color=_SIMULATED, label="simulated, with two standard deviations")
     right.plot(distance, 1e3 * np.exp(result.observed[place]), "o", color=_MEASURED, markersize=4, label="measured")
     right.set_xscale("log")
-    right.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    right.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    right.xaxis.set_minor_formatter(NullFormatter())
+    plain_numbers(right.xaxis)
     right.set_ylim(0)
-    right.set_xlabel("distance, m")
-    right.set_ylabel("root of the semivariance, mm")
+    dress(right, "distance, m", "root of the semivariance, mm")
     right.legend(frameon=False, fontsize=9)
     return png_bytes(figure)
 
@@ -262,24 +277,33 @@ def _size_and_variogram(result: Calibration) -> bytes:
 def _statistics(result: Calibration) -> bytes:
     expected, scatter = result.found.surface.mean(result.found.x), np.sqrt(np.diag(result.found.surface.covariance))
     place = np.arange(len(expected))[::-1]
-    figure = Figure(figsize=(8.0, 0.24 * len(expected) + 1.0), dpi=150, layout="constrained")
+    figure = Figure(figsize=(11.0, 0.2 * len(expected) + 1.0), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     axes.barh(place, 2 * (np.exp(2 * scatter) - 1), left=1 - (np.exp(2 * scatter) - 1), color=_SIMULATED, alpha=0.25, height=0.8)
     axes.plot(np.exp(result.observed - expected), place, "o", color=_MEASURED, markersize=4)
     axes.axvline(1, color="0.3", linewidth=0.8)
-    axes.set_yticks(place, result.statistics, fontsize=8)
-    axes.set_xlabel("measured over expected")
+    dress(axes, "measured over expected", "")
+    axes.set_yticks(place, [_in_words(name) for name in result.statistics], fontsize=8)
     return png_bytes(figure)
 
 
+def _in_words(statistic: str) -> str:
+    """The name of a statistic (pipeline/noise/signature.py) as a reader understands it."""
+    group, name = statistic.split(".")
+    if group == "variogram":
+        return f"variogram at {name.removesuffix('px')} px"
+    return f"{group}: {name.replace('_', ' ').replace('std', 'StD').replace('nmad', 'NMAD')}"
+
+
 def _over_time(result: Calibration) -> bytes:
-    figure = Figure(figsize=(11.0, 3.2), dpi=150, layout="constrained")
+    figure = Figure(figsize=(11.0, 3.2), dpi=DPI, layout="constrained")
     for axes, name, label in zip(
         figure.subplots(1, 2), ("median", "standard_deviation"), ("median, mm", "standard deviation, mm"), strict=True
     ):
         values = [1e3 * getattr(each.size, name) for each in result.epochs]
         axes.bar(np.arange(len(values)), values, color=_MEASURED)
         axes.axhline(float(np.mean(values)), color=_SIMULATED)
-        axes.set_xticks(np.arange(len(values)), [each.name for each in result.epochs], rotation=45, ha="right", fontsize=7)
-        axes.set_ylabel(label)
+        axes.axhline(0, color="0.3", linewidth=0.8)
+        dress(axes, "", label)
+        axes.set_xticks(np.arange(len(values)), [each.name for each in result.epochs], rotation=45, ha="right", fontsize=8)
     return png_bytes(figure)
