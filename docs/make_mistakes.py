@@ -64,6 +64,9 @@ KEYS, VALUES, SENSORS, FILES, OUTPUT, COMMANDS = "Keys", "Values", "Sensors and 
 MISTAKES = (
     _set(KEYS, "a misspelt section", "rockfal.count=3"),
     _set(KEYS, "a misspelt key", "rockfall.cuont=3"),
+    _set(KEYS, "a misspelt preset", "scanner.presett=riegl_vz400i"),
+    _set(KEYS, "a parameter of another effect", "sensor={sensor: tls, effects: [{name: range_offset, scale_ppm: 10}]}"),
+    _set(KEYS, "a noise of the other sensor", "sensor={sensor: tls, noise: {parallax_sigma_px: 0.3}}"),
     _set(KEYS, "keys of two kinds of wall", "wall={mesh: wall.ply, style: glendale}"),
     _set(KEYS, "no value", "wall.style"),
     _set(VALUES, "a word for a number", "scanner.azimuth_step_rad=fast"),

@@ -59,12 +59,12 @@ class CamerasFile(Config):
 
 def _camera_kind(values: Any) -> str:
     if isinstance(values, CamerasFile) or (isinstance(values, dict) and "file" in values):
-        return "file"
+        return "in a file"
     return "pair" if isinstance(values, PairConfig) or (isinstance(values, dict) and "left" in values) else "rig"
 
 
 CamerasConfig = Annotated[
-    Annotated[RigConfig, Tag("rig")] | Annotated[PairConfig, Tag("pair")] | Annotated[CamerasFile, Tag("file")],
+    Annotated[RigConfig, Tag("rig")] | Annotated[PairConfig, Tag("pair")] | Annotated[CamerasFile, Tag("in a file")],
     Discriminator(_camera_kind),
 ]
 

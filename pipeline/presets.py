@@ -7,6 +7,7 @@ from typing import Any
 
 from pipeline.bundled import bundled_config
 from scene.config import load_yaml, parse
+from scene.errors import InputError
 from sensors.presets import ScannerPreset
 
 
@@ -37,8 +38,10 @@ def with_preset(values: dict[str, Any]) -> dict[str, Any]:
     """
     scanner = values.get("scanner")
     own = {"preset": scanner} if isinstance(scanner, str) else scanner
-    if not isinstance(own, dict) or not isinstance(own.get("preset"), str):
+    if not isinstance(own, dict) or "preset" not in own:
         return values
+    if not isinstance(own["preset"], str):
+        raise InputError(f"'scanner.preset': expected a name or a file, got {own['preset']!r:.80}")
     preset = read_preset(own["preset"])
     section = preset.scanner_values() | {key: value for key, value in own.items() if key != "preset"}
     return {**values, "scanner": section, "sensor": _with_model(values.get("sensor"), preset)}

@@ -6,8 +6,9 @@ import math
 import re
 import reprlib
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 
 import pydantic
 import yaml
@@ -22,6 +23,8 @@ class Config(BaseModel):
     """A frozen config section. Field names carry their unit (`_m`, `_rad`, `_px`, `_ppm`)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    short_forms: ClassVar[tuple[str, ...]] = ()
+    """Keys that a file may have in this section and that are resolved to others before it is parsed; messages name them too."""
 
 
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
@@ -66,13 +69,10 @@ def _listed(mistakes: list[str]) -> str:
 
 def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
     """One mistake as `section.key: message, got value`, with the nearest key for an unknown one."""
-    keys, known = _path(model, item["loc"])
+    keys, sections = _place(model, item["loc"])
     key = ".".join(keys)
     if item["type"] == "extra_forbidden":
-        if keys[-1] in known:  # of another kind of this section
-            return f"'{key}' does not go with the other keys of '{'.'.join(keys[:-1])}'; leave it or them out"
-        hint = nearest(keys[-1], known) or (f"allowed: {', '.join(sorted(known))}" if known else "")
-        return f"unknown key '{key}'; {hint}" if hint else f"unknown key '{key}'"
+        return _unknown(keys, sections)
     if item["type"] == "missing":
         return f"'{key}' is missing"
     message = item["msg"].removeprefix("Value error, ")
@@ -80,6 +80,22 @@ def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
         return message
     hint = _hint(keys, item)
     return f"'{key}': {message[0].lower()}{message[1:]}, got {_shown(item['input'])}" + (f"; {hint}" if hint else "")
+
+
+def _unknown(keys: list[str], sections: list[_Section]) -> str:
+    """What a key that is not allowed is: one of another kind of this section, or of none."""
+    key, name = ".".join(keys), keys[-1]
+    owners = list(dict.fromkeys(section.kind for section in sections if name in section.names()))
+    picked = [section for section in sections if section.picked]
+    known = sorted({each for section in picked for each in section.names()})
+    allowed = f"allowed: {', '.join(known)}" if known else ""
+    if owners and name not in known:
+        more = f" and {len(owners) - _MOST_MISTAKES} more" if len(owners) > _MOST_MISTAKES else ""
+        return f"'{key}' belongs to {', '.join(owners[:_MOST_MISTAKES])}{more}, not to {picked[0].kind}; {allowed}"
+    if owners:  # of kinds that no word tells apart
+        return f"'{key}' does not go with the other keys of '{'.'.join(keys[:-1])}'; leave it or them out"
+    hint = nearest(name, known) or allowed
+    return f"unknown key '{key}'; {hint}" if hint else f"unknown key '{key}'"
 
 
 def _hint(keys: list[str], item: ErrorDetails) -> str:
@@ -104,28 +120,49 @@ def _shown(value: Any) -> str:
     return short.repr(value)
 
 
-def _path(model: type[BaseModel], location: tuple[str | int, ...]) -> tuple[list[str], set[str]]:
-    """The keys that lead to a mistake, without the tags of unions, and the names allowed beside the last of them."""
+@dataclass(frozen=True)
+class _Section:
+    """A model that may stand at a place of a config. kind: the word that picks it, or that picks what it stands in, such as an
+    effect's name; "" where none does; picked: whether the config picks it."""
+
+    model: type[BaseModel]
+    kind: str = ""
+    picked: bool = True
+
+    def names(self) -> set[str]:
+        """What may stand in it."""
+        return {*self.model.model_fields, *getattr(self.model, "short_forms", ())}
+
+    def inside(self, field: str) -> list[_Section]:
+        """The models that the annotation of a field holds."""
+        pending: list[Any] = [self.model.model_fields[field].annotation]
+        found = []
+        while pending:
+            annotation = pending.pop(0)
+            if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+                found.append(_Section(annotation, _word_of(annotation) or self.kind, self.picked))
+            pending.extend(getattr(annotation, "__args__", ()))
+        return found
+
+
+def _word_of(model: type[BaseModel]) -> str:
+    """The only value of the field that tells a model from others of its union; "" where it has no such field."""
+    words = (get_args(field.annotation) for field in model.model_fields.values() if get_origin(field.annotation) is Literal)
+    return next((str(word[0]) for word in words if len(word) == 1), "")
+
+
+def _place(model: type[BaseModel], location: tuple[str | int, ...]) -> tuple[list[str], list[_Section]]:
+    """The keys that lead to a mistake, without the tags of unions, and the sections that may stand around the last of them."""
     keys: list[str] = []
-    models: list[type[BaseModel]] = [model]
-    known: set[str] = set()
+    sections = around = [_Section(model)]
     for depth, part in enumerate(location):
-        holders = [found for found in models if part in found.model_fields]
+        holders = [section for section in sections if part in section.model.model_fields]
         if holders or isinstance(part, int) or depth == len(location) - 1:
             keys.append(str(part))
+        elif any(section.kind == part for section in sections):
+            sections = [replace(section, picked=section.picked and section.kind == part) for section in sections]
         if not isinstance(part, int):
-            known = {name for found in models for name in found.model_fields}
+            around = sections
         if holders:
-            models = [inner for outer in holders for inner in _models_in(outer, str(part))]
-    return keys, known
-
-
-def _models_in(model: type[BaseModel], field: str) -> list[type[BaseModel]]:
-    pending: list[Any] = [model.model_fields[field].annotation]
-    found = []
-    while pending:
-        annotation = pending.pop()
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            found.append(annotation)
-        pending.extend(getattr(annotation, "__args__", ()))
-    return found
+            sections = [inner for outer in holders for inner in outer.inside(str(part))]
+    return keys, around

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import psutil
@@ -37,6 +37,7 @@ _BYTES_PER_PULSE = 400
 class ScannerConfig(Config):
     """A laser scanner as an instrument, and the window it scans."""
 
+    short_forms: ClassVar[tuple[str, ...]] = ("preset",)
     name: str | None = Field(None, min_length=1, description="manufacturer and model; a preset gives its own")
     zenith_limits_rad: Window = Field((0.5, 2.3), description="field of view in zenith: smallest, largest [rad]")
     azimuth_step_rad: float = Field(0.0005, gt=0, le=0.02, description="angular step between scan lines [rad]")

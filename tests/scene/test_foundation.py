@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -226,6 +228,41 @@ def test_config_mistakes_are_named_with_the_nearest_key() -> None:
         parse(Outer, {"count": 1, "inner": {"step_m": -1}}, "file.yaml")
     with pytest.raises(InputError, match="expected a mapping"):
         parse(Outer, [1], "file.yaml")
+
+
+class Round(Config):
+    short_forms: ClassVar[tuple[str, ...]] = ("like",)
+    shape: Literal["round"] = "round"
+    inner: Inner = Inner()
+    radius_m: float = 1.0
+
+
+class Square(Config):
+    class Inner(Config):
+        side_m: float = 1.0
+
+    shape: Literal["square"] = "square"
+    inner: Inner = Inner()
+    side_m: float = 1.0
+
+
+class Shapes(Config):
+    shapes: tuple[Annotated[Round | Square, Field(discriminator="shape")], ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"side_m": 1}, "'shapes.0.side_m' belongs to square, not to round; allowed: inner, like, radius_m, shape"),
+        ({"inner": {"side_m": 1}}, "'shapes.0.inner.side_m' belongs to square, not to round; allowed: step_m"),
+        ({"radus_m": 1}, "unknown key 'shapes.0.radus_m'; did you mean 'radius_m'?"),
+        ({"lik": 1}, "unknown key 'shapes.0.lik'; did you mean 'like'?"),
+        ({"sid_m": 1}, "unknown key 'shapes.0.sid_m'; allowed: inner, like, radius_m, shape"),
+    ],
+)
+def test_a_key_of_another_kind_is_told_whose_it_is(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(f"file.yaml: {message}") + "$"):
+        parse(Shapes, {"shapes": [{"shape": "round", **values}]}, "file.yaml")
 
 
 def test_a_config_file_that_cannot_be_read_is_an_input_error(tmp_path: Path) -> None:

@@ -304,7 +304,10 @@ def test_an_effect_acts_at_a_step_edge_with_the_range_that_is_hit() -> None:
     [
         (2 * [{"name": "beam_divergence", "divergence_rad": 3e-4}], "one beam"),
         ([{"name": "beam_divergence", "sub_rays": 18}], "input should be 1, 7, 19"),
-        ([{"name": "range_noise_intensity", "sigma_m": 0.1}], "does not go with"),
+        (
+            [{"name": "range_noise_intensity", "sigma_m": 0.1}],
+            "belongs to range_noise, range_noise_incidence, not to range_noise_intensity",
+        ),
         ([{"name": "range_cyclic", "period_m": 0}], "period_m"),
         ([{"name": "precipitation", "early_share": 1.5}], "less than or equal to 1"),
         ([{"name": "range_offset"}], "does nothing without offset_m"),
