@@ -41,7 +41,7 @@ def write_icp_study(out: Path, study: IcpStudy) -> Path:
 def in_words(found: Recommendation) -> str:
     """A recommendation as a sentence."""
     low, high = found.good
-    error = f"{millimetres(found.normal_error_m, 2)} of error along the surface's normal remain"
+    error = f"{millimetres(found.normal_error_m, 2)} of error along the surface's normal remains"
     if found.parameter == "subsample_ratio":
         good = f"up to {high:g} of the points may be left out"
         return f"icp.subsample_ratio: {found.value:g}. With the run's other settings {good}; {error}."
