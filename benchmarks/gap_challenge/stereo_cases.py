@@ -43,6 +43,9 @@ _SPREADING = {**effects.SPREAD, **effects.OFF_SPREAD}
 Drawn = list[tuple[str, Parameters, Strength]]
 _LOST = 0.02
 _STEP_PX = 32.0
+_STEEP, _WEIGHTLESS = 6.0, 1e12
+"""Differences of neighbours beyond so many typical ones are depth steps, where the surface as known is not known well enough to
+count towards an effect's strength; the variance, px^2, that says so."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +205,19 @@ def _blobs(scene: Set, where: Array, random: Random) -> Array:
     return hidden
 
 
+def _at_steps(disparity: Array) -> Array:
+    """(h, w) whether a pixel lies beside a depth step, or beside one without a disparity."""
+    found = np.zeros(disparity.shape, dtype=bool)
+    for axis in (0, 1):
+        steps = np.diff(disparity, axis=axis)
+        size = np.abs(steps - np.nanmedian(steps))
+        steep = ~(size < _STEEP * 1.4826 * np.nanmedian(size))
+        before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
+        before[axis], after[axis] = (0, 1), (1, 0)
+        found |= np.pad(steep, before) | np.pad(steep, after)
+    return found
+
+
 def _signature(scene: Set, name: str, p: Parameters, part: Image) -> Array:
     """(n,) change of the disparity on the reference, px."""
     if name in effects.CAMERA or name == "row_jitter":
@@ -248,6 +264,7 @@ def _drawn(
 ) -> Drawn:
     """Effects with magnitudes such that each alone is as strong as is drawn for it; strengths are those beside the others."""
     white = np.full(len(part.u), scene.noise[0] ** 2 + 4 / 9 * scene.noise[1] ** 2)
+    unknown = np.where(_at_steps(plain.reshape(scene.u.shape)).ravel()[chosen], _WEIGHTLESS, 0.0)
     found: list[tuple[str, Parameters, Strength | None]] = []
     for kind in kinds:
         target = Target.draw(random)
@@ -255,7 +272,7 @@ def _drawn(
             start, most = _LINEAR[kind]
             unit = effects.shape(kind, part, random)
             alone = mean_strength(
-                kind, _shown(scene, kind, unit, part), base, families, _whitener(scene, white, part, where, unit)
+                kind, _shown(scene, kind, unit, part), base, families, _whitener(scene, white + unknown, part, where, unit)
             )
             found.append((kind, effects.times(unit, min(target.value / max(target.of(alone), 1e-9), most / start)), None))
         elif kind == "regularization_noise":
@@ -275,7 +292,7 @@ def _drawn(
     for kind, p, strength in found:
         if kind in _LINEAR:
             beside = np.concatenate([base, *(column for other, column in shown.items() if other != kind)], axis=1)
-            strength = mean_strength(kind, shown[kind][:, 0], beside, families, _whitener(scene, whole, part, where, p))
+            strength = mean_strength(kind, shown[kind][:, 0], beside, families, _whitener(scene, whole + unknown, part, where, p))
         elif strength is None:
             strength = spread_strength(kind, added[kind], whole - added[kind], {"parallax_noise": [np.ones_like(white)]})
         strong.append((kind, p, strength))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from pipeline.overrides import apply_overrides
 from scene.config import Config, load_yaml, parse
+
+Loss = Literal["proposal_class", "proposal_box", "class", "box", "mask"]
 
 
 class NormalisationConfig(Config):
@@ -90,6 +92,9 @@ class TrainingConfig(Config):
     warm_up_steps: int = Field(200, ge=0, description="steps over which the learning rate rises from zero")
     weight_decay: float = Field(1e-4, ge=0, description="pull of the weights towards zero")
     clip_norm: float = Field(5.0, gt=0, description="largest norm of a gradient")
+    loss_weights: dict[Loss, Annotated[float, Field(gt=0)]] = Field(
+        {}, description="by what losses are multiplied before they are added; 1 for the others, as the thesis has it"
+    )
     flips: bool = Field(True, description="mirror images left-right at random")
     crop_px: int | None = Field(
         None, ge=64, multiple_of=64, description="train on random windows of this side (default: whole images)"

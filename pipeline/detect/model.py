@@ -6,7 +6,8 @@ fixed: empty places are marked by weights or scores.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, get_args
 
 import keras
 import numpy as np
@@ -14,13 +15,18 @@ from keras import ops
 
 from pipeline.detect.backbone import feature_pyramid
 from pipeline.detect.boxes import Tensor, anchors, clip, decode, suppressed
-from pipeline.detect.config import DetectorConfig
+from pipeline.detect.config import DetectorConfig, Loss
 from pipeline.detect.heads import MASK_POOLED_PX, POOLED_PX, box_head, mask_head, proposal_head
 from pipeline.detect.losses import binary_cross_entropy, cross_entropy, smooth_l1
 from pipeline.detect.roi_align import roi_align
 from pipeline.detect.targets import anchor_targets, box_targets, mask_targets
 
-LOSSES = ("proposal_class", "proposal_box", "class", "box", "mask")
+LOSSES: tuple[Loss, ...] = get_args(Loss)
+
+
+def total_loss(losses: Mapping[str, Any], weights: Mapping[Loss, float]) -> Any:
+    """The sum of losses by name, numbers or tensors, with their weights, 1 by default."""
+    return sum(weights.get(name, 1.0) * losses[name] for name in LOSSES)
 
 
 class MaskRCNN(keras.Model):
@@ -30,7 +36,9 @@ class MaskRCNN(keras.Model):
     boxes (b, g, 4) float32 px, valid (b, g) 1 or 0, labels (b, h, w) int32, 1 + the index of a pixel's block.
     """
 
-    def __init__(self, config: DetectorConfig, image_px: int | None = None, seed: int = 1) -> None:
+    def __init__(
+        self, config: DetectorConfig, image_px: int | None = None, seed: int = 1, loss_weights: Mapping[Loss, float] | None = None
+    ) -> None:
         """image_px: side of the images where it differs from the config's (training on windows)."""
         super().__init__(name="mask_rcnn")
         keras.utils.set_random_seed(seed)
@@ -45,6 +53,7 @@ class MaskRCNN(keras.Model):
         self.samples = keras.random.SeedGenerator(seed)
         self.means = {name: keras.metrics.Mean(name=name) for name in LOSSES}
         self.size = size
+        self.term_weights = loss_weights or {}
         self.built = True  # all layers are functional models with their shapes given
 
     def call(self, inputs: dict[str, Tensor], training: bool = False) -> dict[str, Tensor]:
@@ -61,10 +70,10 @@ class MaskRCNN(keras.Model):
     def compute_loss(
         self, x: Any = None, y: Any = None, y_pred: Any = None, sample_weight: Any = None, training: bool = True
     ) -> Tensor:
-        """The sum of the losses, as the thesis has it; each one's mean is kept as a metric."""
+        """The weighted sum of the losses; each one's mean is kept as a metric."""
         for name in LOSSES:
             self.means[name].update_state(y_pred[name])
-        return sum(y_pred[name] for name in LOSSES)
+        return total_loss(y_pred, self.term_weights)
 
     def _proposals(self, logits: Tensor, codes: Tensor) -> Tensor:
         """(b, proposals, 4) px, empty ones without area; the losses do not reach through them."""

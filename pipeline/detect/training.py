@@ -14,7 +14,7 @@ from pipeline.detect import weights
 from pipeline.detect.config import TrainConfig
 from pipeline.detect.data import CocoFolder, batches
 from pipeline.detect.figures import write_loss_figure
-from pipeline.detect.model import LOSSES, MaskRCNN
+from pipeline.detect.model import LOSSES, MaskRCNN, total_loss
 from pipeline.detect.schedule import has_settled, learning_rate
 from pipeline.formats.atomic import write_json, writing
 from pipeline.progress import Progress
@@ -26,7 +26,7 @@ _STATE, _OPTIMIZER = "state.json", "optimizer.npz"
 
 @dataclass
 class History:
-    """Mean losses per epoch, by name; `loss` is their sum."""
+    """Mean losses per epoch, by name; `loss` is their weighted sum."""
 
     training: list[dict[str, float]] = field(default_factory=list)
     validation: list[dict[str, float]] = field(default_factory=list)
@@ -46,7 +46,7 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     progress = progress or Progress()
     folders = CocoFolder(data_set / "train"), CocoFolder(data_set / "val")
     training = config.training
-    model = MaskRCNN(config.detector, training.crop_px, training.seed)
+    model = MaskRCNN(config.detector, training.crop_px, training.seed, training.loss_weights)
     model.compile(optimizer=_optimizer(config), jit_compile=False)
     model.optimizer.build(model.trainable_variables)
     history = _begun(out, config, model, resume=resume)
@@ -68,26 +68,25 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
 def _learn(
     model: MaskRCNN, folder: CocoFolder, config: TrainConfig, epoch: int, steps: int, progress: Progress
 ) -> dict[str, float]:
-    model.reset_metrics()
-    logs: dict[str, Any] = {}
+    found = []
     for step, batch in enumerate(batches(folder, config.detector, config.training, epoch, learning=True)):
         model.optimizer.learning_rate = learning_rate(epoch * steps + step, config.training.epochs * steps, config.training)
-        logs = model.train_on_batch(batch, return_dict=True)
+        found.append(model.train_on_batch(batch, return_dict=True))
         progress.advance((step + 1) / (steps + 1))
-    return _losses(logs)
+    return _mean(found, config)
 
 
 def _validate(model: MaskRCNN, folder: CocoFolder, config: TrainConfig) -> dict[str, float]:
-    model.reset_metrics()
-    logs: dict[str, Any] = {}
+    found = []
     for batch in batches(folder, config.detector, config.training, 0, learning=False):
-        logs = model.test_on_batch(batch, return_dict=True)
-    return _losses(logs)
+        model.reset_metrics()  # train_on_batch does so itself, test_on_batch does not
+        found.append(model.test_on_batch(batch, return_dict=True))
+    return _mean(found, config)
 
 
-def _losses(logs: dict[str, Any]) -> dict[str, float]:
-    found = {name: float(logs[name]) for name in LOSSES}
-    return {"loss": sum(found.values()), **found}
+def _mean(batch_losses: list[dict[str, Any]], config: TrainConfig) -> dict[str, float]:
+    found: dict[str, float] = {name: float(np.mean([losses[name] for losses in batch_losses])) for name in LOSSES}
+    return {"loss": total_loss(found, config.training.loss_weights), **found}
 
 
 def _optimizer(config: TrainConfig) -> keras.optimizers.Optimizer:

@@ -159,8 +159,11 @@ def frequencies(low: float, high: float, step: float, most: int = 200) -> FloatA
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
-def free_forms(covariate: str, values: FloatArray) -> list[Candidate | Grid]:
-    """Forms of one covariate that stand for no effect: a line, a parabola, a smooth curve, a step, a wave."""
+def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> list[Candidate | Grid]:
+    """Forms of one covariate that stand for no effect: a line, a parabola, a smooth curve, a step, a wave.
+
+    highest: frequency from which on a wave is an effect of the catalogue.
+    """
     x = (values - values.mean()) / (float(values.std()) or 1.0)
     knots = np.quantile(x, np.linspace(0, 1, _KNOTS)[1:-1])
     columns = [x, x**2, x**3, *(np.maximum(x - knot, 0) ** 3 for knot in knots)]
@@ -174,8 +177,10 @@ def free_forms(covariate: str, values: FloatArray) -> list[Candidate | Grid]:
     ]
     reach = float(np.ptp(np.quantile(x, [0.005, 0.995])))
     if reach > 0:
-        wave = Wave("period", np.ones_like(x), x)
-        found.append(Grid(covariate, "amplitude", wave, frequencies(0.8 / reach, _MOST_CYCLES / reach, 0.5 / reach), {}, True))
+        tried = frequencies(0.8 / reach, _MOST_CYCLES / reach, 0.5 / reach)
+        tried = tried[tried < highest * float(values.std())]
+        if len(tried) > 1:
+            found.append(Grid(covariate, "amplitude", Wave("period", np.ones_like(x), x), tried, {}, True))
     return found
 
 

@@ -22,9 +22,10 @@ NOT_SCORED = (
 _POINTS_PER_PATCH = 30.0
 _LARGEST = 5.0
 """Deviations are cut off at so many sigmas: an outlier has no more to say."""
-_LEAST, _LEAST_OF_SMOOTHING = 0.0, 5.0
-"""A score that does not rise speaks against an effect; a little low-pass also makes up for rays that are not quite where they are
-thought to be."""
+_SIGMAS = 2.5
+"""By how many standard deviations the gain of a true effect may chance to lie below what the training blocks let expect."""
+_LEAST_OF_SMOOTHING = 5.0
+"""A little low-pass also makes up for rays that are not quite where they are thought to be."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +44,36 @@ def score_effects(
     if not scored or (~trained).sum() < 100:
         return Scored(named, [])
     whole = _value(measurement, named, residuals, trained)
-    gains = {}
+    gains, least = {}, {}
     for item in scored:
-        others = [each for each in named if each is not item]
-        without = _value(measurement, others, residuals, trained)
-        rows = ~trained & np.isfinite(whole[0]) & np.isfinite(without[0])
-        patch = patches(residuals.at[rows], _POINTS_PER_PATCH)
-        scores = [_log_score(value[rows], sigma[rows], patch, reference_sigma) for value, sigma in (whole, without)]
-        gains[item.name] = scores[0] - scores[1]
-    failed = [item for item in named if item.name in gains and gains[item.name] <= _least(item)]
+        without = _value(measurement, [each for each in named if each is not item], residuals, trained)
+        known = np.isfinite(whole[0]) & np.isfinite(without[0])
+        tested, learned = (_gain(whole, without, known & rows, residuals.at, reference_sigma) for rows in (~trained, trained))
+        gains[item.name] = tested
+        expected = learned * float(np.sum(known & ~trained)) / max(float(np.sum(known & trained)), 1.0)
+        least[item.name] = _LEAST_OF_SMOOTHING if item.name == "stereo.smoothing" else _least(expected)
+    failed = [item for item in named if item.name in gains and gains[item.name] <= least[item.name]]
     return Scored([replace(item, gain=gains.get(item.name, item.gain)) for item in named if item not in failed], failed)
 
 
-def _least(item: Named) -> float:
-    return _LEAST_OF_SMOOTHING if item.name == "stereo.smoothing" else _LEAST
+def _gain(
+    whole: tuple[FloatArray, FloatArray], without: tuple[FloatArray, FloatArray], rows: BoolArray, at: FloatArray, sigma: float
+) -> float:
+    """Of the log score, by residuals and their standard deviations (n,) with and without an effect, over some rows.
+
+    at: (n, 2) places on the wall; sigma: of the reference's error.
+    """
+    patch = patches(at[rows], _POINTS_PER_PATCH)
+    scores = [_log_score(value[rows], spread[rows], patch, sigma) for value, spread in (whole, without)]
+    return scores[0] - scores[1]
+
+
+def _least(expected: float) -> float:
+    """The gain up to which an effect fails: none, or where little is expected, less than chance takes from it.
+
+    The gain of a true effect, half a difference of two chi^2, has about twice its expectation as variance.
+    """
+    return min(0.0, expected - _SIGMAS * float(np.sqrt(2 * max(expected, 0.0))))
 
 
 def _value(

@@ -195,18 +195,20 @@ class _Normal:
         y = value.within[:, 0]
         return cls(columns, value, columns.within.T @ columns.within, columns.within.T @ y, float(y @ y))
 
-    def at(self, at: Covariance) -> Fit:
-        """All columns fitted."""
+    def at(self, at: Covariance, precision: FloatArray | None = None) -> Fit:
+        """All columns fitted. precision: (k, k) inverse covariance of the coefficients, around 0, before there are data."""
         basis, y = self.columns.between[at.length], self.value.between[at.length][:, 0]
         weighted = basis * at.weight[:, None]
         constant = 0.5 * (np.log(at.weight).sum() - y @ (at.weight * y) - self.square)
-        return _solve(self.gram + weighted.T @ basis, self.right + weighted.T @ y, float(constant), at)
+        matrix = self.gram + weighted.T @ basis
+        matrix = matrix if precision is None else matrix + precision
+        return _solve(matrix, self.right + weighted.T @ y, float(constant), at)
 
 
-def fitted(covariances: list[Covariance], columns: Projected, value: Projected) -> Fit:
-    """All columns fitted to one value, at the most likely of the covariances."""
+def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> Fit:
+    """All columns fitted to one value, at the most likely of the covariances. precision: (k, k) as in `_Normal.at`."""
     normal = _Normal.of(columns, value)
-    return max((normal.at(each) for each in covariances), key=lambda fit: fit.log_likelihood)
+    return max((normal.at(each, precision) for each in covariances), key=lambda fit: fit.log_likelihood)
 
 
 def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> Fit:

@@ -20,9 +20,11 @@ _ABRUPT = 0.7
 _SCATTERED = 0.8
 _FREE_MARGIN, _FREE_RATIO = 6.0, 1.5
 """A free form must score as much more than the catalogue's effects."""
-_PATCH_SIGMAS = 5.0
-_DIRECTIONS = ("azimuth", "zenith")
-"""What losses may depend on for no reason of the catalogue: range, incidence and power have theirs."""
+_STRIPS, _AGREEMENT = 8, 0.85
+"""Strips across a sector that must agree on its losses, and how well (1: each gains as much as any other). Of 35 cases without
+losses by direction the highest is 0.73, of 3 sectors the lowest 0.96 (development seeds 7 to 9)."""
+_DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
+"""What losses may depend on for no reason of the catalogue (range, incidence and power have theirs), and what goes across it."""
 _BINS = 16
 _MOST_PULSES = 20_000
 """That decide where the search for a limit starts."""
@@ -95,7 +97,7 @@ def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, inte
         limit = replace(limit, score=-np.inf)
     best, other = (limit, rain) if limit.score >= rain.score else (rain, limit)
     free = _free(losses, missing.covariates)
-    if free.score > _FREE_RATIO * max(best.score, 0.0) + _FREE_MARGIN and _patches_agree(lost[fit], best, free, missing.at, fit):
+    if free.score > _FREE_RATIO * max(best.score, 0.0) + _FREE_MARGIN and _strips_agree(missing, best, free, fit):
         best = free
     sureness = 1 / _clustering(lost[fit], best.chance[fit], missing.at[fit])
     best = replace(best, gain=best.gain * sureness, score=best.score * sureness)
@@ -125,12 +127,14 @@ def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
     return float(max(np.sum(left**2) / np.sum(expected), 1.0))
 
 
-def _patches_agree(lost: BoolArray, known: MissingFound, free: MissingFound, at: FloatArray, fit: BoolArray) -> bool:
-    """Whether many patches of the wall prefer a free form: a shrub before the wall takes all pulses of a few."""
+def _strips_agree(missing: Missing, known: MissingFound, free: MissingFound, fit: BoolArray) -> bool:
+    """Whether losses by one angle are common to all strips of the other: a shrub before the wall takes the pulses of a few."""
+    lost, across = missing.lost[fit], missing.covariates[_DIRECTIONS[free.covariate]][fit]
     p, q = (np.clip(each.chance[fit], 1e-9, 1 - 1e-9) for each in (known, free))
     gain = np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p))
-    sums = np.bincount(patches(at[fit], _PULSES_PER_PATCH), gain)
-    return float(sums.sum()) > _PATCH_SIGMAS * float(np.linalg.norm(sums))
+    strip = np.searchsorted(np.quantile(across, np.linspace(0, 1, _STRIPS + 1)[1:-1]), across)
+    sums = np.bincount(strip, gain, _STRIPS)
+    return float(sums.sum()) > _AGREEMENT * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
 
 
 def _is_cut(intensity: FloatArray) -> bool:

@@ -27,7 +27,7 @@ from pipeline.gap.measurement import Measurement
 from pipeline.gap.quantization import find_comb
 from pipeline.gap.registration import registered, settled
 from pipeline.gap.residuals import BoolArray, Residuals
-from pipeline.gap.selection import Chosen, MeanSearch, Tried
+from pipeline.gap.selection import Chosen, MeanSearch, Tried, precision_of
 from pipeline.gap.spread import SpreadFound, find_spread
 from pipeline.gap.stereo_noise import told_apart
 from scene.keyed_random import KeyedRandom
@@ -59,11 +59,12 @@ def believes(measurement: Measurement, name: str) -> bool:
 def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | Grid]:
     """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
     named = tls_signatures.mean_families(part) if part.sensor == "tls" else stereo_signatures.mean_families(part, measurement)
+    lowest = {_PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, Grid) and each.name in _PERIODIC}
     free = [
         form
         for name, values in part.covariates.items()
         if name not in _NOT_FREE and np.ptp(values) > 0
-        for form in free_forms(name, values)
+        for form in free_forms(name, values, highest=lowest.get(name, np.inf))
     ]
     first, second = PLANES[part.sensor]
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
@@ -201,7 +202,13 @@ def _again(
     columns = [_columns(each) for each in known]
     others += [harmonics(_PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in _PERIODIC]
     weighed = _weighed(at, [replace(each, variance=each.variance[_kept(at, part)]) for each in spread], noise[0])
-    search = MeanSearch(replace(weighed, pose=np.concatenate([at.pose, *columns], axis=1)), others, random.child("again"))
+    precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
+    search = MeanSearch(
+        replace(weighed, pose=np.concatenate([at.pose, *columns], axis=1)),
+        others,
+        random.child("again"),
+        np.concatenate([np.zeros(at.pose.shape[1]), *precision]),
+    )
     chosen, tried = search.select()
     fit = search.refined([item.candidate for item in chosen])[1]
     kept, start = [], at.pose.shape[1]

@@ -48,13 +48,17 @@ def residuals_of(measurement: Measurement) -> Residuals:
     return tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
 
 
-def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None) -> tuple[Measurement, Residuals, FloatArray]:
+def settled(
+    measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None
+) -> tuple[Measurement, Residuals, FloatArray]:
     """The measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there.
 
-    trusted: rows of the measurement's points by which to register; all where None. A pose that moves the rays by more than some
-    millimetres on the wall is gone along with, a few times at the most, since slopes at the first place no longer serve.
+    trusted: rows of the measurement's points by which to register, all where None; found: its residuals, if known. A pose that
+    moves the rays by more than some millimetres on the wall is gone along with, a few times at the most, since slopes at the
+    first place no longer serve.
     """
-    found, total = residuals_of(measurement), np.zeros(6)
+    found = residuals_of(measurement) if found is None else found
+    total = np.zeros(6)
     for _ in range(_MOST_MOVES):
         pose = registered(_only(found, trusted))[1]
         if not _is_far(pose, found):

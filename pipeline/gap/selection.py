@@ -7,11 +7,13 @@ best of each size, so that two effects are found too where neither, or a third t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from pipeline.gap.candidates import PLACE, SURFACE, Candidate, Grid
 from pipeline.gap.cells import Cells
@@ -112,7 +114,14 @@ def _stands_out(item: Tried, decoy: float) -> bool:
 class MeanSearch:
     """All candidates on one set of points."""
 
-    def __init__(self, residuals: Residuals, families: list[Candidate | Grid], random: KeyedRandom) -> None:
+    def __init__(
+        self,
+        residuals: Residuals,
+        families: list[Candidate | Grid],
+        random: KeyedRandom,
+        pose_precision: FloatArray | None = None,
+    ) -> None:
+        """pose_precision: (p,) inverse variance of the coefficients of `residuals.pose` before there are data, 0 by default."""
         self._random = random
         self._plain = [family for family in families if isinstance(family, Candidate)]
         self.cells = Cells.over(residuals.at)
@@ -123,6 +132,7 @@ class MeanSearch:
         self._grids = [grid.part(rows) for grid in self._full_grids]
         self._pose, self._turn = np.linalg.qr(residuals.pose[rows] * root)
         self._base = list(range(residuals.pose.shape[1]))
+        self._pose_precision = np.zeros(len(self._base)) if pose_precision is None else pose_precision
         self.value = self.model.project(residuals.value[rows, None] * root)
         matrices = [candidate.columns[rows] * root for candidate in self._plain]
         self._place: dict[int, list[int]] = {}
@@ -153,10 +163,7 @@ class MeanSearch:
 
     def _precision(self) -> FloatArray:
         """(k,) of the fixed columns: none of the pose's and of free forms."""
-        known = [
-            np.zeros(candidate.columns.shape[1]) if candidate.precision is None else candidate.precision
-            for candidate in self._plain
-        ]
+        known = [precision_of(candidate, candidate.columns.shape[1]) for candidate in self._plain]
         return np.concatenate([np.zeros(len(self._base)), *known])
 
     def _null_gains(self, chosen: list[int], within: FloatArray) -> dict[str, FloatArray]:
@@ -223,7 +230,7 @@ class MeanSearch:
         """Columns of some candidates over sigma; of a sine with its change by the frequency where `slopes` say so."""
         rows, root = self.model.rows, self.model.root[:, None]
         matrices = []
-        for candidate, slope in zip(candidates, slopes or [None] * len(candidates), strict=True):
+        for candidate, slope in _with_slopes(candidates, slopes):
             wave = candidate.wave
             columns = candidate.columns if wave is None or slope is None else wave.with_slope(candidate.period, slope)
             matrices.append(columns[rows] * root)
@@ -320,11 +327,15 @@ class MeanSearch:
     def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> Fit:
         """Pose (the columns of `Residuals.pose`) and some candidates, at their most likely covariance."""
         pose, turned = self._fixed.some(self._base), np.linalg.inv(self._turn)
+        known = turned.T @ (self._pose_precision[:, None] * turned)
         if not candidates:
-            found = fitted(self.model.fine, pose, self.value)
+            found = fitted(self.model.fine, pose, self.value, known)
             return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
         matrix = self._matrix(candidates, slopes)
-        found = fitted(self.model.fine, pose.beside(self.model.project(self._without_pose(matrix))), self.value)
+        columns = pose.beside(self.model.project(self._without_pose(matrix)))
+        widths = [candidate.columns.shape[1] + (slope is not None) for candidate, slope in _with_slopes(candidates, slopes)]
+        typical = np.concatenate([precision_of(each, width) for each, width in zip(candidates, widths, strict=True)])
+        found = fitted(self.model.fine, columns, self.value, block_diag(known, np.diag(typical)))
         # the columns were fitted without what the pose explains of them, and the pose by orthonormal ones
         back = np.block(
             [[turned, -turned @ (self._pose.T @ matrix)], [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])]]
@@ -399,6 +410,17 @@ class MeanSearch:
         size, full = np.sqrt(np.maximum(np.diag(matrix), 0)), np.sqrt(np.maximum(np.diag(grams[0]), 1e-300))
         scale = np.maximum(size, 1e-12 * full)
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
+
+
+def precision_of(candidate: Candidate, width: int) -> FloatArray:
+    """(width,) of its coefficients; 0 where nothing is known of them."""
+    return np.zeros(width) if candidate.precision is None else candidate.precision
+
+
+def _with_slopes(
+    candidates: list[Candidate], slopes: list[FloatArray | None] | None
+) -> Iterator[tuple[Candidate, FloatArray | None]]:
+    return zip(candidates, slopes or [None] * len(candidates), strict=True)
 
 
 def _moved(candidate: Candidate, period: float) -> Candidate:

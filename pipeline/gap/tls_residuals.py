@@ -119,7 +119,8 @@ def _recorded(measurement: Measurement) -> tuple[FloatArray, FloatArray, FloatAr
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
     measured = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
     azimuth, zenith = np.arctan2(local[:, 1], local[:, 0]), np.arccos(np.clip(local[:, 2] / measured, -1, 1))
-    return azimuth.mean() + np.angle(np.exp(1j * (azimuth - azimuth.mean()))), zenith, measured
+    middle = np.angle(np.mean(np.exp(1j * azimuth)))  # whichever side of pi the points lie on
+    return middle + np.angle(np.exp(1j * (azimuth - middle))), zenith, measured
 
 
 def _station(measurement: Measurement) -> tuple[FloatArray, FloatArray]:

@@ -18,9 +18,9 @@ from pipeline.gap.footprint import find_footprint
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.missing import LOSSES, MissingFound, find_missing, isolated
-from pipeline.gap.naming import believes, name_effects
+from pipeline.gap.naming import Naming, believes, name_effects
 from pipeline.gap.registration import pose_of, registered, residuals_of, settled
-from pipeline.gap.residuals import BoolArray, Residuals
+from pipeline.gap.residuals import BoolArray, Missing, Residuals
 from pipeline.gap.selection import Tried
 from pipeline.gap.shapes import ShapeFound
 from pipeline.gap.splitting import with_splits
@@ -79,63 +79,46 @@ def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> Diagnosis:
     measurement = with_order(measurement) if measurement.sensor == "tls" else measurement
-    there, plain, surveyed = settled(measurement)
+    first = residuals_of(measurement)
+    held_points = np.zeros(len(measurement.cloud.points), dtype=bool)
+    held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
+    there, plain, surveyed = settled(measurement, first.index[~held_points[first.index]], first)
     if measurement.sensor == "tls":
         plain = replace(plain, missing=missing_returns(there, plain))
     clock.lap("residuals")
     if plain.smooth.sum() < FEWEST_POINTS:
         return _insufficient(measurement, plain, clock)
-    held_points = np.zeros(len(there.cloud.points), dtype=bool)
-    held_points[plain.index] = held_out_blocks(plain.at, Cells.over(plain.at).side_m)
-    state = _State.of(there, plain, *_shapes(there, plain, held_points))
+    state = _State.of(there, plain, held_points, *_shapes(there, plain, held_points))
     clock.lap("changes")
-    named, naming = name_effects(*state.part, state.scale, random)
-    if named:
-        # what moves the beam everywhere hides, or feigns, what it does at edges
-        beside = settled(there.changed(model=with_effects(there.model, [item.entry for item in named])))
-        again = _shapes(beside[0], beside[1], held_points)
-        names, had = ({each.name for each in found} for found in (again[0], state.shapes))
-        # rays that are not quite where they are thought to be look like a low-pass
-        if names != had and ("smoothing" in had or "smoothing" not in names):
-            state = _State.of(there, plain, *again)
-            named, naming = name_effects(*state.part, state.scale, random)
-    residuals, shapes, changed, held_out, chosen = state.residuals, state.shapes, state.changed, state.held_out, state.chosen
-    losses = _missing(there, residuals, state.rough, changed, state.cells.side_m)
+    state, named, naming = _named(there, plain, held_points, state, random)
+    losses = _missing(there, state)
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
-    named = sorted([*named, *map(from_shape, shapes), *lost], key=lambda item: -item.gain)
+    named = sorted([*named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
     clock.lap("naming")
-    tested = np.flatnonzero(residuals.smooth & ~changed & held_out)
-    rows = np.concatenate([chosen, tested[:: max(len(tested) // _MOST_POINTS, 1)]])
-    trained = np.arange(len(rows)) < len(chosen)
-    scored = score_effects(*few(there, residuals, rows), named, trained, naming.reference_sigma)
-    steady = np.flatnonzero(residuals.smooth & ~changed & ~held_out)
-    named = _with_tails(*few(there, residuals, steady[:: max(len(steady) // _MOST_POINTS, 1)]), scored.named, state.cells.side_m)
-    named = with_splits(there, named)
+    named, failed = _confirmed(there, state, named, naming.reference_sigma)
     after = with_effects(measurement.model, [item.entry for item in named])
-    before = pose_of(plain.part(chosen))
+    before = pose_of(plain.part(state.chosen))
     value = plain.value - plain.pose @ before
-    corrected, turned = _corrected(there, after, plain, chosen) if named else (value, before)
-    versions = Version(measurement.model, before), Version(after, turned)
-    scored_on = (residuals.smooth | state.touched) & ~changed & held_out
+    corrected, turned = _corrected(there, after, plain, state.chosen) if named else (value, before)
     if losses and named and named[0].name == lost[0].name and plain.missing is not None:
-        share = np.full(len(losses[1]), float(plain.missing.lost.mean()))
-        gap = measure_losses(plain.missing, share if losses[0].covariate else losses[0].chance, losses[1])
+        gap = _gap_of_losses(plain.missing, *losses)
     else:
-        gap = _gap(there, versions, plain, scored_on, naming.reference_sigma, state.scale, random)
+        versions = Version(measurement.model, before), Version(after, turned)
+        gap = _gap(there, versions, plain, state, naming.reference_sigma, random)
     clock.lap("verification")
     return Diagnosis(
         verdict=_verdict(named),
         effects=tuple(named),
         changes=tuple(state.changes),
-        residuals=replace(plain, smooth=residuals.smooth),
-        held_out=held_out,
+        residuals=replace(plain, smooth=state.residuals.smooth),
+        held_out=state.held_out,
         before=value,
         after=np.where(np.isfinite(corrected), corrected, value),
         pose=surveyed + turned,
         model_after=after,
         gap=gap,
         tried=naming.tried,
-        remaining=_remaining(naming.remaining, scored.failed),
+        remaining=_remaining(naming.remaining, failed),
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,
@@ -164,8 +147,10 @@ class _State:
     chosen: NDArray[np.int64]
 
     @classmethod
-    def of(cls, there: Measurement, plain: Residuals, shapes: list[ShapeFound], touched_points: BoolArray) -> _State:
-        """touched_points: of the measurement."""
+    def of(
+        cls, there: Measurement, plain: Residuals, held_points: BoolArray, shapes: list[ShapeFound], touched_points: BoolArray
+    ) -> _State:
+        """held_points, touched_points: of the measurement."""
         touched = touched_points[plain.index]
         shaped, residuals = _shaped(there, plain, shapes, touched)
         rough, _, scale = registered(residuals)
@@ -173,16 +158,49 @@ class _State:
         changes, changed = find_changes(replace(residuals, value=rough), at_points, residuals.smooth)
         rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
-        held_out = held_out_blocks(residuals.at, cells.side_m)
+        held_out = held_points[residuals.index]
         usable = residuals.smooth & ~changed & (np.abs(rough) < _CLIP * scale * residuals.sigma)
-        chosen = np.flatnonzero(usable & ~held_out)
-        chosen = chosen[:: max(len(chosen) // _MOST_POINTS, 1)]
+        chosen = _thinned(np.flatnonzero(usable & ~held_out))
         return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
 
     @property
     def part(self) -> tuple[Measurement, Residuals]:
         """What selection may look at."""
         return few(self.shaped, self.residuals, self.chosen)
+
+
+def _named(
+    there: Measurement, plain: Residuals, held_points: BoolArray, state: _State, random: KeyedRandom
+) -> tuple[_State, list[Named], Naming]:
+    """What the naming started from in the end, and what it named: the shapes are looked at again with that in the model."""
+    named, naming = name_effects(*state.part, state.scale, random)
+    if named:
+        # what moves the beam everywhere hides, or feigns, what it does at edges
+        model = with_effects(there.model, [item.entry for item in named])
+        beside = settled(there.changed(model=model), plain.index[~held_points[plain.index]])
+        again = _shapes(beside[0], beside[1], held_points)
+        names, had = ({each.name for each in found} for found in (again[0], state.shapes))
+        # rays that are not quite where they are thought to be look like a low-pass
+        if names != had and ("smoothing" in had or "smoothing" not in names):
+            state = _State.of(there, plain, held_points, *again)
+            named, naming = name_effects(*state.part, state.scale, random)
+    return state, named, naming
+
+
+def _confirmed(there: Measurement, state: _State, named: list[Named], reference_sigma: float) -> tuple[list[Named], list[Named]]:
+    """The effects that hold on held-out blocks, with heavy tails and what would split each class; and those that fail there."""
+    fit = state.residuals.smooth & ~state.changed
+    tested = _thinned(np.flatnonzero(fit & state.held_out))
+    rows = np.concatenate([state.chosen, tested])
+    trained = np.arange(len(rows)) < len(state.chosen)
+    scored = score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
+    steady = _thinned(np.flatnonzero(fit & ~state.held_out))
+    tailed = _with_tails(*few(there, state.residuals, steady), scored.named, state.cells.side_m)
+    return with_splits(there, tailed), scored.failed
+
+
+def _thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    return rows[:: max(len(rows) // _MOST_POINTS, 1)]
 
 
 def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> tuple[list[ShapeFound], BoolArray]:
@@ -284,34 +302,39 @@ def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock)
     )  # fmt: skip
 
 
-def _missing(
-    measurement: Measurement, residuals: Residuals, rough: FloatArray, changed: BoolArray, side_m: float
-) -> tuple[MissingFound, BoolArray] | None:
+def _missing(measurement: Measurement, state: _State) -> tuple[MissingFound, BoolArray] | None:
     """The effect on the returns, and the pulses that it was not fitted to."""
+    residuals = state.residuals
     missing = residuals.missing
     if missing is None or any(believes(measurement, name) for name in LOSSES):
         return None
-    held_out = held_out_blocks(missing.at, side_m)
-    early = residuals.smooth & ~changed & (rough < -np.maximum(_EARLY_SIGMAS * residuals.sigma, _EARLY_M))
+    held_out = held_out_blocks(missing.at, state.cells.side_m)
+    early = residuals.smooth & ~state.changed & (state.rough < -np.maximum(_EARLY_SIGMAS * residuals.sigma, _EARLY_M))
     drops = isolated(residuals.at, early)
     found = find_missing(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)
 
 
+def _gap_of_losses(missing: Missing, found: MissingFound, held_out: BoolArray) -> Gap | None:
+    """Where lost returns matter most: the chance of losing each held-out pulse."""
+    share = np.full(len(held_out), float(missing.lost.mean()))
+    return measure_losses(missing, share if found.covariate else found.chance, held_out)
+
+
 def _gap(
     measurement: Measurement,
-    versions: tuple[Version, ...],
-    residuals: Residuals,
-    rows: BoolArray,
+    versions: tuple[Version, Version],
+    plain: Residuals,
+    state: _State,
     reference_sigma: float,
-    scale: float,
     random: KeyedRandom,
 ) -> Gap | None:
-    chosen = np.flatnonzero(rows)
-    if len(chosen) < 100:
+    """On held-out points, where the surface is smooth or an effect was found that shows elsewhere."""
+    rows = np.flatnonzero((state.residuals.smooth | state.touched) & ~state.changed & state.held_out)
+    if len(rows) < 100:
         return None
-    part = residuals.part(chosen[thinned(len(chosen))])
-    return measure_gap(measurement, versions[0], versions[1], part, reference_sigma, _CLIP * scale, random.child("verify"))
+    part = plain.part(rows[thinned(len(rows))])
+    return measure_gap(measurement, *versions, part, reference_sigma, _CLIP * state.scale, random.child("verify"))
 
 
 def _verdict(named: list[Named]) -> str:
