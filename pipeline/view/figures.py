@@ -25,6 +25,10 @@ _POSTS = ((1, 2), (1, 3), (0, 3))
 """A box drawn in one line, bottom and top, and its other three upright edges: indices into (x0, x1, y0, y1, z0, z1)."""
 _FLAT = {"ambient": 0.75, "diffuse": 0.45, "specular": 0.02, "roughness": 0.9, "fresnel": 0.05}
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
+_FROM = np.array([-0.16, -0.1, 1.0])
+"""The direction of the camera: from the front, a little from the left and from below."""
+_FIELD_OF_VIEW, _WIDE, _MARGIN = np.radians(45.0), 1.5, 1.15
+"""Plotly's, up and down; width of the picture over its height, at least on a desktop; what is left around the wall."""
 _FACTS_SHOWN = 6
 _MARKER_PX, _FEW = 4.5, 80
 
@@ -54,13 +58,23 @@ def wall_figure(
             "xaxis": {**axis, "title": "along the wall, m"},
             "yaxis": {**axis, "title": "up the wall, m"},
             "zaxis": {**axis, "title": "towards the sensor, m"},
-            "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": {"x": -0.3, "y": -0.2, "z": 1.85}},
+            "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": _eye(patch)},
         },
         uirevision="camera",
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         showlegend=False,
     )
     return figure
+
+
+def _eye(patch: Patch) -> dict[str, float]:
+    """Where the camera stands to have the whole patch in the picture; 1 is the geometric mean of the patch's extents."""
+    heights = patch.height[np.isfinite(patch.height)]
+    extent = np.array([np.ptp(patch.x), np.ptp(patch.y), np.ptp(heights) if heights.size else 0.0])
+    extent = np.maximum(extent, 1e-3 * extent.max())
+    width, height, depth = extent / np.cbrt(extent.prod())
+    distance = _MARGIN * max(height, width / _WIDE) / (2 * np.tan(_FIELD_OF_VIEW / 2)) + depth / 2
+    return {axis: float(distance * part) for axis, part in zip("xyz", _FROM, strict=True)}
 
 
 def map_figure(

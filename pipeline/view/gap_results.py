@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.formats.laz import read_laz
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.view.results import Item, Layer, Patch, Points, Window, inside
+from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, Points, Window, inside
 from scene.errors import InputError
 from scene.frame import WallFrame
 from scene.mesh import FloatArray
@@ -36,7 +36,9 @@ class GapResults:
         """Raises InputError where a file of the diagnosis is absent or damaged."""
         try:
             self._record = json.loads((folder / "gap.json").read_text(encoding="utf-8"))
-            self.title = f"{folder.name}: {self._record['sensor']}, verdict {self._record['verdict']}"
+            self.title = (
+                f"{folder.name}: {INSTRUMENTS[self._record['sensor']]}, verdict: {self._record['verdict'].replace('_', ' ')}"
+            )
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"is no gap.json ({error!r})", where=str(folder), remedy="run scarpsim gap again") from None
         self._clouds = {step: read_laz(folder / f"{step}.laz") for step in self.steps}

@@ -40,6 +40,9 @@ class Layer:
     limit: float | None = None
 
 
+INSTRUMENTS = {"stereo": "stereo pair", "tls": "laser scanner"}
+
+
 @dataclass(frozen=True)
 class Patch:
     """A raster over a window. x: (w,), y: (h,) centres, m; height: (h, w) m; value: (h, w) in the layer's unit, both NaN without

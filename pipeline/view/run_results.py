@@ -19,7 +19,7 @@ from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.products import epoch_folder
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
-from pipeline.view.results import Item, Layer, Patch, Points, Window, centres, cut, inside
+from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, Points, Window, centres, cut, inside
 from scene.errors import InputError
 from scene.grid import Grid
 
@@ -38,7 +38,7 @@ class RunResults:
         try:
             record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
             self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
-            self.title = f"{folder.name}: {record['sensor']}, {record['wall']['name']}"
+            self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, wall {record['wall']['name']}"
         except (ValueError, KeyError, TypeError) as error:
             problem = f"is not the record of a finished run ({error!r})"
             raise InputError(problem, where=str(folder / "run.json"), remedy="go on with it by simulate --resume") from None

@@ -280,6 +280,26 @@ def open_results_of_nothing() -> Any:
     return Nothing()
 
 
+@pytest.mark.parametrize(("width", "height"), [(24.0, 15.0), (100.0, 30.0), (3.0, 3.0), (5.0, 20.0)])
+def test_the_first_view_holds_the_whole_wall(width: float, height: float) -> None:
+    """Plotly's camera: 45 degrees up and down, at the eye, towards the middle; units in which the extents' product is 1."""
+    x, y = np.linspace(0, width, 9), np.linspace(0, height, 7)
+    relief = np.add.outer(np.sin(y), np.sin(x))
+    patch = Patch(x, y, relief, relief, np.zeros((7, 9), dtype=int), 1)
+    figure = wall_figure(patch, None, [], Layer("difference", "difference", "mm", 10.0), {"surface"})
+    eye = np.array([figure.layout.scene.camera.eye[axis] for axis in "xyz"])
+    extent = np.array([width, height, np.ptp(relief)])
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, 8).T * extent / np.cbrt(extent.prod())
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    seen = corners - eye
+    tangent = np.abs(seen @ np.stack([right, np.cross(right, forward)], axis=1)) / (seen @ forward)[:, None]
+    assert tangent[:, 1].max() < np.tan(np.radians(22.5))
+    assert tangent[:, 0].max() < 1.5 * np.tan(np.radians(22.5))
+    assert tangent.max() > 0.6 * np.tan(np.radians(22.5))  # and is no speck in it
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; the server's answers are tested above")
 def test_a_browser_draws_the_page(address: str, tmp_path: Path) -> None:
     """Headless Chromium without any way out: every script runs, and wall and map are drawn."""
