@@ -38,7 +38,7 @@ class RunResults:
         try:
             record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
             self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
-            self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, wall {record['wall']['name']}"
+            self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
         except (ValueError, KeyError, TypeError) as error:
             problem = f"is not the record of a finished run ({error!r})"
             raise InputError(problem, where=str(folder / "run.json"), remedy="go on with it by simulate --resume") from None
