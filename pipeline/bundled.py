@@ -30,3 +30,23 @@ def bundled_config(kind: str, name: str) -> Path:
     raise InputError(
         f"there is no '{name}'", where=f"configs/{kind}".rstrip("/"), allowed=", ".join(known), remedy=nearest(name, known)
     )
+
+
+def config_path(kind: str, given: Path) -> Path:
+    """`given` itself or, where nothing is there, the bundled config that it names: `glendale`, or by its path in a checkout,
+    `configs/sites/glendale.yaml`, which an installed wheel has elsewhere.
+
+    Raises InputError with the nearest name where a bare word is neither a file nor a bundled config of `kind`.
+    """
+    if given.exists():
+        return given
+    if given.parts[:1] == ("configs",):
+        bundled = configs_folder().joinpath(*given.parts[1:])
+        return bundled if bundled.is_file() else given
+    if given.suffix or len(given.parts) > 1:
+        return given
+    try:
+        return bundled_config(kind, given.name)
+    except InputError as error:
+        what = "is no file, and no bundled config has that name"
+        raise InputError(what, where=str(given), allowed=error.allowed, remedy=error.remedy) from None

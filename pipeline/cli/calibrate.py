@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.bundled import bundled_config
+    from pipeline.bundled import bundled_config, config_path
     from pipeline.cli.simulate import new_folder
     from pipeline.config import load_config
     from pipeline.noise.calibrate import calibrate
@@ -45,7 +45,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.progress import shown_progress
     from pipeline.report.calibration import summary
 
-    path = arguments.config or config_of(arguments.measured) or bundled_config("", "demo")
+    given = config_path("sites", arguments.config) if arguments.config else config_of(arguments.measured)
+    path = given or bundled_config("", "demo")
     config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)
     sensor = arguments.sensor or sensor_of(arguments.measured, config)
     with shown_progress(quiet=arguments.quiet) as progress:

@@ -56,11 +56,12 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def _make(arguments: argparse.Namespace, path: Path) -> Answer:
     out = _out(arguments)
+    from pipeline.bundled import config_path
     from pipeline.dataset.config import load_dataset_config
     from pipeline.dataset.run import Workers, make_dataset
     from pipeline.progress import shown_progress
 
-    config = load_dataset_config(path, arguments.overrides, arguments.seed)
+    config = load_dataset_config(config_path("datasets", path), arguments.overrides, arguments.seed)
     arguments.kept = f"what was finished is in {out} and usable; the same command goes on"
     workers = Workers(arguments.workers or 0, arguments.scheduler or "")
     with shown_progress(quiet=arguments.quiet) as progress:

@@ -15,7 +15,9 @@ EXAMPLE = """  scarpsim icp-study runs/my_site
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", type=Path, metavar="RUN|CONFIG", help="folder of a run, or a config file to simulate")
+    parser.add_argument(
+        "source", type=Path, metavar="RUN|CONFIG", help="folder of a run, or a config file or bundled site to simulate"
+    )
     parser.add_argument("--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="of a config (default: its first)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument("--epochs", type=at_least(1), default=1, metavar="N", help="epochs to register (default: 1)")
@@ -31,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.bundled import config_path
     from pipeline.cli.simulate import new_folder
     from pipeline.config import load_config
     from pipeline.formats.atomic import empty_folder
@@ -48,7 +51,7 @@ def run(arguments: argparse.Namespace) -> Answer:
             config, sensor, surfaces = surfaces_of_run(arguments.source)
             surfaces = surfaces[: arguments.epochs + 1]
         else:
-            config = load_config(arguments.source, arguments.overrides, arguments.sensor, arguments.seed)
+            config = load_config(config_path("sites", arguments.source), arguments.overrides, arguments.sensor, arguments.seed)
             sensor = arguments.sensor or config.sensor_names()[0]
             surfaces = simulated_surfaces(config, sensor, arguments.epochs, progress)
         settings = {"offset_m": arguments.offset_m, "repeats": arguments.repeats}

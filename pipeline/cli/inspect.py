@@ -14,7 +14,12 @@ EXAMPLE = """  scarpsim inspect my_site.yaml
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="config file, as `scarpsim init` writes it")
+    parser.add_argument(
+        "config",
+        type=Path,
+        metavar="CONFIG",
+        help="config file, as `scarpsim init` writes it, or a bundled site, such as glendale",
+    )
     parser.add_argument(
         "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="the one to inspect (default: those of the config)"
     )
@@ -27,12 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.bundled import config_path
     from pipeline.cli.simulate import new_folder
     from pipeline.config import load_config
     from pipeline.planning.inspect import PLAN_FILE, inspect, write_plans
     from pipeline.report.plan import summary
 
-    config = load_config(arguments.config, arguments.overrides, arguments.sensor, arguments.seed)
+    config = load_config(config_path("sites", arguments.config), arguments.overrides, arguments.sensor, arguments.seed)
     sensors = [arguments.sensor] if arguments.sensor else config.sensor_names()
     plans = inspect(config, sensors)
     report = write_plans(arguments.out or new_folder(Path("runs"), "inspect"), config, plans)

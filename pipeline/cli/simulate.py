@@ -22,7 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sensor", required=True, type=one_of("stereo", "tls"), metavar="stereo|tls", help="what observes the wall"
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="config file (default: the bundled demo.yaml)")
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="config file, or a bundled site (default: the bundled demo.yaml)"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random numbers (default: the config's)")
     parser.add_argument(
@@ -42,11 +44,12 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.threads:
         _use_threads(arguments.threads)
     from pipeline import run as pipeline_run
-    from pipeline.bundled import bundled_config
+    from pipeline.bundled import bundled_config, config_path
     from pipeline.config import load_config
     from pipeline.progress import shown_progress
 
-    config = load_config(arguments.config or bundled_config("", "demo"), arguments.overrides, arguments.sensor, arguments.seed)
+    path = config_path("sites", arguments.config) if arguments.config else bundled_config("", "demo")
+    config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)
     arguments.kept = f"what was finished is in {out} and usable; go on with --resume --out {out}"
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = pipeline_run.simulate(config, arguments.sensor, out, resume=arguments.resume, progress=progress)

@@ -32,14 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.bundled import bundled_config
+    from pipeline.bundled import bundled_config, config_path
     from pipeline.detect.config import load_train_config
     from pipeline.detect.data import CocoFolder
     from pipeline.detect.keras_backend import keras_ready
     from pipeline.progress import shown_progress
 
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
-    config = load_train_config(arguments.config or bundled_config("detectors", "light"), overrides)
+    path = config_path("detectors", arguments.config) if arguments.config else bundled_config("detectors", "light")
+    config = load_train_config(path, overrides)
     for split in ("train", "val"):
         CocoFolder(arguments.data_set / split)  # a mistake there should not wait for TensorFlow
     keras_ready()

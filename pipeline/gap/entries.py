@@ -31,6 +31,8 @@ PLANES = {"tls": ("azimuth", "zenith"), "stereo": ("image_x", "image_y")}
 """The two covariates by sensor that an error may depend on together."""
 _NODES, _GRID, _MOST_POINTS = 65, 17, 20_000
 """Of the curve of an empirical term, and of each side of a surface."""
+_WEAKEST = 20
+"""Spacings of the weakest powers that tell how near they come to a limit."""
 _BEYOND = 100.0
 """Times its typical size, an effect explains nothing: no instrument is so far out."""
 
@@ -134,8 +136,10 @@ def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:
     parameters, std = dict(found.parameters), dict(found.std)
     kind = "empirical" if found.covariate else "physical"
     if found.name == "detection_limit" and intensity is not None:
-        low = np.sort(intensity)[: max(len(intensity) // 200, 2)]
-        parameters["minimum_power"], std["minimum_power"] = float(low[0]), float(low[1] - low[0])
+        # above a limit the weakest powers lie about as far apart as the weakest lies above it
+        low = np.sort(intensity)[: _WEAKEST + 1]
+        gap = float(low[-1] - low[0]) / (len(low) - 1)
+        parameters["minimum_power"], std["minimum_power"] = float(low[0]) - gap, gap
     p_value = max(float(np.exp(-found.score)), 1 / 2000)
     return Named(f"tls.{found.name}", kind, {"name": found.name, **parameters}, std, (), p_value, found.gain)
 

@@ -27,6 +27,8 @@ _SHAPE = 1.5
 _MOST_BLUR = 0.35
 _MULTIPLES = np.arange(1, 5)
 _SMALLEST_P = 1e-4
+_ALIKE = 6.0
+"""Difference of chi^2 within which two amplitudes fit alike."""
 _MOST_POINTS = 60_000
 
 
@@ -83,7 +85,11 @@ def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
     shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, _MOST_BLUR, 60)
     for width in (0.01, 0.002):
         coarse = square(shares, blurs)
-        row, column = np.unravel_index(int(np.argmin(coarse)), coarse.shape)
+        profile = coarse.min(axis=1)
+        # Bessel functions come back to the same values: of amplitudes that fit alike the least is meant
+        lowest = (profile <= np.append(profile[1:], np.inf)) & (profile <= np.append(np.inf, profile[:-1]))
+        row = int(np.flatnonzero(lowest & (profile < profile.min() + _ALIKE))[0])
+        column = int(np.argmin(coarse[row]))
         shares = shares[row] + np.linspace(-width, width, 81)
         blurs = np.maximum(blurs[column] + np.linspace(-width, width, 41), 0.0)
     best = float(square(shares, blurs).min())

@@ -11,7 +11,7 @@ every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each can
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -206,9 +206,20 @@ class _Normal:
 
 
 def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> Fit:
-    """All columns fitted to one value, at the most likely of the covariances. precision: (k, k) as in `_Normal.at`."""
+    """All columns fitted to one value, at the most likely of the covariances. precision: (k, k) as in `_Normal.at`.
+
+    The likelihood is that of what the columns leave (REML, Patterson & Thompson 1971), and the coefficients' covariance is a mean
+    over all covariances by it, with what they differ: which of them is true is not known.
+    """
     normal = _Normal.of(columns, value)
-    return max((normal.at(each, precision) for each in covariances), key=lambda fit: fit.log_likelihood)
+    fits = [normal.at(each, precision) for each in covariances]
+    likelihood = np.array([fit.log_likelihood + 0.5 * np.linalg.slogdet(fit.covariance)[1] for fit in fits])
+    best = fits[int(np.argmax(likelihood))]
+    weights = np.exp(likelihood - likelihood.max())
+    weights /= weights.sum()
+    moves = np.stack([fit.coefficients - best.coefficients for fit in fits])
+    covariance = np.einsum("f,fij->ij", weights, np.stack([fit.covariance for fit in fits]))
+    return replace(best, covariance=covariance + np.einsum("f,fi,fj->ij", weights, moves, moves))
 
 
 def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> Fit:

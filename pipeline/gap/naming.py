@@ -116,13 +116,18 @@ def name_effects(
     families = [each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out]
     spread = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random)
     first = MeanSearch(_weighed(part, spread, scale), families, random)
-    chosen, tried = first.select()
-    estimates, last, at, beside = _estimates(first, chosen), first, part, chosen
-    physical = [each for each in estimates if not each.candidate.empirical]
-    beyond = _beyond(measurement, estimates, at)
-    if physical and not beyond:
-        last, at, estimates, beside, tried = _again(measurement, part, families, physical, spread, (scale, added), random)
+    together, tried = first.select()
+    # slopes miss some of a large effect, and two others then make up for it: see first what one alone, taken exactly, leaves
+    single = [[first.alone()]] if sum(not each.candidate.empirical for each in together) > 1 else []
+    for chosen in (*single, together):
+        estimates, last, at, beside = _estimates(first, chosen), first, part, chosen
+        physical = [each for each in estimates if not each.candidate.empirical]
         beyond = _beyond(measurement, estimates, at)
+        if physical and not beyond:
+            last, at, estimates, beside, tried = _again(measurement, part, families, physical, spread, (scale, added), random)
+            if not beside:
+                break
+            beyond = _beyond(measurement, estimates, at)
     if beyond:
         return name_effects(measurement, whole, whole_scale, random, left_out | beyond)
     if chosen:

@@ -275,6 +275,11 @@ class MeanSearch:
             return chosen, self.tried(members)
         return [self._chosen(best, item) for item in best.members], best.tried
 
+    def alone(self) -> Chosen:
+        """The effect of the catalogue that explains most by itself."""
+        best = next(item for item in self.tried(()) if not item.empirical)
+        return self._chosen(_Set((best,), best.score, ()), best)
+
     def _may_be_the_reference(self, members: tuple[Tried, ...], form: Tried) -> bool:
         """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave."""
         if form.candidate.form != "wave":

@@ -38,6 +38,8 @@ FEWEST_POINTS = 800
 _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
 _CLIP = 5.0
+_LEFT_OVER = 0.02
+"""Of the gain of an empirical term on the mean, what a spread gains that is only the part of the form that the term misses."""
 _EARLY_SIGMAS, _EARLY_M = 8.0, 0.5
 _NOT_FREE = {"tls": ("edge_step", "line"), "stereo": ("edge_step", "incidence")}
 """Covariates by sensor that an empirical term cannot be a function of."""
@@ -95,7 +97,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
     named = sorted([*named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
     clock.lap("naming")
-    named, failed = _confirmed(there, state, named, naming.reference_sigma)
+    named, dropped = _confirmed(there, state, named, naming.reference_sigma)
     after = with_effects(measurement.model, [item.entry for item in named])
     before = pose_of(plain.part(state.chosen))
     value = plain.value - plain.pose @ before
@@ -118,7 +120,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         model_after=after,
         gap=gap,
         tried=naming.tried,
-        remaining=_remaining(naming.remaining, failed),
+        remaining={**naming.remaining, "note": "; ".join(each for each in (naming.remaining["note"], *dropped) if each)},
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,
@@ -187,16 +189,20 @@ def _named(
     return state, named, naming
 
 
-def _confirmed(there: Measurement, state: _State, named: list[Named], reference_sigma: float) -> tuple[list[Named], list[Named]]:
-    """The effects that hold on held-out blocks, with heavy tails and what would split each class; and those that fail there."""
+def _confirmed(there: Measurement, state: _State, named: list[Named], reference_sigma: float) -> tuple[list[Named], list[str]]:
+    """The effects that hold on held-out blocks, with heavy tails and what would split each class; and words for the others."""
     fit = state.residuals.smooth & ~state.changed
     tested = _thinned(np.flatnonzero(fit & state.held_out))
     rows = np.concatenate([state.chosen, tested])
     trained = np.arange(len(rows)) < len(state.chosen)
     scored = score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
+    words = [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
+    described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
+    left = [item for item in scored.named if _is_spread(item) and item.gain < _LEFT_OVER * max(described, default=0.0)]
+    words += [f"{item.name} dropped: so much is left over by the empirical term" for item in left]
     steady = _thinned(np.flatnonzero(fit & ~state.held_out))
-    tailed = _with_tails(*few(there, state.residuals, steady), scored.named, state.cells.side_m)
-    return with_splits(there, tailed), scored.failed
+    kept = [item for item in scored.named if item not in left]
+    return with_splits(there, _with_tails(*few(there, state.residuals, steady), kept, state.cells.side_m)), words
 
 
 def _thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -254,8 +260,12 @@ def _with_tails(measurement: Measurement, residuals: Residuals, named: list[Name
     tails = find_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
     if tails is None:
         return named
-    kept = [item for item in named if item.name.partition(".")[2] not in SPREADS]
+    kept = [item for item in named if not _is_spread(item)]
     return [*kept, from_tails(part.sensor, tails * float(np.median(part.sigma)), len(part))]
+
+
+def _is_spread(item: Named) -> bool:
+    return item.name.partition(".")[2] in SPREADS
 
 
 def _corrected(
@@ -269,11 +279,6 @@ def _corrected(
     value = np.full(len(measurement.cloud.points), np.nan)
     value[found.index] = found.value - found.pose @ rest
     return np.asarray(value[residuals.index]), there + rest
-
-
-def _remaining(remaining: dict[str, Any], failed: list[Named]) -> dict[str, Any]:
-    words = [f"{item.name} dropped: it does not hold on blocks that were held out" for item in failed]
-    return {**remaining, "note": "; ".join(each for each in (remaining["note"], *words) if each)}
 
 
 class _Clock:

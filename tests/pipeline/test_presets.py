@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from pipeline.bundled import configs_folder
+from pipeline.bundled import config_path, configs_folder
 from pipeline.config import SimulationConfig, load_config
 from pipeline.presets import read_preset
 from scene.config import parse
@@ -180,3 +180,18 @@ def test_the_fitted_matchers_are_sensor_models_with_heavy_tails(name: str, locks
     model = load_config(configs_folder() / "demo.yaml", [f"sensor={name}"], "stereo", None).stereo_model()
     effects = {effect.name for effect in model.effects if not effect.is_null}
     assert effects == {"smoothing", "heavy_tailed_noise"} | ({"pixel_locking"} if locks else set())
+
+
+def test_a_bundled_config_is_found_by_its_name_and_by_its_path_in_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    bundled = configs_folder() / "sites" / "glendale.yaml"
+    assert config_path("sites", Path("glendale")) == bundled
+    assert config_path("sites", Path("configs/sites/glendale.yaml")) == bundled
+    assert config_path("datasets", Path("small")) == configs_folder() / "datasets" / "small.yaml"
+    Path("glendale").write_text("seed: 1\n")  # one's own goes before
+    for own in ("glendale", "mine.yaml", "configs/sites/none.yaml", "folder/glendale"):
+        assert config_path("sites", Path(own)) == Path(own)
+    with pytest.raises(InputError, match=r"glendal: is no file, and no bundled .* did you mean 'glendale'"):
+        config_path("sites", Path("glendal"))
