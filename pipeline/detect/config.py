@@ -57,6 +57,9 @@ class HeadConfig(Config):
     hidden_units: int = Field(256, ge=1, description="units of the two dense layers of the box head")
     detections: int = Field(150, ge=1, description="most blocks found in one image")
     suppression_iou: float = Field(0.4, gt=0, le=1, description="of two detections that overlap more the better one stays")
+    score_shift: float = Field(
+        0.0, description="added to the log odds of a block; `scarpsim train` sets it so that a score of 0.95 finds blocks best"
+    )
 
 
 class DetectorConfig(Config):

@@ -115,7 +115,8 @@ class MaskRCNN(keras.Model):
         config = self.config.head
         classes, codes = self._on_boxes(levels, proposals, False)
         real = proposals[..., 2] > proposals[..., 0]
-        scores, order = ops.top_k(ops.where(real, ops.softmax(classes)[..., 1], -1.0), proposals.shape[1])
+        odds = classes[..., 1] - classes[..., 0] + config.score_shift
+        scores, order = ops.top_k(ops.where(real, ops.sigmoid(odds), -1.0), proposals.shape[1])
         boxes = clip(decode(codes, proposals), self.size, self.size)
         boxes = ops.take_along_axis(ops.where(real[..., None], boxes, 0.0), order[..., None], axis=1)
         boxes, scores = suppressed(boxes, scores, config.suppression_iou, config.detections)

@@ -15,6 +15,7 @@ from pipeline.detect.config import TrainConfig
 from pipeline.detect.data import CocoFolder, batches
 from pipeline.detect.figures import write_loss_figure
 from pipeline.detect.model import LOSSES, MaskRCNN, total_loss
+from pipeline.detect.operating_point import set_operating_point
 from pipeline.detect.schedule import has_settled, learning_rate
 from pipeline.formats.atomic import write_json, writing
 from pipeline.progress import Progress
@@ -40,6 +41,8 @@ class History:
 def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = False, progress: Progress | None = None) -> History:
     """Train a detector on DATA_SET/train, validate on DATA_SET/val; the best and the last go to out/best and out/checkpoint.
 
+    At the end the best one's scores are shifted as `set_operating_point` says.
+
     With `resume` it goes on after the last whole epoch in `out`, to the same losses as without the interruption. Raises
     InputError for a data set without these folders and for an `out` that holds another training.
     """
@@ -52,7 +55,8 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     history = _begun(out, config, model, resume=resume)
     steps = -(-len(folders[0]) // training.batch)
     logged = _EventLog(out / "events")
-    progress.plan({f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)})
+    epochs = {f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)}
+    progress.plan({**epochs, "scores": 0.3})
     for epoch in range(len(history.training), training.epochs):
         if has_settled(history.total, training):
             break
@@ -62,6 +66,8 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
         logged.add(epoch, history)
         _save(out, config, model, history)
         write_loss_figure(history.training, history.validation, out / "losses.png")
+    with progress.stage("scores"):
+        set_operating_point(out / BEST, folders[1])
     return history
 
 

@@ -16,8 +16,10 @@ from pipeline.detect import weights
 from pipeline.detect.backbone import feature_pyramid
 from pipeline.detect.config import DetectorConfig, HeadConfig, TrainConfig, TrainingConfig, load_train_config
 from pipeline.detect.data import CocoFolder, network_input, window
+from pipeline.detect.evaluate import evaluate
 from pipeline.detect.inference import detect
 from pipeline.detect.model import LOSSES, MaskRCNN
+from pipeline.detect.operating_point import CONFIDENCE, set_operating_point
 from pipeline.detect.training import train
 from pipeline.formats.geotiff import write_geotiff
 from scene.errors import InputError
@@ -93,8 +95,9 @@ def eager():
 
 
 @pytest.mark.slow
-def test_two_tiles_are_learned_by_heart(data_set):
-    """Every block of both tiles is found with a mask that overlaps it by more than 0.9, and nothing else."""
+def test_two_tiles_are_learned_by_heart(data_set, tmp_path):
+    """Every block of both tiles is found with a mask that overlaps it by more than 0.9, and nothing else; also from a score of
+    0.95 on, once the scores of a network that is made too modest are shifted."""
     folder, model = CocoFolder(data_set / "train"), _compiled()
     batch = _batch(data_set / "train")
     for step in range(220):
@@ -112,6 +115,20 @@ def test_two_tiles_are_learned_by_heart(data_set):
                 mask[item.row : item.row + item.mask.shape[0], item.column : item.column + item.mask.shape[1]] = item.mask
                 best = max(best, float((mask & wanted).sum() / (mask | wanted).sum()))
             assert best > 0.9
+    folder.images = folder.images[:2]
+    folder.annotations = [each for each in folder.annotations if each["image_id"] <= 2]
+    modest = SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"score_shift": -4.0})})
+    weights.save(model, tmp_path)
+    weights.save_config(modest, tmp_path)
+    assert set_operating_point(tmp_path, folder) > -4
+    shifted = weights.load(tmp_path)
+    found = [
+        each.annotation(1, image["id"], (SIDE, SIDE))
+        for index, image in enumerate(folder.images)
+        for each in detect(shifted, folder.labelled(index).difference, CONFIDENCE)
+    ]
+    (score,) = evaluate({"images": folder.images, "annotations": folder.annotations}, found, None, (CONFIDENCE,), (0.75,))
+    assert score.f1 == 1
 
 
 def test_a_training_step_is_deterministic(data_set, eager):
