@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.gap.entries import Named
+from pipeline.gap.entries import SPREADS, Named
 from pipeline.gap.missing import LOSSES
 from pipeline.gap.selection import Tried
+from pipeline.gap.spread import SpreadTried
 from pipeline.gap.verify import Gap
 from pipeline.gap.workflow import Diagnosis
 
@@ -22,6 +23,20 @@ VERDICTS = {
 _INSTRUMENTS = {"tls": "ranges of a laser scan", "stereo": "disparities of a stereo pair"}
 _STATISTICS = {"mean": "mean", "spread": "spread", "shape": "outliers", "missing": "lost returns"}
 _CLEAR = 0.01
+
+
+def title(found: Diagnosis) -> str:
+    """The outcome in a few words."""
+    names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
+    match found.verdict:
+        case "no_gap":
+            return "No effect is missing"
+        case "insufficient_data":
+            return "Too few data to say what is missing"
+        case "unknown":
+            return "Missing: something that is not in the catalogue" + (f", and {listed(names)}" if names else "")
+        case _:
+            return f"Missing: {listed(names)}"
 
 
 def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
@@ -55,6 +70,19 @@ def outcome(found: Diagnosis, tried: Sequence[Tried], item: Tried) -> str:
     if any(effect.name == name for effect in found.effects):
         return "named"
     alike = {other for effect in found.effects for other in effect.alike}
+    return "cannot be told from the named one" if name in alike else "rejected"
+
+
+def spread_outcome(found: Diagnosis, item: SpreadTried) -> str:
+    """What became of one of the explanations of the spread."""
+    name = f"{found.residuals.sensor}.{item.name}"
+    if item.empirical:
+        added = any(effect.kind == "empirical" and effect.name.partition(".")[2] in SPREADS for effect in found.effects)
+        return "added as empirical" if added else "rejected"
+    physical = [effect for effect in found.effects if effect.kind == "physical"]
+    if any(effect.name == name for effect in physical):
+        return "named"
+    alike = {other for effect in physical for other in effect.alike}
     return "cannot be told from the named one" if name in alike else "rejected"
 
 

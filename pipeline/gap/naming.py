@@ -28,7 +28,7 @@ from pipeline.gap.quantization import find_comb
 from pipeline.gap.registration import registered, settled
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Chosen, MeanSearch, Tried, precision_of
-from pipeline.gap.spread import SpreadFound, find_spread
+from pipeline.gap.spread import SpreadFound, SpreadTried, find_spread
 from pipeline.gap.stereo_noise import told_apart
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -43,9 +43,11 @@ _PERIODIC = {"range_cyclic": "range", "row_jitter": "image_y"}
 
 @dataclass(frozen=True)
 class Naming:
-    """What the selection leaves beside the effects: what was tried, what remains, and the standard deviation of the reference."""
+    """What the selection leaves beside the effects: what was tried for the mean and for the spread, what remains, and the
+    standard deviation of the reference."""
 
     tried: tuple[Tried, ...]
+    spread_tried: tuple[SpreadTried, ...]
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
     reference_sigma: float
@@ -114,7 +116,7 @@ def name_effects(
         left_out |= {("pixel_locking", False)}
     part = _noisier(part, added)
     families = [each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out]
-    spread = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random)
+    spread, spread_tried = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random)
     first = MeanSearch(_weighed(part, spread, scale), families, random)
     together, tried = first.select()
     # slopes miss some of a large effect, and two others then make up for it: see first what one alone, taken exactly, leaves
@@ -131,21 +133,23 @@ def name_effects(
     if beyond:
         return name_effects(measurement, whole, whole_scale, random, left_out | beyond)
     if chosen:
-        spread = _spread(measurement, at, last.cells, last.without(beside), random)
+        spread, spread_tried = _spread(measurement, at, last.cells, last.without(beside), random)
     named += [from_mean(each, at) for each in estimates]
     named += [from_spread(each, part.sensor) for each in spread]
     names, cosines, survival = first.identifiability()
     remaining = {"p_value": last.p_value(tried[0].score) if tried else 1.0, "note": "; ".join([*part.notes, *_words(left_out)])}
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     shown = tuple(item for item in (chosen[0].tried if chosen else tried) if not item.name.startswith(PLACE))
-    return named, Naming(shown, remaining, table, last.reference_sigma(beside))
+    return named, Naming(shown, tuple(spread_tried), remaining, table, last.reference_sigma(beside))
 
 
-def _spread(measurement: Measurement, part: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> list[SpreadFound]:
-    """Effects on the spread of residuals (n,) without the mean effects found."""
-    found = find_spread(part, cells, value, random)
+def _spread(
+    measurement: Measurement, part: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom
+) -> tuple[list[SpreadFound], list[SpreadTried]]:
+    """Effects on the spread of residuals (n,) without the mean effects found, and what was tried."""
+    found, tried = find_spread(part, cells, value, random)
     model = measurement.model
-    return told_apart(found, part, value, model) if found and isinstance(model, StereoModel) else found
+    return (told_apart(found, part, value, model) if found and isinstance(model, StereoModel) else found), tried
 
 
 def _beyond(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:

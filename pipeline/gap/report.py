@@ -11,7 +11,7 @@ import yaml
 from pipeline.formats.atomic import write_json, write_text, writing
 from pipeline.formats.laz import write_laz
 from pipeline.gap.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
-from pipeline.gap.in_words import VERDICTS, outcome, paragraph, values
+from pipeline.gap.in_words import VERDICTS, outcome, paragraph, spread_outcome, title, values
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.where import where
 from pipeline.gap.workflow import Diagnosis
@@ -89,11 +89,13 @@ def _page(found: Diagnosis, pictures: dict[str, bytes]) -> str:
     after = found.model_after.model_dump(mode="json")
     return template("gap.html.jinja").render(
         found=found,
+        title=title(found),
         paragraph=paragraph(found, rows),
         pictures=pictures,
         where=rows,
         tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
         more=max(len(tried) - _MOST_TRIED, 0),
+        spread_tried=[(item, spread_outcome(found, item)) for item in found.spread_tried],
         added=_yaml({"effects": [effect.entry for effect in found.effects]}),
         model=_yaml(after),
         slowest=sum(found.timings.values()),

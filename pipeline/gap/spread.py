@@ -76,7 +76,16 @@ class SpreadFound:
     std: dict[str, float]
     empirical: bool
     variance: FloatArray
-    tried: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class SpreadTried:
+    """What one form of the spread gains in log-likelihood over the model; score: less what it costs; empirical: of no effect."""
+
+    name: str
+    gain: float
+    score: float
+    empirical: bool = False
 
 
 def standardised(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
@@ -128,8 +137,13 @@ def stereo_candidates(residuals: Residuals) -> list[SpreadCandidate]:
     return [SpreadCandidate("parallax_noise", np.ones((len(residuals), 1)), 1.0, ("sigma_px",))]
 
 
-def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> list[SpreadFound]:
-    """The effects that the spread asks for, at most two. value: (n,) residuals without the mean effects found."""
+def find_spread(
+    residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom
+) -> tuple[list[SpreadFound], list[SpreadTried]]:
+    """The effects that the spread asks for, at most two, and all that were tried, best first.
+
+    value: (n,) residuals without the mean effects found.
+    """
     z = standardised(residuals, cells, value)
     kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, nmad(z, 0.0)))
     squared = z[kept] ** 2
@@ -140,8 +154,10 @@ def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: K
     excess = float(np.mean(best.added(forms)))
     block = block_numbers(residuals.at[kept], cells.side_m)
     p_value = _p_value(squared, [form.sum(axis=1) for form in forms], block, random)
+    tried = [SpreadTried(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
+    tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     if best.gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
-        return []
+        return [], tried
     pairs = [
         _Joint.fitted(squared, forms, [first, second], candidates)
         for first, second in combinations(range(len(forms)), 2)
@@ -156,7 +172,7 @@ def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: K
     empirical = free_score > chosen.score + _FREE_MARGIN and _blocks_prefer(squared, chosen.added(forms), free, block)
     if empirical:
         chosen = best
-    tried = tuple(sorted(((c.name, fit.score) for c, fit in zip(candidates, singles, strict=True)), key=lambda item: -item[1]))
+    tried = sorted([*tried, SpreadTried(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
     found = []
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
@@ -180,10 +196,18 @@ def find_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: K
                 std,
                 empirical,
                 candidate.variance @ theta,
-                tried,
             )
         )
-    return found
+    return found, tried
+
+
+def _best_variants(tried: list[SpreadTried]) -> list[SpreadTried]:
+    """One of each name: of an effect with variants the one that scores most."""
+    best: dict[str, SpreadTried] = {}
+    for item in tried:
+        if item.name not in best or item.score > best[item.name].score:
+            best[item.name] = item
+    return list(best.values())
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from pipeline.gap.residuals import BoolArray, Missing, Residuals
 from pipeline.gap.selection import Tried
 from pipeline.gap.shapes import ShapeFound
 from pipeline.gap.splitting import with_splits
-from pipeline.gap.spread import find_tails
+from pipeline.gap.spread import SpreadTried, find_tails
 from pipeline.gap.stereo_shapes import find_shapes
 from pipeline.gap.tls_residuals import missing_returns, with_order
 from pipeline.gap.verify import Gap, Version, measure_gap, measure_losses, thinned
@@ -64,6 +64,7 @@ class Diagnosis:
     model_after: TlsModel | StereoModel
     gap: Gap | None
     tried: tuple[Tried, ...]
+    spread_tried: tuple[SpreadTried, ...]
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
     seconds: float
@@ -120,6 +121,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         model_after=after,
         gap=gap,
         tried=naming.tried,
+        spread_tried=naming.spread_tried,
         remaining={**naming.remaining, "note": "; ".join(each for each in (naming.remaining["note"], *dropped) if each)},
         identifiability=naming.identifiability,
         seconds=clock.total,
@@ -303,7 +305,7 @@ def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock)
     empty = np.zeros(len(residuals))
     return Diagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, np.zeros(6), measurement.model,
-        None, (), {"p_value": 1.0, "note": note}, {"names": [], "cosines": [], "survival": []}, clock.total, clock.laps,
+        None, (), (), {"p_value": 1.0, "note": note}, {"names": [], "cosines": [], "survival": []}, clock.total, clock.laps,
     )  # fmt: skip
 
 

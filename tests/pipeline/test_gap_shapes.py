@@ -95,7 +95,7 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
     there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
     part = residuals.part(residuals.smooth)
     value = registered(part)[0]
-    spread = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    spread, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     (found,) = told_apart(spread, part, value, there.model)
     assert found.name == kind
