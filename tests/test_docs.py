@@ -23,13 +23,14 @@ FEW_POINTS = [
     *("--set", "depth_map=low", "--set", "difference.gsd_m=0.05"),
 ]
 FEW_BLOCKS = ["--set", "rockfall.count=3"]
+COARSE_PLAN = ["--set", "planning.gsd_m=0.2"]
 SMALL_SET = (
     "[wall.width_m=9,wall.height_m=5,wall.resolution_m=0.1,cameras.distance_m=20,cameras.base_m=5,depth_map=low,station.distance_m=20,"
     "scanner.azimuth_step_rad=0.004,scanner.zenith_step_rad=0.004,difference.gsd_m=0.05]"
 )
 FURTHER = {
     "own_site": {
-        "scarpsim inspect": FEW_POINTS,
+        "scarpsim inspect": [*FEW_POINTS, *COARSE_PLAN],
         "simulate": [*FEW_POINTS, *FEW_BLOCKS, "--set", "epochs=1"],
     },
     "training_set": {
@@ -40,7 +41,7 @@ FURTHER = {
     },
     "compare_sensors": {
         "scarpsim compare": [*SMALL_WALL, *FEW_POINTS, "--epochs", "2", "--sizes-m", "0.3", "0.6"],
-        "scarpsim inspect": [*SMALL_WALL, *FEW_POINTS],
+        "scarpsim inspect": [*SMALL_WALL, *FEW_POINTS, *COARSE_PLAN],
     },
     "calibrate": {
         "simulate": [*SMALL_WALL, *FEW_POINTS, *FEW_BLOCKS],
@@ -51,14 +52,14 @@ FURTHER = {
             "--no-greedy",
         ],
     },
-    "missing_effect": {},
+    "missing_effect": {"simulate": [*SMALL_WALL, *FEW_POINTS, *FEW_BLOCKS]},
 }
 """What is added to the pages' commands, so that they are done in seconds."""
 
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     """Links, anchors, pages missing from the navigation: `strict` makes each of them an error. Nothing is fetched."""
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "SIGNATURE_WIDTH": "100000"}  # no formatter for each signature
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
     built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr

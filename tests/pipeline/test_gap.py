@@ -15,9 +15,10 @@ from gap_cases import Scan, write_scan
 from pipeline.cli.main import main
 from pipeline.gap.in_words import paragraph
 from pipeline.gap.measurement import read_measurement
-from pipeline.gap.report import summary
+from pipeline.gap.report import summary, to_dict
 from pipeline.gap.where import where
 from pipeline.gap.workflow import STEPS, Diagnosis, diagnose
+from scene.backend import dr
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,11 +52,13 @@ def test_a_rockfall_is_a_change_of_the_scene(tmp_path: Path) -> None:
     assert 0.2 < change.volume_m3 < 1.2  # 1.2 x 1.2 x 0.4 m
 
 
-def test_a_wobble_is_named_with_its_values_and_closes_the_gap(tmp_path: Path) -> None:
-    def angles(azimuth: Any, zenith: Any, line: Any) -> Any:
-        return 0 * azimuth, 8e-5 * np.sin(2 * np.pi * line / 37 + 1)
+def wobbling(azimuth: Any, _zenith: Any, line: Any) -> Any:
+    """Recorded minus true angles: 80 microradians in zenith, every 37 lines."""
+    return 0 * azimuth, 8e-5 * np.sin(2 * np.pi * line / 37 + 1)
 
-    found = found_in(tmp_path, 11, angles=angles)
+
+def test_a_wobble_is_named_with_its_values_and_closes_the_gap(tmp_path: Path) -> None:
+    found = found_in(tmp_path, 11, angles=wobbling)
     (effect,) = found.effects
     assert (found.verdict, effect.name) == ("named", "tls.wobble")
     assert abs(effect.entry["amplitude_rad"] - 8e-5) < 4 * effect.std["amplitude_rad"]
@@ -110,3 +113,15 @@ def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: P
     (case / "model.yaml").write_text((out / "model_after.yaml").read_text())
     assert yaml.safe_load((case / "model.yaml").read_text())["effects"][0]["name"] == "range_incidence_bias"
     assert diagnose(read_measurement(case)).verdict == "no_gap"
+
+
+def test_the_outcome_does_not_depend_on_the_number_of_threads(tmp_path: Path) -> None:
+    write_scan(tmp_path, 3, angles=wobbling, step_rad=0.007)
+    measurement, before, told = read_measurement(tmp_path), dr.thread_count(), []
+    try:
+        for count in (1, 2):
+            dr.set_thread_count(count)
+            told.append({key: value for key, value in to_dict(diagnose(measurement), measurement).items() if key != "seconds"})
+    finally:
+        dr.set_thread_count(before)
+    assert told[0] == told[1]
