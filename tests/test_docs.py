@@ -86,7 +86,7 @@ def test_a_how_to_works_as_it_is_written(page: str, tmp_path: Path, monkeypatch:
     if page == "own_site":
         example_data.site(Path(), resolution_m=0.2)
     if page == "missing_effect":
-        example_data.measurement(Path("my_measurement"), step_rad=0.008)
+        example_data.measurement(Path("my_measurement"), step_rad=0.012)
     howtos.carry_out(page, FURTHER[page])
     assert Path(howtos.PICTURES[page]).is_file()
 
