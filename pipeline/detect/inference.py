@@ -34,7 +34,7 @@ def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0
             answer = {name: values[number] for name, values in answers.items()}
             found += [
                 item.moved(row, column)
-                for item in _in_tile(answer, minimum_score, size)
+                for item in _in_tile(answer, minimum_score, size, (difference.shape[0] - row, difference.shape[1] - column))
                 if not _cut(item, row, column, size, difference.shape)
             ]
     return without_doubles(found)
@@ -78,12 +78,12 @@ def _tile(difference: NDArray[np.float32], place: tuple[int, int], size: int) ->
     return np.pad(cut, missing, constant_values=np.nan)
 
 
-def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, size: int) -> Iterator[Detection]:
+def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, size: int, held: tuple[int, int]) -> Iterator[Detection]:
     for box, score, mask in zip(answer["boxes"], answer["scores"], answer["masks"], strict=True):
         if score < minimum_score:
             return
         row, column, pixels = paste(mask, box, size)
-        item = cropped(pixels, row, column, float(score))
+        item = cropped(pixels[: max(held[0] - row, 0), : max(held[1] - column, 0)], row, column, float(score))
         if item is not None:
             yield item
 

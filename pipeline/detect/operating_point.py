@@ -30,7 +30,8 @@ def set_operating_point(folder: Path, validation: CocoFolder) -> float:
     values = [0.0 if math.isnan(each.f1) else each.f1 for each in evaluate(truth, found, None, _TRIED, (OVERLAP,))]
     shift = before + _log_odds(CONFIDENCE) - _log_odds(_TRIED[int(np.argmax(values))]) if max(values) > 0 else 0.0
     head = model.config.head.model_copy(update={"score_shift": round(shift, 3)})
-    weights.save_config(model.config.model_copy(update={"head": head}), folder)
+    model.config = model.config.model_copy(update={"head": head})
+    weights.save(model, folder)  # and without the optimizer's state, which a model in training saves too
     return shift
 
 

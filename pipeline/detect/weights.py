@@ -17,13 +17,8 @@ CONFIG, WEIGHTS = "detector.yaml", "model.weights.h5"
 
 def save(model: Any, folder: Path) -> None:
     """Write the detector `model`, a MaskRCNN, to the folder; each file is whole or absent."""
-    save_config(model.config, folder)
+    write_text(folder / CONFIG, yaml.safe_dump(model.config.model_dump(mode="json"), sort_keys=False))
     save_weights(model, folder / WEIGHTS)
-
-
-def save_config(config: DetectorConfig, folder: Path) -> None:
-    """Write what a detector is made of."""
-    write_text(folder / CONFIG, yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
 
 
 def save_weights(model: Any, path: Path) -> None:

@@ -15,7 +15,7 @@ from pycocotools.coco import COCO
 from test_model import make_set
 
 from pipeline.cli.main import main
-from pipeline.detect import baseline, events
+from pipeline.detect import baseline, events, inference
 from pipeline.detect.config import DetectorConfig, NormalisationConfig, TrainingConfig
 from pipeline.detect.data import CocoFolder, batches, mirrored
 from pipeline.detect.detections import Detection, cropped, without_doubles
@@ -207,3 +207,23 @@ except InputError as error:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2]
     )
     assert "two processes" in done.stdout
+
+
+class _EverythingIsABlock:
+    """Stands for a network whose one detection is the whole window, also where the map has ended."""
+
+    size = 64
+    config = DetectorConfig(image_px=64)
+
+    def predict_on_batch(self, inputs):
+        count = len(inputs["image"])
+        box = np.array([[0, 0, 64, 64]], np.float32)
+        answer = {"boxes": box, "scores": np.ones(1, np.float32), "masks": np.ones((1, 28, 28), np.float32)}
+        return {name: np.repeat(values[None], count, axis=0) for name, values in answer.items()}
+
+
+def test_a_mask_ends_where_a_small_map_ends():
+    difference = np.random.default_rng(1).normal(0, 0.01, (40, 50)).astype(np.float32)
+    (found,) = inference.detect(_EverythingIsABlock(), difference)
+    assert (found.row, found.column, found.mask.shape) == (0, 0, (40, 50))
+    assert found.annotation(1, 1, difference.shape)["area"] == 40 * 50

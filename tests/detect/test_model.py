@@ -117,9 +117,8 @@ def test_two_tiles_are_learned_by_heart(data_set, tmp_path):
             assert best > 0.9
     folder.images = folder.images[:2]
     folder.annotations = [each for each in folder.annotations if each["image_id"] <= 2]
-    modest = SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"score_shift": -4.0})})
+    model.config = SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"score_shift": -4.0})})
     weights.save(model, tmp_path)
-    weights.save_config(modest, tmp_path)
     assert set_operating_point(tmp_path, folder) > -4
     shifted = weights.load(tmp_path)
     found = [
