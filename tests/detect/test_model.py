@@ -20,6 +20,7 @@ from pipeline.detect.evaluate import evaluate
 from pipeline.detect.inference import detect
 from pipeline.detect.model import LOSSES, MaskRCNN
 from pipeline.detect.operating_point import CONFIDENCE, set_operating_point
+from pipeline.detect.run import detect as run_detect
 from pipeline.detect.training import train
 from pipeline.formats.geotiff import write_geotiff
 from scene.errors import InputError
@@ -244,3 +245,14 @@ def test_a_window_keeps_what_it_shows_at_least_half_of(data_set):
     for number, (y0, x0, y1, x1) in enumerate(part.boxes, start=1):
         rows, columns = np.nonzero(part.labels == number)
         assert_allclose((rows.min(), columns.min(), rows.max() + 1, columns.max() + 1), (y0, x0, y1, x1), atol=1)
+
+
+def test_the_detector_that_comes_along_finds_clear_blocks(tmp_path):
+    """Twelve niches of ten times the noise, 10 to 30 px: it was trained on other shapes and other noise, so ten are enough."""
+    make_set(tmp_path / "set", 1, 9, side=512, blocks=12)
+    events = run_detect("default", [tmp_path / "set"], tmp_path / "found", confidences=(CONFIDENCE,), pictures=False)
+    truth = json.loads((tmp_path / "set" / "annotations.json").read_text())
+    found = json.loads((tmp_path / "found" / "detections.json").read_text())["annotations"]
+    (score,) = evaluate(truth, found, None, (CONFIDENCE,), (0.5,))
+    assert len(events) >= score.true_positives >= 10
+    assert score.false_positives <= 2
