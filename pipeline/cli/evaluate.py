@@ -10,7 +10,7 @@ from pipeline.cli.parser import add_output_options, one_of
 
 SUMMARY = "compare detections with the truth: precision, recall, F1, mask areas, COCO metrics"
 EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detections.json
-  scarpsim evaluate my_dataset/test found/detections.json --by noise --out scores"""
+  scarpsim evaluate my_dataset/test found/detections.json --by noise --confidence 0.5 --confidence 0.9 --out scores"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,14 +22,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--iou", type=one_of("segm", "bbox"), default="segm", metavar="segm|bbox", help="overlap of masks or of boxes"
     )
+    parser.add_argument(
+        "--confidence",
+        type=float,
+        action="append",
+        metavar="P",
+        help="lowest score that counts, may be given several times (default: 0.9 0.95 0.99)",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for scores.json and scores.csv (default: only print)")
     add_output_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.detect.run import CONFIDENCES, checked_confidences
     from pipeline.detect.score_files import as_text, assess, write
 
-    assessment = assess(arguments.truth, arguments.predictions, arguments.by, arguments.iou)
+    confidences = checked_confidences(arguments.confidence or CONFIDENCES)
+    assessment = assess(arguments.truth, arguments.predictions, arguments.by, arguments.iou, confidences)
     if arguments.out:
         write(assessment, arguments.out)
     place = f"\nscores: {arguments.out}" if arguments.out else ""

@@ -50,6 +50,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     with shown_progress(quiet=arguments.quiet) as progress:
         history = train(arguments.data_set, config, arguments.out, resume=arguments.resume, progress=progress)
     best, model = min(history.total), arguments.out / "best"
-    told = f"{len(history.total)} epochs, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
-    document = {"folder": str(arguments.out), "model": str(model), "epochs": len(history.total)}
+    count = len(history.total)
+    told = f"{count} epoch{'s' if count > 1 else ''}, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
+    document = {"folder": str(arguments.out), "model": str(model), "epochs": count}
     return Answer(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})

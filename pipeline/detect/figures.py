@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pipeline.detect.detections import Detection
@@ -24,16 +25,21 @@ _TRAINING, _VALIDATION = "#0072B2", "#D55E00"
 _SCALE_SIGMAS = 6.0
 _WIDEST_PX = 2400
 _MOST_NUMBERED = 200
+_MOST_MARKED = 30
+"""Up to this many epochs each has a marker, as one alone makes no line."""
 
 
 def write_loss_figure(training: Sequence[Mapping[str, float]], validation: Sequence[Mapping[str, float]], path: Path) -> None:
     """The four losses, the proposals' share added to the heads', against the epoch."""
     figure = Figure(figsize=(9.6, 6.4), dpi=110, layout="constrained")
     epochs = np.arange(1, len(training) + 1)
+    marker = "o" if len(epochs) <= _MOST_MARKED else ""
     for axes, (title, names) in zip(figure.subplots(2, 2).flat, _PANELS.items(), strict=True):
         for history, colour, label in ((training, _TRAINING, "training"), (validation, _VALIDATION, "validation")):
-            axes.plot(epochs, [sum(losses[name] for name in names) for losses in history], color=colour, label=label)
+            sums = [sum(losses[name] for name in names) for losses in history]
+            axes.plot(epochs, sums, color=colour, label=label, marker=marker, markersize=3)
         axes.set(title=title, xlabel="epoch", ylabel="loss")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
     figure.axes[0].legend()
@@ -43,15 +49,14 @@ def write_loss_figure(training: Sequence[Mapping[str, float]], validation: Seque
 def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[Detection], path: Path, title: str = "") -> None:
     """A difference map with the outlines of what was found in it; colours end at six NMAD on either side of zero."""
     step = max(1, -(-max(difference.shape) // _WIDEST_PX))
-    limit = max(_SCALE_SIGMAS * nmad(difference), 1e-4)
+    shown = 1e3 * difference[::step, ::step]
+    limit = 1e3 * max(_SCALE_SIGMAS * nmad(difference), 1e-4)
     extent = (grid.x_min, grid.x_min + grid.width * grid.gsd, grid.y_max - grid.height * grid.gsd, grid.y_max)
     width = 10.0
     figure = Figure(figsize=(width, 0.9 + width * grid.height / grid.width * 0.85), dpi=140, layout="constrained")
     axes = figure.subplots()
     axes.set_facecolor("#b5b5b5")
-    image = axes.imshow(
-        difference[::step, ::step], cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest"
-    )
+    image = axes.imshow(shown, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
     for number, item in enumerate(found, start=1):
         contours, _ = cv2.findContours(item.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         for contour in contours:
@@ -60,13 +65,20 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
             axes.plot(np.append(x, x[0]), np.append(y, y[0]), color="black", linewidth=0.9)
         if number <= _MOST_NUMBERED:
             axes.annotate(f"{number}", (float(x.max()), float(y.max())), fontsize=6)
-    figure.colorbar(image, ax=axes, label="difference, m (missing rock positive)", shrink=0.8)
+    bar = figure.colorbar(image, ax=axes, label="reference minus epoch, mm", shrink=0.8, extend=_cut_off(shown, limit))
+    bar.ax.tick_params(labelsize=8)
     axes.set(
         xlabel="x along the wall, m",
         ylabel="y up the wall, m",
         title=title or f"{len(found)} blocks found; numbers as in the table",
     )
     _write(figure, path)
+
+
+def _cut_off(values: NDArray[np.floating], limit: float) -> str:
+    """At which ends of a colour bar from -limit to limit values lie beyond it, in matplotlib's words."""
+    below, above = bool((values < -limit).any()), bool((values > limit).any())
+    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
 
 
 def _write(figure: Figure, path: Path) -> None:

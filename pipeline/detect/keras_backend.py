@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from scene.errors import InputError
 
@@ -11,9 +16,12 @@ _MODULES = {"tensorflow": "tensorflow", "jax": "jax", "torch": "torch"}
 
 
 def keras_ready() -> None:
-    """Make sure that Keras can be imported, on TensorFlow unless KERAS_BACKEND says otherwise; else an InputError."""
+    """Import Keras, on TensorFlow unless KERAS_BACKEND says otherwise; raises InputError where one of them is not installed.
+
+    TensorFlow writes some lines to stderr while it is imported, whatever the level of its log. They are dropped, and the level
+    is set to errors alone, unless TF_CPP_MIN_LOG_LEVEL is set: with 0 there TensorFlow says everything.
+    """
     backend = os.environ.setdefault("KERAS_BACKEND", "tensorflow")
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     missing = [name for name in ("keras", _MODULES.get(backend, backend)) if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(
@@ -21,3 +29,27 @@ def keras_ready() -> None:
             where="the detector",
             remedy="install the extra: uv sync --extra detect (in a checkout), or pip install 'scarpsim[detect]'",
         )
+    if "TF_CPP_MIN_LOG_LEVEL" not in os.environ:
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+        with stderr_dropped():
+            importlib.import_module("keras")
+
+
+@contextmanager
+def stderr_dropped() -> Iterator[None]:
+    """Drop what the process writes to stderr, libraries in C as well, unless an exception leaves the body."""
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    with tempfile.TemporaryFile() as written:
+        os.dup2(written.fileno(), 2)
+        try:
+            yield
+        except BaseException:
+            sys.stderr.flush()
+            written.seek(0)
+            os.write(stderr, written.read())
+            raise
+        finally:
+            sys.stderr.flush()
+            os.dup2(stderr, 2)
+            os.close(stderr)

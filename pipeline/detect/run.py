@@ -88,7 +88,8 @@ def detect(
     detections_c.json and events_c.csv; for the lowest also a raster of masks and an overlay picture per map.
     """
     inputs, progress = find_inputs(places), progress or Progress()
-    find = detector(model)
+    with progress.stage("network"):
+        find = detector(model)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     found_events: list[events.Event] = []

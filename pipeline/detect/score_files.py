@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.detect.evaluate import Overlap, Score, coco_metrics, evaluate
+from pipeline.detect.evaluate import CONFIDENCES, Overlap, Score, coco_metrics, evaluate
 from pipeline.formats.atomic import write_json, write_text
 from scene.errors import InputError, nearest
 
@@ -29,8 +29,16 @@ class Assessment:
         return {"scores": [score.to_dict() for score in self.scores], "coco": self.coco}
 
 
-def assess(truth: Path, predictions: Path, keys: Sequence[str] = (), kind: Overlap = "segm") -> Assessment:
+def assess(
+    truth: Path,
+    predictions: Path,
+    keys: Sequence[str] = (),
+    kind: Overlap = "segm",
+    confidences: Sequence[float] = CONFIDENCES,
+) -> Assessment:
     """Compare two COCO files; `keys` of the truth's images, such as noise or wall, make the groups.
+
+    kind: overlap of masks or of boxes; confidences: lowest scores that count, each a column of the tables.
 
     Predictions that list their images are joined by file name, others (pycocotools' plain list) by image id. Raises InputError
     for files that are not COCO, predictions without scores, and images that the truth does not have.
@@ -40,7 +48,7 @@ def assess(truth: Path, predictions: Path, keys: Sequence[str] = (), kind: Overl
     if not isinstance(reference, dict) or not reference.get("images"):
         raise InputError("names no image", where=str(path), remedy="give the COCO annotations of the same maps")
     items = _joined(reference, found, str(predictions))
-    scores = evaluate(reference, items, _groups(reference, keys, str(path)), kind=kind)
+    scores = evaluate(reference, items, _groups(reference, keys, str(path)), confidences, kind=kind)
     return Assessment(scores, coco_metrics(reference, items, kind))
 
 
@@ -51,7 +59,7 @@ def as_text(assessment: Assessment) -> str:
     for score in assessment.scores:
         groups.setdefault(score.group, []).append(score)
     for group, scores in groups.items():
-        lines += ["", group, f"{'confidence':<12}" + "".join(f"{score.confidence:>9.2f}" for score in scores)]
+        lines += ["", group, f"{'confidence':<12}" + "".join(f"{_probability(score.confidence):>9}" for score in scores)]
         lines.append(f"{'IoU':<12}" + "".join(f"{score.iou:>9.2f}" for score in scores))
         for title, name in (("TP", "true_positives"), ("FP", "false_positives"), ("FN", "false_negatives")):
             lines.append(f"{title:<12}" + "".join(f"{getattr(score, name):>9}" for score in scores))
@@ -70,6 +78,11 @@ def write(assessment: Assessment, folder: Path) -> None:
     table.writeheader()
     table.writerows(rows)
     write_text(folder / "scores.csv", text.getvalue())
+
+
+def _probability(value: float) -> str:
+    """With two decimals, or more where it has more."""
+    return max(f"{value:.2f}", f"{value:g}", key=len)
 
 
 def _cell(value: float) -> str:

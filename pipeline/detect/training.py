@@ -49,10 +49,11 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     progress = progress or Progress()
     folders = CocoFolder(data_set / "train"), CocoFolder(data_set / "val")
     training = config.training
-    model = MaskRCNN(config.detector, training.crop_px, training.seed, training.loss_weights)
-    model.compile(optimizer=_optimizer(config), jit_compile=False)
-    model.optimizer.build(model.trainable_variables)
-    history = _begun(out, config, model, resume=resume)
+    with progress.stage("network"):
+        model = MaskRCNN(config.detector, training.crop_px, training.seed, training.loss_weights)
+        model.compile(optimizer=_optimizer(config), jit_compile=False)
+        model.optimizer.build(model.trainable_variables)
+        history = _begun(out, config, model, resume=resume)
     steps = -(-len(folders[0]) // training.batch)
     logged = _EventLog(out / "events")
     epochs = {f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)}
@@ -63,9 +64,9 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
         with progress.stage(f"epoch {epoch + 1}"):
             history.training.append(_learn(model, folders[0], config, epoch, steps, progress))
             history.validation.append(_validate(model, folders[1], config))
-        logged.add(epoch, history)
-        _save(out, config, model, history)
-        write_loss_figure(history.training, history.validation, out / "losses.png")
+            logged.add(epoch, history)
+            _save(out, config, model, history)
+            write_loss_figure(history.training, history.validation, out / "losses.png")
     with progress.stage("scores"):
         set_operating_point(out / BEST, folders[1])
     return history

@@ -32,7 +32,7 @@ def save_weights(model: Any, path: Path) -> None:
 def load_config(folder: Path) -> DetectorConfig:
     """What the detector in the folder is made of; raises InputError where that is not to be had."""
     if not (folder / CONFIG).is_file():
-        remedy = "give a folder that `scarpsim train` made, or leave the model out for the one that comes with scarpsim"
+        remedy = "give a folder that `scarpsim train` made, or say `default` for the one that comes with scarpsim"
         raise InputError(f"holds no detector ({CONFIG} is missing)", where=str(folder), remedy=remedy)
     return parse(DetectorConfig, load_yaml(folder / CONFIG), where=str(folder / CONFIG))
 

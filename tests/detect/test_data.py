@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from pipeline.detect.config import DetectorConfig, NormalisationConfig, Training
 from pipeline.detect.data import CocoFolder, batches, mirrored
 from pipeline.detect.detections import Detection, cropped, without_doubles
 from pipeline.detect.inference import paste, tile_places
+from pipeline.detect.keras_backend import stderr_dropped
 from pipeline.detect.normalisation import denormalised, nmad, normalised
 from pipeline.detect.run import detect, find_inputs
 from pipeline.detect.schedule import has_settled, learning_rate
@@ -227,3 +229,16 @@ def test_a_mask_ends_where_a_small_map_ends():
     (found,) = inference.detect(_EverythingIsABlock(), difference)
     assert (found.row, found.column, found.mask.shape) == (0, 0, (40, 50))
     assert found.annotation(1, 1, difference.shape)["area"] == 40 * 50
+
+
+def test_what_libraries_write_is_dropped_unless_they_fail(capfd):
+    def failing() -> None:
+        os.write(2, b"the reason")
+        raise ImportError
+
+    with stderr_dropped():
+        os.write(2, b"chatter")
+    os.write(2, b"between ")
+    with pytest.raises(ImportError), stderr_dropped():
+        failing()
+    assert capfd.readouterr().err == "between the reason"

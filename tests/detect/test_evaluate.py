@@ -107,3 +107,11 @@ def test_an_unknown_key_names_the_known(truth, tmp_path):
     (tmp_path / "found.json").write_text("[]")
     with pytest.raises(InputError, match="did you mean 'noise'"):
         assess(tmp_path, tmp_path / "found.json", ["niose"])
+
+
+def test_the_tables_have_the_confidences_that_were_asked_for(truth, found, tmp_path):
+    (tmp_path / "annotations.json").write_text(json.dumps(truth))
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    assessment = assess(tmp_path, tmp_path / "found.json", confidences=(0.4, 0.995))
+    assert [score.confidence for score in assessment.scores] == [0.4, 0.4, 0.995, 0.995]
+    assert as_text(assessment).splitlines()[1].split() == ["confidence", "0.40", "0.40", "0.995", "0.995"]
