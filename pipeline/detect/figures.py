@@ -39,8 +39,9 @@ def write_loss_figure(training: Sequence[Mapping[str, float]], validation: Seque
             sums = [sum(losses[name] for name in names) for losses in history]
             axes.plot(epochs, sums, color=colour, label=label, marker=marker, markersize=3)
         axes.set(title=title, xlabel="epoch", ylabel="loss")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_ylim(bottom=0)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        axes.update_datalim([(1, 0)])
+        axes.set(xlim=(0.5, len(epochs) + 0.5), ylim=(0, None))
         axes.grid(alpha=0.3)
     figure.axes[0].legend()
     _write(figure, path)
