@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from pipeline.gap.in_words import with_unit
 from pipeline.gap.pictures import png
 from pipeline.gap.stereo_residuals import predicted_variance
 from pipeline.gap.tls_spread import model_variance
@@ -21,11 +22,8 @@ _BINS = 24
 _POINTS_PER_PIXEL = 8.0
 _BEFORE, _AFTER, _NAMED = "#D55E00", "#0072B2", "black"
 _COLUMNS = 3
-_UNITS = {
-    "range": "m", "depth": "m", "azimuth": "rad", "zenith": "rad", "incidence": "rad", "image_x": "px",
-    "image_y": "px", "radius": "px", "disparity": "px", "intensity": "ln of power over its median", "line": "number",
-    "time": "share of the scan", "disparity_fraction": "px",
-}  # fmt: skip
+_CROWDED = ("edge_step",)
+"""Covariates of which most values lie near zero, the rest over decades."""
 
 
 def maps_figure(found: Diagnosis) -> bytes:
@@ -41,12 +39,12 @@ def maps_figure(found: Diagnosis) -> bytes:
     for panel, values, title in zip(panels[0], means, ("before", "after"), strict=True):
         image = panel.imshow(values, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=pixels.extent, origin="lower")
         panel.set_title(f"mean residual, {title}", fontsize=10)
-    figure.colorbar(image, ax=panels[0], label="measured minus predicted, mm")
+    figure.colorbar(image, ax=panels[0], label="measured minus predicted, mm", extend="both")
     for panel, values, title in zip(panels[1], spreads, ("before", "after"), strict=True):
         image = panel.imshow(values, cmap="PuOr_r", vmin=0.4, vmax=1.6, extent=pixels.extent, origin="lower")
         panel.set_title(f"spread over the predicted one, {title}", fontsize=10)
         panel.set_xlabel("along the wall, m")
-    figure.colorbar(image, ax=panels[1], label="1: as predicted")
+    figure.colorbar(image, ax=panels[1], label="1: as predicted", extend="both")
     for panel in panels.ravel():
         panel.set_facecolor("0.85")
         for change in found.changes:
@@ -93,11 +91,13 @@ def profiles_figure(found: Diagnosis) -> bytes:
         for sigma, colour in zip(predicted, (_BEFORE, _AFTER), strict=True):
             lower.plot(middle, np.sqrt(_means(group, sigma**2, len(middle))), color=colour, linestyle="--", linewidth=1.0)
         upper.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
-        upper.set_title(f"{name}, {_UNITS.get(name, 'm' if found.residuals.sensor == 'tls' else 'px')}", fontsize=9)
+        upper.set_title(with_unit(name, found.residuals.sensor), fontsize=9)
         upper.set_ylabel("mean, mm", fontsize=8)
         lower.set_ylabel("spread, mm", fontsize=8)
         for panel in (upper, lower):
             panel.tick_params(labelsize=7)
+            if name in _CROWDED:
+                panel.set_xscale("log")
         if number == 0:
             upper.legend(fontsize=7)
     for panel in panels.ravel():

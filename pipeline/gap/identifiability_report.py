@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.formats.atomic import write_json, write_text, writing
 from pipeline.gap.figures import matrix_figure
 from pipeline.gap.identifiability import ALIKE, NAMED_AT, Identifiability
-from pipeline.gap.in_words import listed
+from pipeline.gap.in_words import listed, number
 from pipeline.gap.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE
 from pipeline.provenance import versions
 from pipeline.report.page import template
@@ -108,5 +108,4 @@ def _row(found: Identifiability, row: int) -> _Row:
 
 
 def _value(parameter: str, value: float) -> str:
-    number = f"{value:.2g}" if np.isfinite(value) else _NEVER
-    return f"{parameter} {number}".strip()
+    return f"{parameter} {number(value, 2) if np.isfinite(value) else _NEVER}".strip()

@@ -11,6 +11,7 @@ from pipeline.gap.selection import Tried
 from pipeline.gap.spread import SpreadTried
 from pipeline.gap.verify import Gap
 from pipeline.gap.workflow import Diagnosis
+from pipeline.report.page import percent, true_minus
 
 VERDICTS = {
     "no_gap": "The measurement agrees with the model: nothing was found that the model does not hold.",
@@ -23,6 +24,11 @@ VERDICTS = {
 _INSTRUMENTS = {"tls": "ranges of a laser scan", "stereo": "disparities of a stereo pair"}
 _STATISTICS = {"mean": "mean", "spread": "spread", "shape": "outliers", "missing": "lost returns"}
 _CLEAR = 0.01
+_UNITS = {
+    "range": "m", "depth": "m", "azimuth": "rad", "zenith": "rad", "incidence": "rad", "image_x": "px",
+    "image_y": "px", "radius": "px", "disparity": "px", "intensity": "ln of power over its median", "line": "number",
+    "time": "share of the scan", "disparity_fraction": "px", "log_power": "ln of relative power",
+}  # fmt: skip
 
 
 def title(found: Diagnosis) -> str:
@@ -91,6 +97,30 @@ def listed(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
+def with_unit(covariate: str, sensor: str) -> str:
+    """A covariate as a report shows it, with the unit of its values."""
+    return f"{covariate}, {_UNITS.get(covariate, 'm' if sensor == 'tls' else 'px')}"
+
+
+def number(value: float, digits: int = 4) -> str:
+    """With at most so many significant digits, written out below a million and above a ten-thousandth."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
+def decimal(value: float) -> str:
+    """With one decimal, without any from ten thousand on."""
+    return true_minus(value, 1) if abs(value) < 9999.95 else number(value, 5)
+
+
+def rounded(value: Any) -> Any:
+    """A value of an effect's entry with at most five significant digits in each number."""
+    if isinstance(value, dict):
+        return {key: rounded(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each) for each in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
 def values(effect: Named) -> str:
     """Parameters with their standard deviations."""
     return ", ".join(_value(key, value, effect.std.get(key)) for key, value in effect.entry.items() if key != "name")
@@ -98,14 +128,14 @@ def values(effect: Named) -> str:
 
 def _value(key: str, value: Any, std: float | None) -> str:
     if isinstance(value, dict):
-        cycle = f", repeated every {value['period']:.4g}" if value.get("period") else ""
-        return f"{key} {value['low']:.4g} to {value['high']:.4g}{cycle}"
+        cycle = f", repeated every {number(value['period'])}" if value.get("period") else ""
+        return f"{key} {number(value['low'])} to {number(value['high'])}{cycle}"
     if isinstance(value, list):
         flat = [each for row in value for each in row]
-        return f"{key} {len(value)} x {len(value[0])} from {min(flat):.3g} to {max(flat):.3g}"
+        return f"{key} {len(value)} x {len(value[0])} from {number(min(flat), 3)} to {number(max(flat), 3)}"
     if not isinstance(value, float):
         return f"{key} {value}"
-    return f"{key} {value:.4g}" + ("" if not std else f" \N{PLUS-MINUS SIGN} {std:.1g}")
+    return f"{key} {number(value)}" + ("" if not std else f" \N{PLUS-MINUS SIGN} {std:.1g}")
 
 
 def _effect(effect: Named) -> str:
@@ -130,4 +160,4 @@ def _gap(gap: Gap, named: bool) -> str:
     text = f"On blocks that no step has used, the gap is {scores}; the model's own noise leaves {floor}"
     if gap.closed is None:
         return f"{text}, so before and floor differ by no more than their uncertainty."
-    return f"{text}: {gap.closed:.0%} of the gap is closed."
+    return f"{text}: {percent(gap.closed, 0)} of the gap is closed."

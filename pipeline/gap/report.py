@@ -11,11 +11,22 @@ import yaml
 from pipeline.formats.atomic import write_json, write_text, writing
 from pipeline.formats.laz import write_laz
 from pipeline.gap.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
-from pipeline.gap.in_words import VERDICTS, outcome, paragraph, spread_outcome, title, values
+from pipeline.gap.in_words import (
+    VERDICTS,
+    decimal,
+    number,
+    outcome,
+    paragraph,
+    rounded,
+    spread_outcome,
+    title,
+    values,
+    with_unit,
+)
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.where import where
 from pipeline.gap.workflow import Diagnosis
-from pipeline.report.page import template
+from pipeline.report.page import p_value_in_words, percent, template
 
 _MOST_TRIED = 25
 
@@ -64,7 +75,7 @@ def summary(found: Diagnosis) -> str:
     if found.changes:
         lines.append(f"  {len(found.changes)} regions where the scene itself moved were set aside")
     if found.gap is not None:
-        closed = "within its uncertainty" if found.gap.closed is None else f"{found.gap.closed:.0%} closed"
+        closed = "within its uncertainty" if found.gap.closed is None else f"{percent(found.gap.closed, 0)} closed"
         factor, unit = found.gap.shown
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
         lines.append(f"  gap {scores}: {closed}")
@@ -96,8 +107,13 @@ def _page(found: Diagnosis, pictures: dict[str, bytes]) -> str:
         tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
         more=max(len(tried) - _MOST_TRIED, 0),
         spread_tried=[(item, spread_outcome(found, item)) for item in found.spread_tried],
-        added=_yaml({"effects": [effect.entry for effect in found.effects]}),
+        added=_yaml({"effects": [rounded(effect.entry) for effect in found.effects]}),
         model=_yaml(after),
+        number=number,
+        decimal=decimal,
+        rounded=rounded,
+        p_value=p_value_in_words,
+        with_unit=with_unit,
         slowest=sum(found.timings.values()),
     )
 

@@ -1,0 +1,29 @@
+"""Numbers as the reports of `gap` show them."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.gap.in_words import decimal, number, rounded, with_unit
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "shown"),
+    [(0.0082523077, 4, "0.008252"), (104.0, 2, "100"), (12345.678, 4, "12350"), (2.78e-10, 2, "2.8e-10"), (0.0, 4, "0")],
+)
+def test_numbers_are_plain_and_short(value: float, digits: int, shown: str) -> None:
+    assert number(value, digits) == shown
+
+
+def test_a_gain_has_one_decimal_where_that_means_something() -> None:
+    assert [decimal(value) for value in (812.0, -0.26, 43139.9, 123456.0)] == ["812.0", "\N{MINUS SIGN}0.3", "43140", "123460"]
+
+
+def test_rounding_goes_into_tables_and_leaves_all_but_fractions_alone() -> None:
+    entry = {"name": "empirical", "bins": 8, "values_m": [[0.123456789, 2.0]], "step": {"low": -1.2345678}}
+    assert rounded(entry) == {"name": "empirical", "bins": 8, "values_m": [[0.12346, 2.0]], "step": {"low": -1.2346}}
+
+
+def test_covariates_have_the_unit_of_their_sensor() -> None:
+    assert [with_unit("edge_step", sensor) for sensor in ("tls", "stereo")] == ["edge_step, m", "edge_step, px"]
+    assert with_unit("zenith", "tls") == "zenith, rad"
