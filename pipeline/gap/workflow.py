@@ -19,15 +19,16 @@ from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.missing import LOSSES, MissingFound, find_missing, isolated
 from pipeline.gap.naming import Naming, believes, name_effects
-from pipeline.gap.registration import pose_of, registered, residuals_of, settled
-from pipeline.gap.residuals import BoolArray, Missing, Residuals
+from pipeline.gap.registration import registered, residuals_of, settled
+from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.selection import Tried
 from pipeline.gap.shapes import ShapeFound
+from pipeline.gap.showing import Showing
 from pipeline.gap.splitting import with_splits
 from pipeline.gap.spread import SpreadTried, find_tails
 from pipeline.gap.stereo_shapes import find_shapes
 from pipeline.gap.tls_residuals import missing_returns, with_order
-from pipeline.gap.verify import Gap, Version, measure_gap, measure_losses, thinned
+from pipeline.gap.verify import Gap
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
@@ -99,30 +100,35 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     named = sorted([*named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
     clock.lap("naming")
     named, dropped = _confirmed(there, state, named, naming.reference_sigma)
-    after = with_effects(measurement.model, [item.entry for item in named])
-    before = pose_of(plain.part(state.chosen))
-    value = plain.value - plain.pose @ before
-    corrected, turned = _corrected(there, after, plain, state.chosen) if named else (value, before)
-    if losses and named and named[0].name == lost[0].name and plain.missing is not None:
-        gap = _gap_of_losses(plain.missing, *losses)
-    else:
-        versions = Version(measurement.model, before), Version(after, turned)
-        gap = _gap(there, versions, plain, state, naming.reference_sigma, random)
+    showing = Showing(
+        measurement=there,
+        residuals=plain,
+        chosen=state.chosen,
+        tested=state.shown & state.held_out,
+        learned=state.shown & ~state.held_out,
+        losses=losses,
+        reference_sigma=naming.reference_sigma,
+        largest=_CLIP * state.scale,
+        random=random,
+    )
+    shown, harmful = showing.show(named)
+    notes = [naming.remaining["note"], *dropped, *harmful]
+    value = plain.value - plain.pose @ showing.pose
     clock.lap("verification")
     return Diagnosis(
-        verdict=_verdict(named),
-        effects=tuple(named),
+        verdict=_verdict(shown.named),
+        effects=tuple(shown.named),
         changes=tuple(state.changes),
         residuals=replace(plain, smooth=state.residuals.smooth),
         held_out=state.held_out,
         before=value,
-        after=np.where(np.isfinite(corrected), corrected, value),
-        pose=surveyed + turned,
-        model_after=after,
-        gap=gap,
+        after=np.where(np.isfinite(shown.value), shown.value, value),
+        pose=surveyed + shown.pose,
+        model_after=shown.model,
+        gap=shown.gap,
         tried=naming.tried,
         spread_tried=naming.spread_tried,
-        remaining={**naming.remaining, "note": "; ".join(each for each in (naming.remaining["note"], *dropped) if each)},
+        remaining={**naming.remaining, "note": "; ".join(each for each in notes if each)},
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,
@@ -166,6 +172,11 @@ class _State:
         usable = residuals.smooth & ~changed & (np.abs(rough) < _CLIP * scale * residuals.sigma)
         chosen = _thinned(np.flatnonzero(usable & ~held_out))
         return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
+
+    @property
+    def shown(self) -> BoolArray:
+        """(n,) points on which a gap may be measured: on smooth surface, or where an effect was found that shows elsewhere."""
+        return np.asarray((self.residuals.smooth | self.touched) & ~self.changed)
 
     @property
     def part(self) -> tuple[Measurement, Residuals]:
@@ -270,19 +281,6 @@ def _is_spread(item: Named) -> bool:
     return item.name.partition(".")[2] in SPREADS
 
 
-def _corrected(
-    measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, chosen: NDArray[np.int64]
-) -> tuple[FloatArray, FloatArray]:
-    """(n,) residuals of the same points against another model, registered by the points `chosen`; NaN where that one misses the
-    reference. The pose (6,) against the measurement's."""
-    _, found, there = settled(measurement.changed(model=model), residuals.index[chosen])
-    trusted = found.smooth & np.isin(found.index, residuals.index[chosen])
-    rest = pose_of(found.part(np.flatnonzero(trusted)))
-    value = np.full(len(measurement.cloud.points), np.nan)
-    value[found.index] = found.value - found.pose @ rest
-    return np.asarray(value[residuals.index]), there + rest
-
-
 class _Clock:
     def __init__(self, told: Callable[[str], None] | None) -> None:
         self._start = self._last = time.perf_counter()
@@ -320,28 +318,6 @@ def _missing(measurement: Measurement, state: _State) -> tuple[MissingFound, Boo
     drops = isolated(residuals.at, early)
     found = find_missing(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)
-
-
-def _gap_of_losses(missing: Missing, found: MissingFound, held_out: BoolArray) -> Gap | None:
-    """Where lost returns matter most: the chance of losing each held-out pulse."""
-    share = np.full(len(held_out), float(missing.lost.mean()))
-    return measure_losses(missing, share if found.covariate else found.chance, held_out)
-
-
-def _gap(
-    measurement: Measurement,
-    versions: tuple[Version, Version],
-    plain: Residuals,
-    state: _State,
-    reference_sigma: float,
-    random: KeyedRandom,
-) -> Gap | None:
-    """On held-out points, where the surface is smooth or an effect was found that shows elsewhere."""
-    rows = np.flatnonzero((state.residuals.smooth | state.touched) & ~state.changed & state.held_out)
-    if len(rows) < 100:
-        return None
-    part = plain.part(rows[thinned(len(rows))])
-    return measure_gap(measurement, *versions, part, reference_sigma, _CLIP * state.scale, random.child("verify"))
 
 
 def _verdict(named: list[Named]) -> str:
