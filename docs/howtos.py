@@ -34,7 +34,7 @@ PICTURES = {
 """The pages, and the picture among their results that each shows."""
 _BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _PROGRAMS: dict[str, Callable[[list[str]], int]] = {"scarpsim": main, "simulate": simulate}
-_COLOURS, _WIDEST = 128, 1100
+_COLOURS, _WIDEST = 256, 1100
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _renew(page: str) -> None:
         sys.stderr.write(f"== {page}\n{carry_out(page)}\n")
         with Image.open(PICTURES[page]) as picture:
             picture.thumbnail((_WIDEST, _WIDEST))
-            small = picture.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+            small = picture.convert("RGB").quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         small.save(FOLDER / "images" / f"howto_{page}.png", optimize=True)
 
 
