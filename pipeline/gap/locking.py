@@ -27,8 +27,9 @@ _SHAPE = 1.5
 _MOST_BLUR = 0.35
 _MULTIPLES = np.arange(1, 5)
 _SMALLEST_P = 1e-4
-_ALIKE = 6.0
-"""Difference of chi^2 within which two amplitudes fit alike."""
+_ALIKE, _FITS = 6.0, 20.0
+"""Difference of chi^2 (of four values) within which two amplitudes fit alike, and the most with which one fits."""
+_FOLDING = 1 / (2 * np.pi)
 _MOST_POINTS = 60_000
 
 
@@ -83,23 +84,35 @@ def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
         return np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
 
     shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, _MOST_BLUR, 60)
+    coarse = square(shares, blurs)
+    row = _plausible(shares, coarse.min(axis=1))
     for width in (0.01, 0.002):
-        coarse = square(shares, blurs)
-        profile = coarse.min(axis=1)
-        # Bessel functions come back to the same values: of amplitudes that fit alike the least is meant
-        lowest = (profile <= np.append(profile[1:], np.inf)) & (profile <= np.append(np.inf, profile[:-1]))
-        row = int(np.flatnonzero(lowest & (profile < profile.min() + _ALIKE))[0])
         column = int(np.argmin(coarse[row]))
         shares = shares[row] + np.linspace(-width, width, 81)
         blurs = np.maximum(blurs[column] + np.linspace(-width, width, 41), 0.0)
-    best = float(square(shares, blurs).min())
+        coarse = square(shares, blurs)
+        row = int(np.argmin(coarse.min(axis=1)))
+    best = float(coarse.min())
     # the spread by curvature, the blur free
-    around = shares[len(shares) // 2] + np.linspace(-0.02, 0.02, 201)
+    around = shares[row] + np.linspace(-0.02, 0.02, 201)
     profile = square(around, np.linspace(0.0, _MOST_BLUR, 200)).min(axis=1)
     weight = np.exp(-0.5 * (profile - profile.min()) / max(best, 1.0))
     weight /= weight.sum()
     mean = float(weight @ around)
     return mean, float(np.sqrt(weight @ (around - mean) ** 2 + 1e-8))
+
+
+def _plausible(shares: FloatArray, square: FloatArray) -> int:
+    """Row of the amplitude that is meant, of the minima of chi^2: Bessel functions come back to the same values.
+
+    Of amplitudes that fit alike it is the least; one that folds disparities over, from 1 / 2 pi on, has to fit well.
+    """
+    lowest = (square <= np.append(square[1:], np.inf)) & (square <= np.append(np.inf, square[:-1]))
+    rows = np.flatnonzero(lowest & (square < square.min() + _ALIKE))
+    unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
+    if square.min() > _FITS and len(unfolded):
+        rows = unfolded[[np.argmin(square[unfolded])]]
+    return int(rows[0])
 
 
 def _means(disparity: FloatArray, frequencies: FloatArray) -> NDArray[np.complex128]:
