@@ -58,7 +58,7 @@ class Axis(Config):
             return np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
         turned = np.mod(x, self.period) if self.period else x
         place = np.clip((turned - self.low) / (self.high - self.low) * (count - 1), 0, count - 1)
-        index = np.minimum(place.astype(np.int64), count - 2)
+        index = np.minimum(np.nan_to_num(place).astype(np.int64), count - 2)
         return index, place - index
 
 

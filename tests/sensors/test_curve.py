@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.interpolate import RegularGridInterpolator
 
 from scene.backend import mi
@@ -60,3 +61,10 @@ def test_rows_of_different_length_are_an_error_that_says_so() -> None:
 def test_an_axis_that_runs_backwards_is_an_error() -> None:
     with pytest.raises(InputError, match="low < high"):
         parse(RangeEmpirical, {"name": "range_empirical", "along": {"low": 1.0, "high": 0.0}}, "model.yaml")
+
+
+def test_what_is_not_known_stays_unknown_on_the_host():
+    """A ray that misses the reference has no covariate; its neighbours keep their values."""
+    axis = Axis(low=0.0, high=1.0)
+    x = np.array([0.25, np.nan, 0.75])
+    assert_allclose(surface_on_host(x, x, axis, Axis(), [[0.0, 1.0]]), x)
