@@ -79,7 +79,7 @@ def _between(table: mi.Float64, index: mi.UInt32, share: mi.Float64) -> mi.Float
 
 
 def surface_on_host(x: FloatArray, y: FloatArray, along: Axis, across: Axis, rows_of_values: Rows) -> FloatArray:
-    """The same for NumPy arrays (n,)."""
+    """The same for NumPy arrays (n,); NaN where x or y is."""
     values = np.asarray(rows_of_values, dtype=np.float64)
     rows, columns = values.shape
     (i, a), (j, b) = across.place_on_host(y, rows), along.place_on_host(x, columns)

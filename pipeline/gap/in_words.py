@@ -68,27 +68,28 @@ def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
 
 def outcome(found: Diagnosis, tried: Sequence[Tried], item: Tried) -> str:
     """What became of one of the explanations `tried`, best first: named, in the class of a named one, or rejected."""
-    name = f"{found.residuals.sensor}.{item.name}"
     if item.empirical:
         added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
         best = next(each for each in tried if each.empirical and each.name == item.name)
         return "added as empirical" if item is best and item.name in added else "rejected"
-    if any(effect.name == name for effect in found.effects):
-        return "named"
-    alike = {other for effect in found.effects for other in effect.alike}
-    return "cannot be told from the named one" if name in alike else "rejected"
+    return _outcome_of(found, item.name)
 
 
 def spread_outcome(found: Diagnosis, item: SpreadTried) -> str:
     """What became of one of the explanations of the spread."""
-    name = f"{found.residuals.sensor}.{item.name}"
     if item.empirical:
         added = any(effect.kind == "empirical" and effect.name.partition(".")[2] in SPREADS for effect in found.effects)
         return "added as empirical" if added else "rejected"
-    physical = [effect for effect in found.effects if effect.kind == "physical"]
-    if any(effect.name == name for effect in physical):
+    return _outcome_of(found, item.name)
+
+
+def _outcome_of(found: Diagnosis, effect: str) -> str:
+    """What became of an effect of the catalogue."""
+    name = f"{found.residuals.sensor}.{effect}"
+    physical = [each for each in found.effects if each.kind == "physical"]
+    if any(each.name == name for each in physical):
         return "named"
-    alike = {other for effect in physical for other in effect.alike}
+    alike = {other for each in physical for other in each.alike}
     return "cannot be told from the named one" if name in alike else "rejected"
 
 

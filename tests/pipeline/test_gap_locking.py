@@ -33,3 +33,15 @@ def test_disparities_of_a_rough_wall_show_none() -> None:
         facets = rng.uniform(200, 230, 10)[:, None] + rng.uniform(0, 6, (10, 1)) * rng.uniform(size=(10, 300))
         measured = facets + 0.3 * rng.standard_normal(facets.shape) + 0.4
         assert find_locking(measured.ravel(), facets.ravel()) is None
+
+
+def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one() -> None:
+    """A tenth of the disparities snapped to whole pixels beside 0.12 px of locking: the mean of the first multiple alone is as
+    that of 0.46 px, which no matcher makes. Snapping is no sine, so the amplitude is held to a sixth."""
+    rng = np.random.default_rng(3)
+    plain = rng.uniform(0, 80, 60_000)
+    locked = plain + 0.12 * np.sin(2 * np.pi * plain)
+    measured = np.where(rng.uniform(size=len(plain)) < 0.1, np.rint(locked), locked)
+    found = find_locking(measured, plain)
+    assert found is not None
+    assert found.amplitude_px == pytest.approx(0.12, abs=0.02)
