@@ -12,6 +12,8 @@ import numpy as np
 Json = dict[str, Any]
 CLEAR = 8.0
 """Signal-to-noise x sin(angle to the nearest other effect) from which an answer is expected to be right."""
+_ALONE = 0.05
+"""Share of an effect's square that another may take over for the effect to be unlike all others."""
 _Z90 = 1.6449
 _BINS = (0.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, np.inf)
 _NAMING = ("named", "several", "ambiguous", "unknown")
@@ -125,14 +127,20 @@ def _off(key: str, truth: float, given: Json | None) -> Json:
     return {"true": truth, "value": given["value"], "std": given["std"], "inside": bool(abs(away) <= _Z90 * given["std"])}
 
 
-def _control(truth: Json, named: list[Json]) -> float | None:
+def _control(truth: Json, named: list[Json]) -> Json | None:
     """Share of the held-out gap that the best effect outside the answered class closes, best by its fit, where one clear effect
-    on the mean was named."""
+    on the mean was named; and what of the signature's square the angle to the nearest other effect leaves to that, 1 - sin^2."""
     if truth["stratum"] != "one" or not truth["closed_by"] or not named or not _clear(truth["effects"][0]):
         return None
     inside = {truth["effects"][0]["name"], *(name for each in named for name in each["class"])}
     outside = [shares for name, shares in truth["closed_by"].items() if name not in inside]
-    return max(max(outside, key=lambda shares: shares["fitted"])["held_out"], 0.0) if outside else None
+    if not outside:
+        return None
+    sine = truth["effects"][0]["snr_sin_angle"] / truth["effects"][0]["snr"]
+    return {
+        "closed": max(max(outside, key=lambda shares: shares["fitted"])["held_out"], 0.0),
+        "by_angle": 1 - min(sine, 1.0) ** 2,
+    }
 
 
 def _figures(rows: list[Json]) -> list[Json]:
@@ -151,6 +159,7 @@ def _figures(rows: list[Json]) -> list[Json]:
     closed = [row["gap"]["closed"] for row in right if row["gap"].get("closed") is not None]
     pooled = _pooled(row["gap"] for row in right)
     control = [row["control"] for row in rows if row["control"] is not None]
+    alone = [each["closed"] for each in control if each["by_angle"] <= _ALONE]
     return [
         _share("false alarms on no-effect cases", of["none"], lambda row: row["verdict"] in _NAMING, "at most 1 %", (0.0, 0.01)),
         _share(
@@ -170,7 +179,21 @@ def _figures(rows: list[Json]) -> list[Json]:
         _number(
             "gap closed, all cases' metres summed", [pooled] if pooled is not None else [], median, "(shown beside it)", None
         ),
-        _number("gap closed by the best wrong effect outside the class (median)", control, median, "at most 5 %", (0.0, 0.05)),
+        _number(
+            "gap closed by the best wrong effect outside the class (median)",
+            [each["closed"] for each in control],
+            median,
+            "at most 5 %",
+            (0.0, 0.05),
+        ),
+        _number(
+            "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)",
+            [each["by_angle"] for each in control],
+            median,
+            "",
+            None,
+        ),
+        _number("the same, where that angle leaves it 5 % at most", alone, median, "at most 5 %", (0.0, 0.05)),
         _share("two effects at once, both classes right", clear_two, lambda row: all(row["hits"]), "85 %", (0.85, 1.0)),
         _share(
             "rightly named, but the gap is within its uncertainty", right, lambda row: row["gap"].get("closed") is None, "", None

@@ -73,7 +73,8 @@ def _least(expected: float) -> float:
 
     The gain of a true effect, half a difference of two chi^2, has about twice its expectation as variance.
     """
-    return min(0.0, expected - _SIGMAS * float(np.sqrt(2 * max(expected, 0.0))))
+    likely = max(expected, 0.0)
+    return min(0.0, likely - _SIGMAS * float(np.sqrt(2 * likely)))
 
 
 def _value(

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scene.mesh import FloatArray
 
 BoolArray = NDArray[np.bool_]
+OUTLIER = 5.0
+"""Predicted sigmas, times what residuals spread of them, beyond which a point has no say."""
 
 
 @dataclass(frozen=True)

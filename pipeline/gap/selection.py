@@ -39,6 +39,8 @@ _WAVE_RATIO = 2.0
 _WAVE_SIGMAS = 1.0
 """Standard deviations of the reference's error that a wave without a name has to have at least."""
 _MOST_EFFECTS = 3
+_LEADING, _LARGE, _MOST_LEADING = 0.5, 50.0, 8
+"""Share of the largest gain that an effect must gain to be taken exactly too; the gain below which none is; how many at most."""
 _WIDTH = 5
 """Sets of one size that are grown further."""
 _NULL_ROWS = 8_000
@@ -275,10 +277,27 @@ class MeanSearch:
             return chosen, self.tried(members)
         return [self._chosen(best, item) for item in best.members], best.tried
 
-    def alone(self) -> Chosen:
-        """The effect of the catalogue that explains most by itself."""
-        best = next(item for item in self.tried(()) if not item.empirical)
-        return self._chosen(_Set((best,), best.score, ()), best)
+    def leading(self) -> list[Candidate]:
+        """Effects of the catalogue that are large and explain much by themselves, each variant for itself, best first."""
+        plain, fixed, _ = self.equations.profile(self._base, [self._place[id(candidate)] for candidate in self._plain])
+        gains = fixed[:, 0] - plain[0]
+        found = [(gain, each) for gain, each in zip(gains, self._plain, strict=True) if not each.empirical]
+        ranked = sorted(found, key=lambda item: -item[0])
+        least = max(_LEADING * ranked[0][0], _LARGE) if ranked else 0.0
+        return [each for gain, each in ranked if gain >= least][:_MOST_LEADING]
+
+    def alone(self, candidate: Candidate) -> Chosen:
+        """A candidate by itself."""
+        best = next(item for item in self.tried(()) if item.name == candidate.name and not item.empirical)
+        item = replace(best, candidate=candidate)
+        return self._chosen(_Set((item,), item.score, ()), item)
+
+    def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
+        """Of other residuals (n,) of the same points, pose and a candidate fitted."""
+        matrix = self._matrix([candidate], None)
+        columns = self._fixed.some(self._base).beside(self.model.project(self._without_pose(matrix)))
+        projected = self.model.project(value[self.model.rows, None] * self.model.root[:, None])
+        return fitted(self.model.fine, columns, projected).log_likelihood
 
     def _may_be_the_reference(self, members: tuple[Tried, ...], form: Tried) -> bool:
         """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave."""

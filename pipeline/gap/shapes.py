@@ -78,8 +78,14 @@ def log_density(rough: FloatArray, moved: FloatArray, sigma: FloatArray) -> Floa
 
 
 def refined(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
-    """The value of the largest total gain, on a grid and then on finer ones around the best."""
+    """The value of the largest total gain: on a grid, on finer ones around the best, and at the top of a parabola through three."""
     best = max(values, key=lambda each: float(gains(each).sum()))
+    step = 0.0
     for factor in factors:
-        best = max((best * factor**power for power in range(-3, 4)), key=lambda each: float(gains(each).sum()))
-    return best
+        tried = [float(gains(best * factor**power).sum()) for power in range(-4, 5)]
+        top = int(np.argmax(tried[1:-1])) + 1
+        low, middle, high = tried[top - 1 : top + 2]
+        curvature = low - 2 * middle + high
+        step = float(np.clip(0.5 * (low - high) / curvature, -1.0, 1.0)) if curvature < 0 else 0.0
+        best *= factor ** (top - 4)
+    return float(best * factors[-1] ** step) if factors else best

@@ -20,6 +20,7 @@ from pipeline.gap.disparity_raster import spacing
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.spread import SpreadFound
 from pipeline.robust import nmad
+from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel
 
@@ -33,29 +34,72 @@ _FINEST = 2.0
 """Cells of the raster from which on a grid of nodes differs from white noise."""
 _MARGIN = 6.0
 """Difference of chi^2 from which on one of the two is named alone."""
-_RIDGE = 0.02
+_RIDGE, _FEW = 0.02, 0.2
+"""Share of the covariance of lags added to its diagonal: always, and times lags per block of the wall: few blocks mistake it."""
+_BILINEAR = 4 / 9
+"""Mean variance of a grid of nodes of variance 1 that is interpolated bilinearly."""
+_DRAWS = 1999
+_ALONE, _LEAST_SIGMAS = 12.0, 4.0
+"""Difference of chi^2 and standard deviations of its variance that noise on nodes needs where points by themselves show none."""
+_LARGEST_REFERENCE_M = 0.02
+"""Error of the reference, correlated over metres, that there may be: smaller noise on nodes cannot be told from it."""
 
 
 @dataclass(frozen=True)
 class _Variogram:
-    """step: px of the raster; lag: (k, 2) px; value: (k,) px^2 less what the model predicts; root: (k, k) whitens it
-    (root @ value has unit variance)."""
+    """step: px of the raster; lag: (k, 2) px; blocks: (k, b) px^2 less what the model predicts, of each block of the wall times
+    its share of all points; root: (k, k) whitens their sum (root @ value has unit variance)."""
 
     step: float
     lag: FloatArray
-    value: FloatArray
+    blocks: FloatArray
     root: FloatArray
 
-    def fitted(self, form: FloatArray) -> tuple[float, float, float]:
-        """chi^2, variance and its standard deviation of a form (k,) beside the reference's error; both at least 0."""
+    @property
+    def value(self) -> FloatArray:
+        """(k,) of all blocks, px^2."""
+        return np.asarray(self.blocks.sum(axis=1))
+
+    def fitted(self, form: FloatArray) -> _Form:
+        """A form (k,) beside the reference's error; both at least 0."""
         smooth = np.sum(self.lag**2, axis=1)
         columns = self.root @ np.stack([form, smooth / smooth.max()], axis=1)
         value = self.root @ self.value
-        best = np.linalg.lstsq(columns, value, rcond=None)[0]
-        if best[1] < 0:
-            columns, best = columns[:, :1], np.linalg.lstsq(columns[:, :1], value, rcond=None)[0]
-        covariance = np.linalg.inv(columns.T @ columns)
-        return float(np.sum((value - columns @ best) ** 2)), float(best[0]), float(np.sqrt(covariance[0, 0]))
+        weights = np.linalg.pinv(columns)
+        if weights[1] @ value < 0:
+            columns, weights = columns[:, :1], np.linalg.pinv(columns[:, :1])
+        best = weights @ value
+        square = float(np.sum((value - columns @ best) ** 2))
+        shares = weights[0] @ self.root @ self.blocks
+        worse = np.sqrt(max(square / (len(value) - columns.shape[1]), 1.0))  # than a form of the right kind would fit
+        error = max(worse * float(np.linalg.norm(weights[0])), float(np.linalg.norm(shares - shares.mean())))
+        return _Form(square, float(best[0]), error, shares)
+
+    @property
+    def smooth_square(self) -> float:
+        """chi^2 of the reference's error alone."""
+        smooth = np.sum(self.lag**2, axis=1)
+        column, value = self.root @ (smooth / smooth.max()), self.root @ self.value
+        return float(value @ value - max(column @ value, 0.0) ** 2 / (column @ column))
+
+    def best_nodes(self) -> tuple[_Form, float, list[float]] | None:
+        """The grid of nodes that fits best with its step, px, and steps that fit as well; None where all are too fine for it."""
+        trials = [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= _FINEST * self.step]
+        if not trials:
+            return None
+        form, step = min(trials, key=lambda trial: trial[0].square)
+        return form, step, [each for trial, each in trials if trial.square < form.square + 1]
+
+
+@dataclass(frozen=True)
+class _Form:
+    """A form of the semivariogram fitted. square: chi^2; variance and its standard deviation, px^2; blocks: (b,) shares of the
+    variance."""
+
+    square: float
+    variance: float
+    error: float
+    blocks: FloatArray
 
 
 def told_apart(found: list[SpreadFound], part: Residuals, value: FloatArray, model: StereoModel) -> list[SpreadFound]:
@@ -66,41 +110,61 @@ def told_apart(found: list[SpreadFound], part: Residuals, value: FloatArray, mod
     return [_named(each, part, value, model) if each.name == "parallax_noise" else each for each in found]
 
 
+def find_nodes(part: Residuals, value: FloatArray, model: StereoModel, random: KeyedRandom) -> SpreadFound | None:
+    """Noise on nodes so far apart that the points around one do not differ by it; larger than a reference may be wrong.
+
+    value: (n,) residuals without the mean effects found.
+    """
+    variogram = _variogram(part, value, model)
+    best = None if variogram is None else variogram.best_nodes()
+    if variogram is None or best is None:
+        return None
+    form, step, near = best
+    without = min(variogram.smooth_square, variogram.fitted(np.ones(len(variogram.lag))).square)
+    certain = form.square < without - _ALONE and form.variance > _LEAST_SIGMAS * form.error
+    if not certain or np.sqrt(form.variance) * float(np.median(part.unit_m)) < _LARGEST_REFERENCE_M:
+        return None
+    signs = random.child("nodes").generator().choice([-1.0, 1.0], size=(len(form.blocks), _DRAWS))
+    p_value = float((1 + np.sum(np.abs(form.blocks @ signs) >= form.variance)) / (1 + _DRAWS))
+    name = "regularization_noise"
+    found = SpreadFound(name, name, (), p_value, (without - form.square) / 2, {}, {}, False, np.zeros(len(part)))
+    return _on_nodes(found, form, step, near)
+
+
 def _named(white: SpreadFound, part: Residuals, value: FloatArray, model: StereoModel) -> SpreadFound:
     both = replace(white, alike=tuple(sorted({*white.alike, "regularization_noise"})))
     variogram = _variogram(part, value, model)
     if variogram is None:
         return both
-    plain, variance, error = variogram.fitted(np.ones(len(variogram.value)))
-    if variance > 0:
-        both = _with_variance(both, variance, error, 1.0)
+    plain = variogram.fitted(np.ones(len(variogram.lag)))
+    if plain.variance > 0:
+        both = _with_variance(both, plain, 1.0)
     resolved = _FINEST * variogram.step <= _STEPS_PX[0]  # else a grid may be too fine for this raster to tell
     white = replace(both, alike=white.alike) if resolved else both
-    trials = [(variogram.fitted(_nodes(variogram.lag, step)), step) for step in _STEPS_PX if step >= _FINEST * variogram.step]
-    (square, variance, error), step = min(trials, key=lambda trial: trial[0][0], default=((np.inf, 0.0, 0.0), 0.0))
-    if plain < square - _MARGIN:
+    best = variogram.best_nodes()
+    if best is None or plain.square < best[0].square - _MARGIN:
         return white
-    if variance <= 0 or plain < square + _MARGIN:
+    if best[0].variance <= 0 or plain.square < best[0].square + _MARGIN:
         return both
-    near = [each for trial, each in trials if trial[0] < square + 1]
-    nodes = _with_variance(
-        replace(white, name="regularization_noise", effect="regularization_noise", alike=()), variance, error, 4 / 9
-    )
-    return replace(
-        nodes,
-        parameters={**nodes.parameters, "step_px": step},
-        std={**nodes.std, "step_px": max(float(np.std(near)), 0.2 * step)},
-    )
+    nodes = replace(white, name="regularization_noise", effect="regularization_noise", alike=())
+    return _on_nodes(nodes, *best)
 
 
-def _with_variance(found: SpreadFound, variance: float, error: float, share: float) -> SpreadFound:
+def _on_nodes(found: SpreadFound, form: _Form, step: float, near: list[float]) -> SpreadFound:
+    """With the parameters of a grid of nodes."""
+    nodes = _with_variance(found, form, _BILINEAR)
+    parameters, std = {**nodes.parameters, "step_px": step}, {**nodes.std, "step_px": max(float(np.std(near)), 0.2 * step)}
+    return replace(nodes, parameters=parameters, std=std)
+
+
+def _with_variance(found: SpreadFound, form: _Form, share: float) -> SpreadFound:
     """With the standard deviation sigma_px that a variance with its error gives. share: of it that a disparity has on average."""
-    sigma = float(np.sqrt(variance))
+    sigma = float(np.sqrt(form.variance))
     return replace(
         found,
         parameters={"sigma_px": sigma},
-        std={"sigma_px": error / (2 * sigma)},
-        variance=np.full(len(found.variance), share * variance),
+        std={"sigma_px": form.error / (2 * sigma)},
+        variance=np.full(len(found.variance), share * form.variance),
     )
 
 
@@ -128,9 +192,10 @@ def _variogram(part: Residuals, value: FloatArray, model: StereoModel) -> _Vario
     mean = means @ weight
     left = (means - mean[:, None]) * np.sqrt(weight)
     covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
-    covariance += _RIDGE * np.diag(np.diag(covariance))
+    covariance += (_RIDGE + _FEW * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
     offsets = np.array([[lag * step * (axis == 1), lag * step * (axis == 0)] for axis in (0, 1) for lag in lags])
-    return _Variogram(step, offsets, mean - _predicted(offsets, model), np.linalg.inv(np.linalg.cholesky(covariance)))
+    blocks = (means - _predicted(offsets, model)[:, None]) * weight
+    return _Variogram(step, offsets, blocks, np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def _by_block(raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int) -> tuple[FloatArray, FloatArray]:
@@ -162,7 +227,7 @@ def _predicted(lag: FloatArray, model: StereoModel) -> FloatArray:
 def _nodes(lag: FloatArray, step: float) -> FloatArray:
     """(k,) semivariogram of a grid of nodes of variance 1."""
     across, down = (_spline(lag[:, axis] / step) for axis in (0, 1))
-    return 4 / 9 - across * down
+    return _BILINEAR - across * down
 
 
 def _spline(x: FloatArray) -> FloatArray:

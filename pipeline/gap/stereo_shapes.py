@@ -7,13 +7,14 @@ with the effect than to that without, in blocks all over the wall.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom
 
 from pipeline.gap.disparity_raster import RASTER_EFFECTS, DisparityRaster
+from pipeline.gap.entries import typical_sizes
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.shapes import Blocks, ShapeFound, log_density, refined
@@ -59,6 +60,14 @@ class _Witnesses:
         more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
         return np.where((moved == without) | self.held_out, 0.0, more)
 
+    def likelier(self, beside: list[Effect], found: list[ShapeFound]) -> ShapeFound:
+        """Of effects that may feign each other, the one that explains more of the points that any of them moves clearly."""
+        without = self.raster.moved(beside, self.disparity)
+        moved = [self.raster.moved([*beside, each.effect], self.disparity) for each in found]
+        clear = ~self.held_out & np.any([np.abs(each - without) > _CLEAR * self.sigma for each in moved], axis=0)
+        gains = [float(log_density(self.rough, each, self.sigma)[clear].sum()) for each in moved]
+        return found[int(np.argmax(gains))]
+
 
 def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArray, held_out: BoolArray) -> list[ShapeFound]:
     """The effects on the shape that the points ask for, one after another. rough: (n,) registered residuals, px; held_out: (n,)
@@ -80,19 +89,26 @@ def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArra
         held_out,
     )
     found: list[ShapeFound] = []
+
+    def smoothing(untouched: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+        touched = np.any([np.zeros(len(rough), dtype=bool), *(each.touched for each in found)], axis=0)
+        return _smoothing(replace(untouched, held_out=held_out | touched), beside)
+
     trials: dict[str, Callable[[_Witnesses, list[Effect]], ShapeFound | None]] = {
         "edge_fattening": _fattening,
-        "smoothing": _smoothing,
+        "smoothing": smoothing,
         "occlusion_fill": _filling,
     }
     for name in {effect.name for effect in believed}:
         del trials[name]
     while trials:
         beside = [*believed, *(each.effect for each in found)]
-        tried = [each for trial in trials.values() if (each := trial(witnesses, beside)) is not None]
+        tried = {name: each for name, trial in trials.items() if (each := trial(witnesses, beside)) is not None}
         if not tried:
             break
-        found.append(max(tried, key=lambda each: each.gain))
+        feigned = [tried.pop(name) for name in ("edge_fattening", "smoothing") if name in tried]
+        likely = [witnesses.likelier(beside, feigned)] if feigned else []
+        found.append(max([*likely, *tried.values()], key=lambda each: each.gain))
         del trials[found[-1].name]
     return found
 
@@ -160,13 +176,15 @@ def _strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArray[np.int
 def _reach(widths: NDArray[np.int64], held: BoolArray, step: float) -> tuple[float, float]:
     """Widest strip that is filled and its standard deviation, px: by which strips hold points.
 
-    Where all of them do, the widest is the least that the reach may be: it is given with a standard deviation as large as itself.
+    Where all of them do, the widest is the least that the reach may be; how much more it is, is known as before: as much as is
+    typical, give or take that (an exponential distribution).
     """
     tried = np.unique(widths)
     best = int(np.argmax([_log_chance(held, widths <= each) for each in tried]))
     low = float(tried[best])
     if best + 1 == len(tried):
-        return (low + 0.5) * step, low * step
+        typical = typical_sizes("occlusion_fill")["reach_px"]
+        return (low + 0.5) * step + typical, typical
     return (low + tried[best + 1]) / 2 * step, (tried[best + 1] - low) / np.sqrt(12) * step
 
 

@@ -14,13 +14,14 @@ from threadpoolctl import threadpool_limits
 from pipeline.gap.cells import Cells, block_numbers, held_out_blocks
 from pipeline.gap.changes import SceneChange, find_changes
 from pipeline.gap.entries import SPREADS, Named, from_missing, from_shape, from_tails, with_effects
+from pipeline.gap.families import believes
 from pipeline.gap.footprint import find_footprint
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.missing import LOSSES, MissingFound, find_missing, isolated
-from pipeline.gap.naming import Naming, believes, name_effects
+from pipeline.gap.naming import Naming, name_effects
 from pipeline.gap.registration import registered, residuals_of, settled
-from pipeline.gap.residuals import BoolArray, Residuals
+from pipeline.gap.residuals import OUTLIER, BoolArray, Residuals
 from pipeline.gap.selection import Tried
 from pipeline.gap.shapes import ShapeFound
 from pipeline.gap.showing import Showing
@@ -33,12 +34,11 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
-STEPS = {"residuals": 3.0, "changes": 4.0, "naming": 10.0, "verification": 2.0}
+STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
 """The steps of `diagnose` and about what each takes, s."""
 FEWEST_POINTS = 800
 _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
-_CLIP = 5.0
 _LEFT_OVER = 0.02
 """Of the gain of an empirical term on the mean, what a spread gains that is only the part of the form that the term misses."""
 _EARLY_SIGMAS, _EARLY_M = 8.0, 0.5
@@ -92,9 +92,8 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     clock.lap("residuals")
     if plain.smooth.sum() < FEWEST_POINTS:
         return _insufficient(measurement, plain, clock)
-    state = _State.of(there, plain, held_points, *_shapes(there, plain, held_points))
-    clock.lap("changes")
-    state, named, naming = _named(there, plain, held_points, state, random)
+    explained = _named(there, plain, held_points, random)
+    state, named, naming = explained.state, explained.named, explained.naming
     losses = _missing(there, state)
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
     named = sorted([*named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
@@ -108,7 +107,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         learned=state.shown & ~state.held_out,
         losses=losses,
         reference_sigma=naming.reference_sigma,
-        largest=_CLIP * state.scale,
+        largest=OUTLIER * state.scale,
         random=random,
     )
     shown, harmful = showing.show(named)
@@ -169,7 +168,7 @@ class _State:
         rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
         held_out = held_points[residuals.index]
-        usable = residuals.smooth & ~changed & (np.abs(rough) < _CLIP * scale * residuals.sigma)
+        usable = residuals.smooth & ~changed & (np.abs(rough) < OUTLIER * scale * residuals.sigma)
         chosen = _thinned(np.flatnonzero(usable & ~held_out))
         return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
 
@@ -184,22 +183,56 @@ class _State:
         return few(self.shaped, self.residuals, self.chosen)
 
 
-def _named(
-    there: Measurement, plain: Residuals, held_points: BoolArray, state: _State, random: KeyedRandom
-) -> tuple[_State, list[Named], Naming]:
-    """What the naming started from in the end, and what it named: the shapes are looked at again with that in the model."""
-    named, naming = name_effects(*state.part, state.scale, random)
-    if named:
-        # what moves the beam everywhere hides, or feigns, what it does at edges
-        model = with_effects(there.model, [item.entry for item in named])
-        beside = settled(there.changed(model=model), plain.index[~held_points[plain.index]])
-        again = _shapes(beside[0], beside[1], held_points)
-        names, had = ({each.name for each in found} for found in (again[0], state.shapes))
+@dataclass(frozen=True)
+class _Attempt:
+    """What naming started from and what it named."""
+
+    state: _State
+    named: list[Named]
+    naming: Naming
+
+    @classmethod
+    def of(cls, state: _State, random: KeyedRandom) -> _Attempt:
+        return cls(state, *name_effects(*state.part, state.scale, random))
+
+    @property
+    def shapes(self) -> set[str]:
+        """Effects where the surface is not smooth."""
+        return {each.name for each in self.state.shapes}
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Empirical terms, and all effects and changes of the scene."""
+        state = self.state
+        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(state.shapes) + len(state.changes)
+
+
+def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random: KeyedRandom) -> _Attempt:
+    """What the naming started from in the end, and what it named.
+
+    What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
+    what was named; and where there seemed to be some, beside what is named without them. Fewer effects are the explanation.
+    """
+
+    def beside(found: _Attempt) -> _Attempt:
+        if not found.named:
+            return found
+        model = with_effects(there.model, [item.entry for item in found.named])
+        seen = settled(there.changed(model=model), plain.index[~held_points[plain.index]])[:2]
+        again = _State.of(there, plain, held_points, *_shapes(*seen, held_points))
+        names = {each.name for each in again.shapes}
         # rays that are not quite where they are thought to be look like a low-pass
-        if names != had and ("smoothing" in had or "smoothing" not in names):
-            state = _State.of(there, plain, held_points, *again)
-            named, naming = name_effects(*state.part, state.scale, random)
-    return state, named, naming
+        feigned = "smoothing" in names - found.shapes
+        return found if names == found.shapes or feigned else _Attempt.of(again, random)
+
+    first = _Attempt.of(_State.of(there, plain, held_points, *_shapes(there, plain, held_points)), random)
+    found = [beside(first)]
+    if first.shapes:
+        untouched = np.zeros(len(held_points), dtype=bool)
+        smooth = _Attempt.of(_State.of(there, plain, held_points, [], untouched), random)
+        if smooth.named:
+            found.append(beside(smooth))
+    return min(found, key=lambda each: each.complexity)
 
 
 def _confirmed(there: Measurement, state: _State, named: list[Named], reference_sigma: float) -> tuple[list[Named], list[str]]:

@@ -1,0 +1,77 @@
+"""Large effects, which slopes say only half of, and what is known of an effect's size before there are data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gap_cases import write_scan
+
+from benchmarks.gap_challenge import stereo_cases
+from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_challenge.strength import Target
+from pipeline.gap.cells import Cells, held_out_blocks
+from pipeline.gap.entries import Named
+from pipeline.gap.held_out import score_effects
+from pipeline.gap.mean_model import MeanModel, fitted
+from pipeline.gap.measurement import read_measurement
+from pipeline.gap.registration import settled
+from pipeline.gap.workflow import diagnose
+
+
+class _Strong(Target):
+    """Effects as large as the generator makes them."""
+
+    @classmethod
+    def draw(cls, random: np.random.Generator) -> Target:
+        return Target(400.0, own=False)
+
+
+@pytest.mark.parametrize("kind", ["camera_phi", "camera_omega"])
+def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """Some milliradians, which move the registered pair by metres: slopes give half the angle and make up for the rest with
+    other effects."""
+    monkeypatch.setattr(stereo_cases, "Target", _Strong)
+    make(Case(0, (3, 1), "one", "stereo", (kind,), 8_000, 8_000), tmp_path / "case", tmp_path / "truth.json")
+    (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
+    found = diagnose(read_measurement(tmp_path / "case"))
+    (effect,) = found.effects
+    assert f"stereo.{kind}" in {effect.name, *effect.alike}
+    if effect.name == f"stereo.{kind}" and effect.entry["camera"] == truth["parameters"]["camera"]:
+        error = effect.entry["angle_rad"] - truth["parameters"]["angle_rad"]
+        assert abs(error) < max(4 * effect.std["angle_rad"], 0.02 * abs(truth["parameters"]["angle_rad"]))
+    assert found.gap is not None
+    assert (found.gap.closed or 0.0) > 0.9
+
+
+def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
+    """One column under white noise: (x'x + k)^-1 x'y, and that inverse as the variance."""
+    rng = np.random.default_rng(1)
+    at = rng.uniform(0, 20, (4000, 2))
+    model = MeanModel(Cells.over(at), np.full(4000, 0.5))
+    x, y = rng.standard_normal((4000, 1)), rng.standard_normal((4000, 1))
+    columns, value = (model.project(each[model.rows] / 0.5) for each in (x, y))
+    white = [each for each in model.fine if each.ratio == 0.0]
+    gram = float((x[model.rows] ** 2).sum()) / 0.25
+    right = float((x[model.rows] * y[model.rows]).sum()) / 0.25
+    for known in (0.0, gram, 100 * gram):
+        found = fitted(white, columns, value, np.array([[known]]))
+        assert found.coefficients[0] == pytest.approx(right / (gram + known), rel=1e-6)
+        assert found.covariance[0, 0] == pytest.approx(1 / (gram + known), rel=1e-6)
+
+
+def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path: Path) -> None:
+    """Ranges grow with the incidence angle; beside that a scale error is named that is not there, nine parts in 10,000."""
+    write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
+    there, residuals, _ = settled(read_measurement(tmp_path))
+    trained = ~held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    true, wrong = (
+        Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
+        for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 900.0))
+    )
+    scored = score_effects(there, residuals, [wrong, true], trained, 0.0004)
+    assert [item.name for item in scored.failed] == ["tls.range_scale"]
+    assert [item.name for item in scored.named] == ["tls.range_incidence_bias"]
+    assert scored.named[0].gain > 50
