@@ -98,9 +98,12 @@ def write_scan(
     fall: tuple[float, float, float] | None = None,
     step_rad: float = 0.0045,
     intensity: bool = True,
+    epochs: int = 1,
+    stable_areas: list[list[float]] | None = None,
 ) -> None:
-    """A laser scan. angles: (azimuth, zenith, line) to recorded minus true angles; ranges: recorded ranges; lost: returns lost;
-    fall: x, z and depth of a niche of 1.2 m that the reference does not have."""
+    """A laser scan, or epochs of it whose poses are off each for itself. angles: (azimuth, zenith, line) to recorded minus true
+    angles; ranges: recorded ranges; lost: returns lost; fall: x, z and depth of a niche of 1.2 m that the reference does not
+    have."""
     rng = np.random.default_rng(seed)
     shape = int(WIDTH / STEP) + 1, int(HEIGHT / STEP) + 1
     nodes = 0.5 * smooth_noise(shape, 9.0, rng) + 0.08 * smooth_noise(shape, 2.5, rng)
@@ -114,22 +117,32 @@ def write_scan(
     zenith = np.arange(0.85, 1.63, step_rad)
     az, ze = (grid.ravel() for grid in np.meshgrid(azimuth, zenith, indexing="ij"))
     line = np.repeat(np.arange(len(azimuth)), len(zenith)).astype(float)
-    daz, dz = (np.zeros_like(az),) * 2 if angles is None else angles(az, ze, line)
-    true_az, true_z = (nominal - error - ANGLE_SIGMA * rng.standard_normal(len(az)) for nominal, error in ((az, daz), (ze, dz)))
-    pose = 0.002 * rng.standard_normal(3), 3e-5 * rng.standard_normal(3)
-    rotation = _turned(turn)
-    skew = np.array([[0, -pose[1][2], pose[1][1]], [pose[1][2], 0, -pose[1][0]], [-pose[1][1], pose[1][0], 0]])
-    true_range, cosine = wall.cast(position + pose[0], unit(true_az, true_z) @ (rotation.T @ (np.eye(3) + skew).T))
-    hit = np.isfinite(true_range) & (cosine > 0.15)
-    albedo = 0.4 * np.exp(0.35 * np.interp(az, azimuth, smooth_noise((len(azimuth), 2), 8.0, rng)[:, 0]))
-    albedo = albedo * np.exp(0.3 * rng.standard_normal(len(az)))
-    power = albedo * cosine * (100 / np.where(hit, true_range, 1e3)) ** 2
-    scan = Scan(true_range + SIGMA * rng.standard_normal(len(az)), az, ze, cosine, power, line, np.arange(len(az)) / len(az), rng)
-    recorded = scan.R if ranges is None else ranges(scan)
-    keep = hit & (rng.uniform(size=len(az)) > 0.01)
-    keep &= True if lost is None else ~lost(scan)
-    columns = [*(unit(az, ze) * recorded[:, None]).T, power, 5e-5 * np.arange(len(az))]
-    _points(folder / "scan.ply", [column[keep] for column in columns], ["x", "y", "z", "intensity", "gps_time"], intensity)
+    for epoch in range(epochs):
+        daz, dz = (np.zeros_like(az),) * 2 if angles is None else angles(az, ze, line)
+        true_az, true_z = (
+            nominal - error - ANGLE_SIGMA * rng.standard_normal(len(az)) for nominal, error in ((az, daz), (ze, dz))
+        )
+        pose = 0.002 * rng.standard_normal(3), 3e-5 * rng.standard_normal(3)
+        rotation = _turned(turn)
+        skew = np.array([[0, -pose[1][2], pose[1][1]], [pose[1][2], 0, -pose[1][0]], [-pose[1][1], pose[1][0], 0]])
+        true_range, cosine = wall.cast(position + pose[0], unit(true_az, true_z) @ (rotation.T @ (np.eye(3) + skew).T))
+        hit = np.isfinite(true_range) & (cosine > 0.15)
+        albedo = 0.4 * np.exp(0.35 * np.interp(az, azimuth, smooth_noise((len(azimuth), 2), 8.0, rng)[:, 0]))
+        albedo = albedo * np.exp(0.3 * rng.standard_normal(len(az)))
+        power = albedo * cosine * (100 / np.where(hit, true_range, 1e3)) ** 2
+        scan = Scan(
+            true_range + SIGMA * rng.standard_normal(len(az)), az, ze, cosine, power, line, np.arange(len(az)) / len(az), rng
+        )
+        recorded = scan.R if ranges is None else ranges(scan)
+        keep = hit & (rng.uniform(size=len(az)) > 0.01)
+        keep &= True if lost is None else ~lost(scan)
+        columns = [*(unit(az, ze) * recorded[:, None]).T, power, 5e-5 * np.arange(len(az))]
+        _points(
+            folder / f"scan_{epoch}.ply",
+            [column[keep] for column in columns],
+            ["x", "y", "z", "intensity", "gps_time"],
+            intensity,
+        )
     Field(nodes + 0.0004 * smooth_noise(shape, 3.0, rng)).write(folder / "wall.ply")
     _yaml(
         folder / "model.yaml", {"sensor": "tls", "noise": {"range_sigma_m": SIGMA, "angle_sigma_rad": ANGLE_SIGMA}, "effects": []}
@@ -139,7 +152,8 @@ def write_scan(
         {
             "sensor": "tls",
             "reference": "wall.ply",
-            "points": "scan.ply",
+            "points": [f"scan_{epoch}.ply" for epoch in range(epochs)] if epochs > 1 else "scan_0.ply",
+            "stable_areas": stable_areas or [],
             "frame": "scanner",
             "scanner": {"position_m": position.tolist(), "rotation": rotation.tolist()},
             "pattern": {

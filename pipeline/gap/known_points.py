@@ -91,8 +91,8 @@ def _ordered(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _only_geometry(like: Residuals, geometry: TlsGeometry, sigma: FloatArray, pose: FloatArray) -> Residuals:
     zero = np.zeros(len(sigma))
     return replace(
-        like, value=zero, sigma=sigma, unit_m=zero + 1, smooth=zero < 1, pose=pose, at=np.zeros((len(sigma), 2)), covariates={},
-        index=np.arange(len(sigma)), geometry=geometry, missing=None,
+        like, value=zero, sigma=sigma, unit_m=zero + 1, smooth=zero < 1, even=zero < 1, pose=pose, at=np.zeros((len(sigma), 2)),
+        covariates={}, index=np.arange(len(sigma)), geometry=geometry, missing=None,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, field_validator
 
+from pipeline.areas import Area, in_areas
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import read_cameras_yaml
 from pipeline.formats.ply import read_ply
@@ -65,7 +66,9 @@ class MeasurementConfig(Config):
     scanner: ScannerPose | None = None
     pattern: ScanPattern | None = None
     cameras: Path | None = Field(None, description="cameras.yaml or a Metashape XML: the nominal calibration (stereo)")
-    stable_areas: list[Any] = Field([], description="polygons or boxes in the wall frame: [x0, y0, x1, y1] or [[x, y], ...]")
+    stable_areas: tuple[Area, ...] = Field(
+        (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]"
+    )
     model: Path = Field(description="what the simulation believes about the sensor today")
 
 
@@ -83,7 +86,8 @@ class Measurement:
 
     cloud: points in the wall frame; reference: wall frame; station: position (3,) and rotation (3, 3) scanner to wall frame, TLS
     only; cameras: world frame, stereo only; frame: the wall frame; order: each point's scan line and share of the scan's duration
-    (n,), None where not known, once they were counted (see `with_order`).
+    (n,), None where not known, once they were counted (see `with_order`); stable_areas: outside of which the scene may have
+    changed, everywhere where there are none.
     """
 
     sensor: Literal["tls", "stereo"]
@@ -95,6 +99,18 @@ class Measurement:
     station: tuple[FloatArray, FloatArray] | None = None
     cameras: CameraPair | None = None
     order: tuple[FloatArray | None, FloatArray | None] | None = None
+    stable_areas: tuple[Area, ...] = ()
+
+    @property
+    def epochs(self) -> NDArray[np.int64]:
+        """(n,) the epoch of each point, from 0."""
+        return np.asarray(self.cloud.extra.get("epoch", np.zeros(len(self.cloud.points))), dtype=np.int64)
+
+    @property
+    def stable(self) -> NDArray[np.bool_]:
+        """(n,) points in the areas where nothing moved; all where none are given."""
+        x, y = self.cloud.points[:, :2].T
+        return in_areas(self.stable_areas, x, y) if self.stable_areas else np.ones(len(x), dtype=bool)
 
     @cached_property
     def scene(self) -> RayCaster:
@@ -151,6 +167,7 @@ def read_measurement(folder: Path) -> Measurement:
         pattern=config.pattern,
         station=station,
         cameras=cameras,
+        stable_areas=config.stable_areas,
     )
 
 

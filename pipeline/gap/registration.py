@@ -44,8 +44,15 @@ def pose_of(residuals: Residuals) -> FloatArray:
 
 
 def residuals_of(measurement: Measurement) -> Residuals:
-    """The raw residuals of either sensor."""
-    return tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
+    """The raw residuals of either sensor; those of several epochs as if all had been taken from one place."""
+    found = tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
+    epochs = measurement.epochs[found.index]
+    numbers = np.unique(epochs)
+    if len(numbers) < 2:
+        return found
+    poses = np.stack([registered(found.part(epochs == number))[1] for number in numbers])
+    away = (poses - poses.mean(axis=0))[np.searchsorted(numbers, epochs)]
+    return replace(found, value=found.value - np.einsum("ni,ni->n", found.pose, away))
 
 
 def settled(

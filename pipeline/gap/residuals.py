@@ -21,10 +21,11 @@ class Residuals:
 
     value, sigma: (n,), m of range (TLS) or px of disparity (stereo), sigma being what the model predicts; unit_m: (n,) metres of
     range or depth per unit of the observable; smooth: (n,) where the surface around the point is smooth enough for a mean to make
-    sense; pose: (n, 6) derivatives by translation (m) and rotation (rad) of the sensor in the wall frame; at: (n, 2) wall frame
-    x, y of the reference's point, which unlike the measured one does not move with the noise, m; covariates: named (n,) arrays;
-    index: (n,) rows of the measurement's points; missing: of the pulses that were sent and should have met the wall, None where
-    the pattern is not known; shared_noise: variance, and width on the wall (m), of predicted noise that neighbours share.
+    sense, and of stable ground; even: the same of any ground; pose: (n, 6) derivatives by translation (m) and rotation (rad) of
+    the sensor in the wall frame; at: (n, 2) wall frame x, y of the reference's point, which unlike the measured one does not move
+    with the noise, m; covariates: named (n,) arrays; index: (n,) rows of the measurement's points; missing: of the pulses that
+    were sent and should have met the wall, None where the pattern is not known; shared_noise: variance, and width on the wall
+    (m), of predicted noise that neighbours share.
     """
 
     sensor: str
@@ -32,6 +33,7 @@ class Residuals:
     sigma: FloatArray
     unit_m: FloatArray
     smooth: BoolArray
+    even: BoolArray
     pose: FloatArray
     at: FloatArray
     covariates: dict[str, FloatArray]
@@ -52,6 +54,7 @@ class Residuals:
             sigma=self.sigma[rows],
             unit_m=self.unit_m[rows],
             smooth=self.smooth[rows],
+            even=self.even[rows],
             pose=self.pose[rows],
             at=self.at[rows],
             covariates={name: values[rows] for name, values in self.covariates.items()},

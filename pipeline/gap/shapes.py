@@ -78,7 +78,7 @@ def log_density(rough: FloatArray, moved: FloatArray, sigma: FloatArray) -> Floa
 
 
 def refined(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
-    """The value of the largest total gain: on a grid, on finer ones around the best, and at the top of a parabola through three."""
+    """The value of the largest total gain: on a grid, on finer ones around the best, at the top of a parabola through three."""
     best = max(values, key=lambda each: float(gains(each).sum()))
     step = 0.0
     for factor in factors:

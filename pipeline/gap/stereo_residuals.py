@@ -74,12 +74,14 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
     slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
     covariates = _covariates(nominal, geometry, depth, curvature)
     mean = _mean_error(model, geometry, measurement) + _empirical(model, covariates)
+    even = hit & ~hidden & (curvature < _EDGE_PX)
     whole = Residuals(
         sensor="stereo",
         value=measured - geometry.disparity - mean,
         sigma=np.full(len(u), np.sqrt(predicted_variance(model))),
         unit_m=1 / slope,
-        smooth=hit & ~hidden & (curvature < _EDGE_PX),
+        smooth=even & measurement.stable,
+        even=even,
         pose=_pose(nominal, geometry),
         at=geometry.point[:, :2],
         covariates=covariates,

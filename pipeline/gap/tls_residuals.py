@@ -6,10 +6,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.gap.directed import aimed, simulated_ranges
 from pipeline.gap.measurement import Measurement, ScanPattern
-from pipeline.gap.residuals import Missing, Residuals, plane_slopes
+from pipeline.gap.residuals import BoolArray, Missing, Residuals, plane_slopes
 from pipeline.gap.tls_signatures import log_over_median
 from pipeline.gap.tls_spread import model_variance
 from scene.errors import InputError
@@ -97,7 +98,8 @@ def tls_residuals(measurement: Measurement) -> Residuals:
         value=measured - predicted,
         sigma=sigma,
         unit_m=np.ones_like(measured),
-        smooth=hit & flat,
+        smooth=hit & flat & measurement.stable,
+        even=hit & flat,
         pose=_pose(axes[0], normal, distance),
         at=(position + distance[:, None] * axes[0])[:, :2],
         covariates=_covariates(geometry, curvature),
@@ -169,8 +171,16 @@ def _order(measurement: Measurement, azimuth: FloatArray) -> tuple[FloatArray | 
     line = _lines(measurement.pattern, azimuth)
     time = measurement.cloud.gps_time
     if time is not None and np.ptp(time) > 0:
-        return line, (time - time.min()) / np.ptp(time)
+        return line, _shares(time, measurement.epochs)
     return line, None if line is None or line.max() == 0 else line / line.max()
+
+
+def _shares(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArray:
+    """(n,) share of its epoch's duration."""
+    first, last = np.full(epochs.max() + 1, np.inf), np.full(epochs.max() + 1, -np.inf)
+    np.minimum.at(first, epochs, time)
+    np.maximum.at(last, epochs, time)
+    return np.asarray((time - first[epochs]) / np.maximum(last - first, 1e-300)[epochs])
 
 
 def _lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | None:
@@ -213,21 +223,15 @@ def _notes(measurement: Measurement) -> tuple[str, ...]:
 
 
 def missing_returns(measurement: Measurement, residuals: Residuals) -> Missing | None:
-    """Every pulse of the pattern that should meet the wall, and whether it came back; None without a pattern.
+    """Every pulse of the pattern that should meet the wall, and whether it came back, epoch after epoch; None without a pattern.
 
     residuals: of all points of the measurement.
     """
-    pattern, geometry = measurement.pattern, residuals.geometry
+    pattern = measurement.pattern
     if pattern is None:
         return None
     position, rotation = _station(measurement)
     sweeps = [_sweep(values) for values in (pattern.azimuth_rad, pattern.zenith_rad)]
-    turn = 2 * np.pi * np.round((geometry.azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
-    columns = [np.rint((geometry.azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2])]
-    columns.append(np.rint((geometry.zenith - sweeps[1][0]) / pattern.zenith_rad[2]))
-    line, pulse = (np.clip(column, 0, len(sweep) - 1).astype(int) for column, sweep in zip(columns, sweeps, strict=True))
-    seen = np.zeros((len(sweeps[0]), len(sweeps[1])), dtype=bool)
-    seen[line, pulse] = True
     azimuth, zenith = (grid.ravel() for grid in np.meshgrid(*sweeps, indexing="ij"))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in _axes(azimuth, zenith)]
     distance, normal, curvature = _surface(measurement.scene, position, axes)
@@ -241,8 +245,21 @@ def missing_returns(measurement: Measurement, residuals: Residuals) -> Missing |
         "zenith": zenith,
     }
     at = (position + distance[:, None] * axes[0])[:, :2]
-    chosen = {name: values[usable] for name, values in covariates.items()}
-    return Missing(~seen.ravel()[usable], chosen, at[usable])
+    epochs = measurement.epochs[residuals.index]
+    seen = [_seen(pattern, sweeps, residuals.geometry.part(epochs == number))[usable] for number in np.unique(epochs)]
+    chosen = {name: np.tile(values[usable], len(seen)) for name, values in covariates.items()}
+    return Missing(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
+
+
+def _seen(pattern: ScanPattern, sweeps: list[FloatArray], geometry: TlsGeometry) -> BoolArray:
+    """(m,) pulses of a pattern in whose direction a point stands."""
+    turn = 2 * np.pi * np.round((geometry.azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
+    columns = [np.rint((geometry.azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2])]
+    columns.append(np.rint((geometry.zenith - sweeps[1][0]) / pattern.zenith_rad[2]))
+    line, pulse = (np.clip(column, 0, len(sweep) - 1).astype(int) for column, sweep in zip(columns, sweeps, strict=True))
+    seen = np.zeros((len(sweeps[0]), len(sweeps[1])), dtype=bool)
+    seen[line, pulse] = True
+    return seen.ravel()
 
 
 def _sweep(values: tuple[float, float, float]) -> FloatArray:

@@ -37,6 +37,8 @@ from sensors.model import StereoModel, TlsModel
 STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
 """The steps of `diagnose` and about what each takes, s."""
 FEWEST_POINTS = 800
+_FEWEST_EPOCHS = 3
+"""From so many epochs on the last is held out as a whole."""
 _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
 _LEFT_OVER = 0.02
@@ -86,6 +88,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     first = residuals_of(measurement)
     held_points = np.zeros(len(measurement.cloud.points), dtype=bool)
     held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
+    held_points |= _held_epoch(measurement.epochs)
     there, plain, surveyed = settled(measurement, first.index[~held_points[first.index]], first)
     if measurement.sensor == "tls":
         plain = replace(plain, missing=missing_returns(there, plain))
@@ -134,6 +137,12 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     )
 
 
+def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
+    """(n,) points of the last epoch where there are enough to learn from without it."""
+    last = int(epochs.max(initial=0))
+    return epochs == last if last + 1 >= _FEWEST_EPOCHS else np.zeros(len(epochs), dtype=bool)
+
+
 @dataclass(frozen=True)
 class _State:
     """What naming starts from, once effects where the surface is not smooth are known.
@@ -164,7 +173,7 @@ class _State:
         shaped, residuals = _shaped(there, plain, shapes, touched)
         rough, _, scale = registered(residuals)
         at_points = there.cloud.points[residuals.index]
-        changes, changed = find_changes(replace(residuals, value=rough), at_points, residuals.smooth)
+        changes, changed = find_changes(replace(residuals, value=rough), at_points, residuals.even & ~touched)
         rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
         held_out = held_points[residuals.index]
@@ -332,7 +341,7 @@ class _Clock:
 
 
 def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> Diagnosis:
-    note = f"{int(residuals.smooth.sum())} points on smooth parts of the reference, {FEWEST_POINTS} are needed"
+    note = f"{int(residuals.smooth.sum())} points on smooth parts of the reference and stable ground, {FEWEST_POINTS} are needed"
     empty = np.zeros(len(residuals))
     return Diagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, np.zeros(6), measurement.model,

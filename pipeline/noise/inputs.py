@@ -79,7 +79,7 @@ def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: Senso
     of_points = bool(measured.points)
     site = _measured_site(read_measurement(paths[0]), config) if of_points else prepare_site(config, sensor, random)
     areas = config.calibration.stable_areas
-    drawn = area_mask(areas, measured.grid, "calibration") if areas else measured.stable
+    drawn = area_mask(areas, measured.grid) if areas else measured.stable
     stable = _covered(measured.maps, of_points) & (unchanged(list(measured.maps)) if drawn is None else drawn)
     return Material(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points)
 

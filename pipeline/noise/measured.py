@@ -6,14 +6,14 @@ points' differences, so what is compared is never interpolated between points. M
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.areas import Area, in_areas
 from pipeline.closest_points import ReferenceSurface
 from pipeline.difference import DifferenceConfig, raster_grid
 from pipeline.formats.geotiff import read_geotiff
@@ -79,7 +79,7 @@ def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, 
     grid = raster_grid(bounds, DifferenceConfig(gsd_m=max(config.gsd_m, max(map(_spacing, clouds)))))
     maps = np.stack([point_differences(measurement.scene, points, grid) for points in clouds])
     areas = parse(MeasurementConfig, load_yaml(folder / FILE), str(folder / FILE)).stable_areas
-    stable = area_mask(areas, grid, str(folder / FILE)) if areas else None
+    stable = area_mask(areas, grid) if areas else None
     return MeasuredMaps(folder.name, grid, maps, stable, tuple(map(len, clouds)), tuple(registrations))
 
 
@@ -103,38 +103,8 @@ def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> N
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32).reshape(grid.shape)
 
 
-def area_mask(areas: Sequence[Any], grid: Grid, where: str) -> BoolArray:
-    """(h, w) the pixels whose centre lies in one of the areas: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame, m.
-
-    Raises InputError, naming `where`, for an area that is neither.
-    """
-    x = (grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd).astype(np.float64)
-    y = (grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd).astype(np.float64)
-    mask = np.zeros(grid.shape, dtype=bool)
-    for number, area in enumerate(areas):
-        try:
-            corners = np.array(area, dtype=np.float64)
-        except (TypeError, ValueError):
-            corners = np.zeros(0)
-        if corners.shape == (4,):
-            x0, y0, x1, y1 = corners
-            mask |= (y >= y0)[:, None] & (y <= y1)[:, None] & (x >= x0) & (x <= x1)
-        elif corners.ndim == 2 and corners.shape[0] >= 3 and corners.shape[1] == 2:
-            mask |= _inside(corners, x, y)
-        else:
-            raise InputError(
-                f"area {number + 1} is neither a box nor a polygon",
-                where=f"{where}: stable_areas",
-                allowed="[x0, y0, x1, y1] or [[x, y], [x, y], [x, y], ...]",
-            )
-    return mask
-
-
-def _inside(corners: FloatArray, x: FloatArray, y: FloatArray) -> BoolArray:
-    """(len(y), len(x)) even-odd rule: how many sides a ray to the right crosses."""
-    result = np.zeros((len(y), len(x)), dtype=bool)
-    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        crosses = (y0 > y) != (y1 > y)
-        at = x0 + (y[crosses] - y0) * (x1 - x0) / (y1 - y0) if crosses.any() else np.zeros(0)
-        result[crosses] ^= x[None] < at[:, None]
-    return result
+def area_mask(areas: Iterable[Area], grid: Grid) -> BoolArray:
+    """(h, w) the pixels whose centre lies in one of the areas."""
+    x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
+    y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
+    return in_areas(areas, *np.meshgrid(x.astype(np.float64), y.astype(np.float64)))

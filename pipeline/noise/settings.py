@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from pydantic import Field
 
+from pipeline.areas import Area
 from scene.config import Config
-
-Box = tuple[float, float, float, float]
-Vertex = tuple[float, float]
-Area = Box | Annotated[tuple[Vertex, ...], Field(min_length=3)]
-"""A box (x0, y0, x1, y1) or the vertices of a polygon, wall frame, m."""
 
 
 class CalibrationConfig(Config):

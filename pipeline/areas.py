@@ -1,0 +1,39 @@
+"""Areas of a wall, as configs draw them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from scene.mesh import FloatArray
+
+Box = tuple[float, float, float, float]
+Vertex = tuple[float, float]
+Area = Box | Annotated[tuple[Vertex, ...], Field(min_length=3)]
+"""A box (x0, y0, x1, y1) or the vertices of a polygon, wall frame, m."""
+
+
+def in_areas(areas: Iterable[Area], x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+    """Whether places x, y (of any one shape, wall frame, m) lie in one of the areas."""
+    found = np.zeros(np.shape(x), dtype=bool)
+    for area in areas:
+        corners = np.array(area, dtype=np.float64)
+        if corners.shape == (4,):
+            x0, y0, x1, y1 = corners
+            found |= (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)
+        else:
+            found |= _inside(corners, x, y)
+    return found
+
+
+def _inside(corners: FloatArray, x: FloatArray, y: FloatArray) -> Any:
+    """By the even-odd rule: how many sides a ray to the right crosses."""
+    found = np.zeros(np.shape(x), dtype=bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        crosses = (y0 > y) != (y1 > y)
+        found ^= crosses & (x < x0 + (y - y0) * (x1 - x0) / ((y1 - y0) or 1.0))
+    return found

@@ -1,0 +1,53 @@
+"""Several epochs, and ground that is known to be stable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gap_cases import Scan, write_scan
+
+from pipeline.gap.measurement import read_measurement
+from pipeline.gap.registration import residuals_of
+from pipeline.gap.workflow import Diagnosis, diagnose
+
+
+def found_in(folder: Path, seed: int, **how: Any) -> Diagnosis:
+    write_scan(folder, seed, step_rad=0.007, **how)
+    return diagnose(read_measurement(folder))
+
+
+def test_three_epochs_from_places_of_their_own_leave_no_gap_and_the_last_is_held_out(tmp_path: Path) -> None:
+    """Each stands some millimetres and 30 microradians off, which is no noise of the angles."""
+    found = found_in(tmp_path, 21, epochs=3)
+    assert (found.verdict, found.effects) == ("no_gap", ())
+    epochs = read_measurement(tmp_path).epochs[found.residuals.index]
+    assert found.held_out[epochs == 2].all()
+    assert 0.05 < found.held_out[epochs < 2].mean() < 0.5
+
+
+def test_an_effect_on_two_epochs_is_named(tmp_path: Path) -> None:
+    found = found_in(tmp_path, 22, epochs=2, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1))
+    (effect,) = found.effects
+    assert effect.name == "tls.range_incidence_bias"
+    assert abs(effect.entry["coefficient_m"] - 0.01) < 4 * effect.std["coefficient_m"]
+
+
+def half_that_moved(scan: Scan) -> Any:
+    """Ranges of a wall of which one half has crept up to 8 cm towards the scanner."""
+    return scan.R - 0.08 * np.clip((scan.az - np.median(scan.az)) / np.ptp(scan.az), 0, None) * (1 + scan.z)
+
+
+def still_half(folder: Path) -> list[float]:
+    """The other half as a box in the wall frame."""
+    residuals = residuals_of(read_measurement(folder))
+    azimuth = residuals.geometry.azimuth
+    x = residuals.at[azimuth < (azimuth.min() + azimuth.max()) / 2 - 0.03, 0]
+    return [float(x.min()), -1e3, float(x.max()), 1e3]
+
+
+def test_ground_that_may_have_moved_has_no_say(tmp_path: Path) -> None:
+    assert found_in(tmp_path, 23, ranges=half_that_moved).verdict != "no_gap"
+    found = found_in(tmp_path, 23, ranges=half_that_moved, stable_areas=[still_half(tmp_path)])
+    assert (found.verdict, found.effects) == ("no_gap", ())
