@@ -29,7 +29,7 @@ _MULTIPLES = np.arange(1, 5)
 _SMALLEST_P = 1e-4
 _ALIKE, _FITS = 6.0, 20.0
 """Difference of chi^2 (of four values) within which two amplitudes fit alike, and the most with which one fits."""
-_FOLDING = 1 / (2 * np.pi)
+_FOLDING, _FAR, _NO_SINE = 1 / (2 * np.pi), 0.3, 0.02
 _MOST_POINTS = 60_000
 
 
@@ -85,7 +85,7 @@ def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
 
     shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, _MOST_BLUR, 60)
     coarse = square(shares, blurs)
-    row = _plausible(shares, coarse.min(axis=1))
+    row = _plausible(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)
     for width in (0.01, 0.002):
         column = int(np.argmin(coarse[row]))
         shares = shares[row] + np.linspace(-width, width, 81)
@@ -102,16 +102,19 @@ def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
     return mean, float(np.sqrt(weight @ (around - mean) ** 2 + 1e-8))
 
 
-def _plausible(shares: FloatArray, square: FloatArray) -> int:
+def _plausible(shares: FloatArray, square: FloatArray, whole: float) -> int:
     """Row of the amplitude that is meant, of the minima of chi^2: Bessel functions come back to the same values.
 
-    Of amplitudes that fit alike it is the least; one that folds disparities over, from 1 / 2 pi on, has to fit well.
+    whole: chi^2 of no locking. Of amplitudes that fit alike it is the least; one that folds disparities over, from 1 / 2 pi on,
+    has to fit well, and one beyond `_FAR` gives way to a small one that leaves as little as a matcher's curve is no sine.
     """
     lowest = (square <= np.append(square[1:], np.inf)) & (square <= np.append(np.inf, square[:-1]))
     rows = np.flatnonzero(lowest & (square < square.min() + _ALIKE))
     unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
-    if square.min() > _FITS and len(unfolded):
-        rows = unfolded[[np.argmin(square[unfolded])]]
+    if len(unfolded):
+        small = int(unfolded[np.argmin(square[unfolded])])
+        if square.min() > _FITS or (shares[rows[0]] > _FAR and square[small] < _NO_SINE * whole):
+            return small
     return int(rows[0])
 
 

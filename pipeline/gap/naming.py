@@ -16,7 +16,7 @@ from pipeline.gap.quantization import find_comb
 from pipeline.gap.registration import registered
 from pipeline.gap.residuals import Residuals
 from pipeline.gap.selection import MeanSearch, Tried
-from pipeline.gap.spread import SpreadFound, SpreadTried, find_spread
+from pipeline.gap.spread import SpreadFound, SpreadTried, find_spread, share_of_spread
 from pipeline.gap.stereo_noise import find_nodes, told_apart
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -81,7 +81,8 @@ def name_effects(
     named += [from_spread(each, part.sensor) for each in spread]
     names, cosines, survival = first.identifiability()
     p_value = found.search.p_value(found.tried[0].score) if found.tried else 1.0
-    remaining = {"p_value": p_value, "note": "; ".join([*part.notes, *_words(left_out)])}
+    share = 1.0 if spread else share_of_spread(found.at, found.search.cells, left)
+    remaining = {"p_value": p_value, "note": "; ".join([*part.notes, *_words(left_out), *_quieter(share)])}
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     tried = found.chosen[0].tried if found.chosen else found.tried
     shown = tuple(item for item in tried if not item.name.startswith(PLACE))
@@ -100,3 +101,8 @@ def _spread(
 def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
     said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out))
     return [f"{what} left out: the best value is beyond what a config may hold" for what in said]
+
+
+def _quieter(share: float) -> list[str]:
+    said = f"the residuals spread {share:.0%} of what the model predicts: its noise is too large, which no effect can mend"
+    return [said] if share < 1.0 else []

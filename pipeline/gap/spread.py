@@ -21,6 +21,8 @@ _ALPHA = 0.004
 _LEAST_GAIN = 6.0
 _LEAST_EXCESS = 0.03
 """Added variance, as a share of the model's, below which the reference's own small errors may be meant."""
+_LEAST_SHARE = 0.9
+"""Of the predicted spread: less is worth a word."""
 _CLIP = 4.5
 _LEAST_LEFT = 0.3
 """Share of a point's variance that its cell's plane must leave."""
@@ -199,6 +201,20 @@ def find_spread(
             )
         )
     return found, tried
+
+
+def share_of_spread(residuals: Residuals, cells: Cells, value: FloatArray) -> float:
+    """How many of the predicted standard deviations the residuals really spread where that is clearly less, else 1.
+
+    No effect takes noise away: the model's own is too large.
+    """
+    z = standardised(residuals, cells, value)
+    kept = np.isfinite(z)
+    squared = np.minimum(z[kept] ** 2, _CUT**2)
+    means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
+    below = float(means.sum()) < -_BLOCK_SIGMAS * float(np.linalg.norm(means))
+    share = float(np.sqrt(squared.mean()))
+    return share if below and share < _LEAST_SHARE else 1.0
 
 
 def _best_variants(tried: list[SpreadTried]) -> list[SpreadTried]:

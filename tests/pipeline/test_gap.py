@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -125,3 +126,15 @@ def test_the_outcome_does_not_depend_on_the_number_of_threads(tmp_path: Path) ->
     finally:
         dr.set_thread_count(before)
     assert told[0] == told[1]
+
+
+def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
+    """Ranges of 3 mm noise against a model of 6 mm and the angles' share."""
+    write_scan(tmp_path, 31, step_rad=0.007)
+    model = tmp_path / "model.yaml"
+    model.write_text(model.read_text().replace("range_sigma_m: 0.003", "range_sigma_m: 0.006"))
+    found = diagnose(read_measurement(tmp_path))
+    assert (found.verdict, found.effects) == ("no_gap", ())
+    told = re.search(r"the residuals spread (\d+)% of what the model predicts", found.remaining["note"])
+    assert told is not None
+    assert 45 <= int(told[1]) <= 75
