@@ -174,8 +174,12 @@ def table(found: list[tuple[str, Diagnosis]]) -> str:
 
 
 def _entry(entry: dict[str, Any]) -> str:
-    values = {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in entry.items()}
-    return "`" + json.dumps(values).replace('"', "").replace("[", "").replace("]", "") + "`"
+    values = {
+        key: float(f"{value:.3g}") if isinstance(value, float) else value
+        for key, value in entry.items()
+        if isinstance(value, str | float | int)
+    }
+    return "`" + json.dumps(values).replace('"', "") + "`"
 
 
 def page(name: str, title: str, before: str, found: list[tuple[str, Diagnosis]]) -> None:
@@ -218,12 +222,13 @@ def main() -> None:
 _INTRODUCTIONS = {
     "real_pair": "Middlebury 2014's motorcycle (741 x 500 px, disparities measured with structured light) is matched by OpenCV's"
     " semi-global matching; the reference is the surface of the measured disparities, cut where they jump by more than 1 px,"
-    " and the model is the simulated matcher's default noise (0.3 px white, 0.1 px smooth). Made by\n\n"
+    " and the model believes in a nearly perfect matcher (0.05 px of white noise, no effects). Made by\n\n"
     "    python docs/make_gap_examples.py motorcycle\n\n"
     "which leaves the measurement folders and the whole reports in runs/gap_examples/motorcycle.",
     "sgbm": "Rendered photographs of a wall 24 x 15 m in Glendale's style from 50 m (base 13 m, medium quality) are matched by"
-    " OpenCV's semi-global matching, with and without least-squares refinement; the model is the simulated matcher's default"
-    " noise (0.3 px of the frame white, 0.1 px smooth; a pixel of the matched pictures is 4 px of the frame). Made by\n\n"
+    " OpenCV's semi-global matching, with and without least-squares refinement; the model believes in a nearly"
+    " perfect matcher (0.05 px of the frame of white noise, no effects; a pixel of the matched pictures is 4 px of the frame)."
+    " Made by\n\n"
     "    python docs/make_gap_examples.py sgbm\n\n"
     "which leaves the measurement folders and the whole reports in runs/gap_examples/sgbm. [docs/matching.md](../matching.md)"
     " has the matchers' errors in figures.",

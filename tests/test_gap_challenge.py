@@ -230,6 +230,19 @@ def test_right_answers_score_well() -> None:
     assert found["gap closed by the best wrong effect outside the class (median)"]["value"] == 0.03
 
 
+def test_the_control_is_shown_beside_what_the_angle_lets_a_wrong_effect_close() -> None:
+    """S/N 30 and 20 of it unlike the nearest other: 1 - (20 / 30)^2 of the square can be taken over."""
+    near, far = pair("one", "a", "a", ("c",)), pair("one", "a", "a", ("c",))
+    far[0]["effects"][0]["snr_sin_angle"] = 29.8
+    far[0]["closed_by"]["b"] = {"fitted": 0.01, "held_out": 0.01}
+    found = figures_of(near)
+    by_angle = "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)"
+    assert found[by_angle]["value"] == pytest.approx(1 - (20 / 30) ** 2)
+    alone = "the same, where that angle leaves it 5 %"
+    assert found[alone]["value"] is None
+    assert figures_of(near, far)[alone]["value"] == 0.01
+
+
 def test_wrong_answers_score_badly() -> None:
     every = (pair("one", "a", "b"), pair("none", said="a"), pair("change", said="a"), pair("off", "off_a", "a"))
     found = figures_of(*every)

@@ -58,12 +58,14 @@ def name_effects(
     locking = (
         None if tls or believes(measurement, "pixel_locking") else find_locking(part.geometry.found, part.geometry.disparity)
     )
+    found_apart = set()
     if locking is not None:
         named.append(from_locking(locking))
         added = locking.amplitude_px**2 / 2
-        left_out |= {("pixel_locking", False)}
+        found_apart.add(("pixel_locking", False))
     part = noisier(part, added)
-    families = [each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out]
+    allowed = (each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out | found_apart)
+    families = list(allowed)
     spread, spread_tried = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random)
     points = Points(measurement, part, families, spread, (scale, added), random)
     first = MeanSearch(weighed(part, spread, scale), families, random)
