@@ -51,3 +51,16 @@ def test_ground_that_may_have_moved_has_no_say(tmp_path: Path) -> None:
     assert found_in(tmp_path, 23, ranges=half_that_moved).verdict != "no_gap"
     found = found_in(tmp_path, 23, ranges=half_that_moved, stable_areas=[still_half(tmp_path)])
     assert (found.verdict, found.effects) == ("no_gap", ())
+
+
+def test_a_rockfall_beyond_stable_ground_is_reported(tmp_path: Path) -> None:
+    write_scan(tmp_path, 16, fall=(20.0, 12.0, 0.4))
+    (change,) = diagnose(read_measurement(tmp_path)).changes
+    low, high = map(float, change.bounds[:, 0])
+    x = residuals_of(read_measurement(tmp_path)).at[:, 0]
+    sides = ([float(x.min()), low - 1.0], [high + 1.0, float(x.max())])
+    start, stop = max(sides, key=lambda side: side[1] - side[0])
+    write_scan(tmp_path, 16, fall=(20.0, 12.0, 0.4), stable_areas=[[start, -1e3, stop, 1e3]])
+    found = diagnose(read_measurement(tmp_path))
+    assert (found.verdict, len(found.changes)) == ("no_gap", 1)
+    assert np.allclose(found.changes[0].bounds, change.bounds, atol=0.5)
