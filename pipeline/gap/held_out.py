@@ -24,6 +24,8 @@ _LARGEST = 5.0
 """Deviations are cut off at so many sigmas: an outlier has no more to say."""
 _SIGMAS = 2.5
 """By how many standard deviations the gain of a true effect may chance to lie below what the training blocks let expect."""
+_MOST_LOST = 1.5
+"""What chance may take at the most: held-out blocks that are less likely by more with an effect speak against it."""
 _LEAST_OF_SMOOTHING = 5.0
 """A little low-pass also makes up for rays that are not quite where they are thought to be."""
 
@@ -74,7 +76,7 @@ def _least(expected: float) -> float:
     The gain of a true effect, half a difference of two chi^2, has about twice its expectation as variance.
     """
     likely = max(expected, 0.0)
-    return min(0.0, likely - _SIGMAS * float(np.sqrt(2 * likely)))
+    return max(min(0.0, likely - _SIGMAS * float(np.sqrt(2 * likely))), -_MOST_LOST)
 
 
 def _value(

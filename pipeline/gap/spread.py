@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -146,13 +146,19 @@ def find_spread(
 
     value: (n,) residuals without the mean effects found.
     """
-    z = standardised(residuals, cells, value)
-    kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, nmad(z, 0.0)))
-    squared = z[kept] ** 2
     candidates = tls_candidates(residuals) if residuals.sensor == "tls" else stereo_candidates(residuals)
-    forms = [candidate.variance[kept] / residuals.sigma[kept, None] ** 2 for candidate in candidates]
-    singles = [_Joint.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
-    best = max(singles, key=lambda fit: fit.score)
+    weighed = residuals
+    for again in (True, False):
+        # noisy points move a cell's plane, and with that what its quiet points show, unless they have the weight they deserve
+        z = standardised(weighed, cells, value)
+        kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, nmad(z, 0.0)))
+        squared = (z * weighed.sigma / residuals.sigma)[kept] ** 2
+        forms = [candidate.variance[kept] / residuals.sigma[kept, None] ** 2 for candidate in candidates]
+        singles = [_Joint.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
+        best = max(singles, key=lambda fit: fit.score)
+        if again:
+            added = candidates[best.members[0]].variance @ best.theta[0]
+            weighed = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
     excess = float(np.mean(best.added(forms)))
     block = block_numbers(residuals.at[kept], cells.side_m)
     p_value = _p_value(squared, [form.sum(axis=1) for form in forms], block, random)
