@@ -138,3 +138,17 @@ def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
     told = re.search(r"the residuals spread (\d+)% of what the model predicts", found.remaining["note"])
     assert told is not None
     assert 45 <= int(told[1]) <= 75
+
+
+def test_noise_by_incidence_is_told_from_noise_of_the_angles(tmp_path: Path) -> None:
+    """Nine points a cell, quiet ones beside noisy ones: without their weights the noisy tilt the cell's plane, and the quiet seem
+    noisy too."""
+    noisy = found_in(
+        tmp_path,
+        43,
+        ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1) * scan.rng.standard_normal(len(scan.R)),
+        step_rad=0.012,
+    )
+    (effect,) = noisy.effects
+    assert (noisy.verdict, effect.name) == ("named", "tls.range_noise_incidence")
+    assert abs(effect.entry["sigma_m"] - 0.01) < 3 * effect.std["sigma_m"]
