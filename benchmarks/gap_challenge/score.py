@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from itertools import pairwise
 from statistics import median
 from typing import Any
@@ -132,11 +133,12 @@ def _control(truth: Json, named: list[Json]) -> Json | None:
     on the mean was named; and what of the signature's square the angle to the nearest other effect leaves to that, 1 - sin^2."""
     if truth["stratum"] != "one" or not truth["closed_by"] or not named or not _clear(truth["effects"][0]):
         return None
-    inside = {truth["effects"][0]["name"], *(name for each in named for name in each["class"])}
+    true = truth["effects"][0]
+    inside = {true["name"], *true.get("alike", ()), *(name for each in named for name in each["class"])}
     outside = [shares for name, shares in truth["closed_by"].items() if name not in inside]
     if not outside:
         return None
-    sine = truth["effects"][0]["snr_sin_angle"] / truth["effects"][0]["snr"]
+    sine = true["snr_sin_angle"] / true["snr"]
     return {
         "closed": max(max(outside, key=lambda shares: shares["fitted"])["held_out"], 0.0),
         "by_angle": 1 - min(sine, 1.0) ** 2,
@@ -152,9 +154,8 @@ def _figures(rows: list[Json]) -> list[Json]:
     committed = [row for row in rows if row["named"]]
     committed_one = [row for row in of["one"] if row["named"]]
     sizes = [len(each["class"]) for row in committed for each in row["named"]]
-    intervals = [
-        each["inside"] for row in rows for each in row["intervals"] if each["same_camera"] and each["inside"] is not None
-    ]
+    intervals = _insides(rows)
+    complete = _insides(row for row in rows if all(row["hits"]))
     right = [row for row in (*of["one"], *of["two"]) if all(row["hits"]) and not row["empirical"]]
     closed = [row["gap"]["closed"] for row in right if row["gap"].get("closed") is not None]
     pooled = _pooled(row["gap"] for row in right)
@@ -175,6 +176,7 @@ def _figures(rows: list[Json]) -> list[Json]:
             "real change blamed on the sensor", of["change"], lambda row: row["verdict"] in _NAMING, "at most 5 %", (0.0, 0.05)
         ),
         _share("90 % intervals that contain the true parameter", intervals, bool, "86-94 %", (0.86, 0.94)),
+        _share("the same, where every true effect was named", complete, bool, "86-94 %", (0.86, 0.94)),
         _number("gap closed on held-out data, effects named (median)", closed, median, "95 %", (0.95, np.inf)),
         _number(
             "gap closed, all cases' metres summed", [pooled] if pooled is not None else [], median, "(shown beside it)", None
@@ -200,6 +202,11 @@ def _figures(rows: list[Json]) -> list[Json]:
         ),
         _share("cases without an answer", rows, lambda row: row["verdict"] == "error", "none", (0.0, 0.0)),
     ]
+
+
+def _insides(rows: Iterable[Json]) -> list[bool]:
+    """Of each interval of an effect that was named, and for the right camera, whether it holds the truth."""
+    return [each["inside"] for row in rows for each in row["intervals"] if each["same_camera"] and each["inside"] is not None]
 
 
 def _pooled(gaps: Any) -> float | None:

@@ -21,7 +21,7 @@ _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
 _FINER = (1.12, 1.03)
 _MOST_POINTS = 30_000
 _FEWEST = 20
-_PROFILE = 0.08
+_PROFILE = 0.12
 """Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
 
 

@@ -36,6 +36,8 @@ _LEAST_HELD, _HELD_BY_CHANCE = 0.6, 0.3
 _FILLED, _STRAY_FILLED = 0.9, 0.02
 """Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
 _NEAR_STEPS = 2
+_FILTERED = 0.02
+"""Share by which a low-pass is off since the reference is filtered for the rock, at its own cells and up to its own borders."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
     tested = witnesses.blocks.tested(gains(sigma))
     if tested is None:
         return None
-    std = witnesses.blocks.std(gains, sigma)
+    std = float(np.hypot(witnesses.blocks.std(gains, sigma), _FILTERED * sigma))
     return ShapeFound(Smoothing(sigma_px=sigma), {"sigma_px": std}, *tested, np.zeros(len(witnesses.rough), dtype=bool))
 
 
