@@ -7,13 +7,25 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from scene.mesh import FloatArray
 
 Box = tuple[float, float, float, float]
 Vertex = tuple[float, float]
-Area = Box | Annotated[tuple[Vertex, ...], Field(min_length=3)]
+
+
+def _drawn(area: Any) -> Any:
+    try:
+        shape = np.array(area, dtype=np.float64).shape
+    except (TypeError, ValueError):
+        shape = ()
+    if shape != (4,) and not (len(shape) == 2 and shape[0] >= 3 and shape[1] == 2):
+        raise ValueError("is neither a box [x0, y0, x1, y1] nor a polygon [[x, y], [x, y], [x, y], ...]")
+    return area
+
+
+Area = Annotated[Box | Annotated[tuple[Vertex, ...], Field(min_length=3)], BeforeValidator(_drawn)]
 """A box (x0, y0, x1, y1) or the vertices of a polygon, wall frame, m."""
 
 

@@ -17,10 +17,9 @@ from pipeline.areas import Area, in_areas
 from pipeline.closest_points import ReferenceSurface
 from pipeline.difference import DifferenceConfig, raster_grid
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.gap.measurement import FILE, MeasurementConfig, read_measurement
+from pipeline.gap.measurement import FILE, read_measurement
 from pipeline.register import IcpConfig, Registration, register_to
 from scene.backend import mi
-from scene.config import load_yaml, parse
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
@@ -67,9 +66,8 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
 
 def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
     measurement = read_measurement(folder)
-    cloud, bounds = measurement.cloud, measurement.reference.bounds
-    epoch = cloud.extra.get("epoch", np.zeros(len(cloud.points), dtype=np.int64))
-    clouds = [cloud.points[epoch == number] for number in np.unique(epoch)]
+    bounds, epochs = measurement.reference.bounds, measurement.epochs
+    clouds = [measurement.cloud.points[epochs == number] for number in np.unique(epochs)]
     target = ReferenceSurface.build(measurement.reference.vertices, measurement.reference.vertex_normals()) if icp else None
     registrations = []
     for number, points in enumerate(clouds):
@@ -78,8 +76,7 @@ def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, 
             clouds[number] = registrations[-1].apply(points)
     grid = raster_grid(bounds, DifferenceConfig(gsd_m=max(config.gsd_m, max(map(_spacing, clouds)))))
     maps = np.stack([point_differences(measurement.scene, points, grid) for points in clouds])
-    areas = parse(MeasurementConfig, load_yaml(folder / FILE), str(folder / FILE)).stable_areas
-    stable = area_mask(areas, grid) if areas else None
+    stable = area_mask(measurement.stable_areas, grid) if measurement.stable_areas else None
     return MeasuredMaps(folder.name, grid, maps, stable, tuple(map(len, clouds)), tuple(registrations))
 
 

@@ -14,6 +14,8 @@ from pipeline.formats.geotiff import write_geotiff
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.noise.measured import area_mask, point_differences, read_measured
+from pipeline.noise.settings import CalibrationConfig
+from scene.config import parse
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
@@ -39,6 +41,12 @@ def test_areas_are_boxes_and_polygons() -> None:
     assert triangle.sum() in range(45, 56)  # half of the pixels, those on the diagonal either way
     assert triangle[9, 0]
     assert not triangle[0, 9]
+
+
+@pytest.mark.parametrize("area", [[1, 2, 3], [[0, 0], [1, 1]], "everywhere"])
+def test_an_area_that_is_neither_is_named(area: object) -> None:
+    with pytest.raises(InputError, match=r"'stable_areas\.0': .*is neither a box .* nor a polygon"):
+        parse(CalibrationConfig, {"stable_areas": [area]}, "config")
 
 
 def test_a_folder_of_maps_and_a_folder_of_points(tmp_path: Path) -> None:
