@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -9,13 +10,17 @@ import numpy as np
 
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.residuals import BoolArray
+from scene.backend import dr, mi
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
+from scene.upload import on_device, vectors_on_device
 from sensors.camera import Camera, CameraPair
+from sensors.device import rotated, vector
 from sensors.effects.base import Effect, Stage
 from sensors.rectify import Rectification, rectify
+from sensors.stereo import rectified_pixel
 
 _HIDDEN_SHARE = 2e-4
 """A point is hidden where another surface stands before it by this share of its distance."""
@@ -56,31 +61,48 @@ class NominalPair:
         pair = measurement.cameras.in_wall_frame(measurement.frame)
         return cls(pair, rectify(pair))
 
-    def rectified(self, camera: Camera, turn: FloatArray, u: FloatArray, v: FloatArray, centre: float) -> FloatArray:
-        """(n,) rectified column of image pixels."""
-        x, y = camera.tangents(u, v)
-        ray = np.einsum("ij,nj->ni", turn, np.stack([x, y, np.ones_like(x)], axis=1))
-        return np.asarray(self.geometry.f * ray[:, 0] / ray[:, 2] + centre)
-
     def disparity(self, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]) -> FloatArray:
         """(n,) disparity of pixels of the left and of the right image, px."""
+        pixels = (tuple(on_device(mi.Float64, each) for each in pixel) for pixel in (left, right))
+        columns = zip((self.left_column, self.right_column), pixels, strict=True)
+        first, second = (column(u, v) for column, (u, v) in columns)
+        return _on_host(first - second)[0]
+
+    def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
+        """(n,) rectified column of pixels of the left image."""
         rect = self.geometry
-        return self.rectified(self.pair.left, rect.left, *left, rect.u_left) - self.rectified(
-            self.pair.right, rect.right, *right, rect.u_right
-        )
+        return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
+
+    def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
+        """(n,) rectified column of pixels of the right image."""
+        rect = self.geometry
+        return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
 
 
 def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pixels (u, v) of points (n, 3)."""
-    local = np.einsum("ji,nj->ni", camera.rotation, points - camera.position)
-    u, v = camera.pixel(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
-    return np.asarray(u), np.asarray(v)
+    u, v = _on_host(*_pixel(camera, vectors_on_device(points)))
+    return u, v
 
 
 def rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
     """(n, 3) directions of pixels with unit component along the camera's axis."""
-    x, y = camera.tangents(u, v)
-    return np.einsum("ij,nj->ni", camera.rotation, np.stack([x, y, np.ones_like(x)], axis=1))
+    return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
+
+
+def _pixel(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
+    local = rotated(camera.rotation.T, point - vector(camera.position))
+    u, v = camera.on_device().pixel(local.x / local.z, local.y / local.z)
+    return u, v
+
+
+def _ray(camera: Camera, u: mi.Float64, v: mi.Float64) -> mi.Array3f64:
+    return rotated(camera.rotation, mi.Array3f64(*camera.on_device().tangents(u, v), 1.0))
+
+
+def _on_host(*columns: mi.Float64) -> list[FloatArray]:
+    dr.eval(*columns)
+    return [np.array(column) for column in columns]
 
 
 def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> BoolArray:
@@ -90,14 +112,21 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
     return np.asarray(scene.cast(position, back / length[:, None])[0] < length * (1 - _HIDDEN_SHARE))
 
 
-def seen_disparity(nominal: NominalPair, real: CameraPair, geometry: StereoGeometry) -> FloatArray:
-    """(n,) disparity that a real pair gives on each point's tangent plane, in the nominal rectified pair."""
-    ray = rays(real.left, geometry.u, geometry.v)
-    distance = np.einsum("ni,ni->n", geometry.point - real.left.position, geometry.normal) / np.einsum(
-        "ni,ni->n", ray, geometry.normal
-    )
-    point = real.left.position + distance[:, None] * ray
-    return nominal.disparity((geometry.u, geometry.v), project(real.right, point))
+def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: StereoGeometry) -> list[FloatArray]:
+    """(n,) of each real pair: the disparity that it gives on each point's tangent plane, in the nominal rectified pair."""
+    u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
+    point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
+    column = nominal.left_column(u, v)
+    dr.eval(column)
+
+    def seen(pair: CameraPair) -> mi.Float64:
+        origin, ray = vector(pair.left.position), _ray(pair.left, u, v)
+        met = origin + dr.dot(point - origin, normal) / dr.dot(ray, normal) * ray
+        disparity = column - nominal.right_column(*_pixel(pair.right, met))
+        dr.eval(disparity)  # one kernel for all pairs, and no waiting for it
+        return disparity
+
+    return _on_host(*[seen(pair) for pair in real])
 
 
 def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:

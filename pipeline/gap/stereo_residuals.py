@@ -8,7 +8,16 @@ import numpy as np
 
 from pipeline.gap.disparity_raster import RASTER_EFFECTS, DisparityRaster, spacing
 from pipeline.gap.measurement import Measurement
-from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, is_hidden, moved_pair, project, rays, real_pair, seen_disparity
+from pipeline.gap.nominal_pair import (
+    NominalPair,
+    StereoGeometry,
+    is_hidden,
+    moved_pair,
+    project,
+    rays,
+    real_pair,
+    seen_disparities,
+)
 from pipeline.gap.residuals import Residuals
 from pipeline.rigid import RigidTransform
 from scene.mesh import FloatArray
@@ -142,14 +151,10 @@ def _reference(
 def _pose(nominal: NominalPair, geometry: StereoGeometry) -> FloatArray:
     """(n, 6) change of the disparity if both cameras stand shifted (m) and turned (rad) about the left one, wall frame."""
     centre, step = nominal.pair.left.position, 1e-4
-    base = seen_disparity(nominal, nominal.pair, geometry)
-    columns = []
-    for axis in range(6):
-        vector = np.zeros(3)
-        vector[axis % 3] = step
-        moved = moved_pair(nominal.pair, centre, vector, turned=axis >= 3)
-        columns.append((seen_disparity(nominal, moved, geometry) - base) / step)
-    return np.stack(columns, axis=1)
+    units = step * np.eye(3)
+    moved = [moved_pair(nominal.pair, centre, unit, turned=turned) for turned in (False, True) for unit in units]
+    base, *columns = seen_disparities(nominal, [nominal.pair, *moved], geometry)
+    return np.stack([(column - base) / step for column in columns], axis=1)
 
 
 def _mean_error(model: StereoModel, geometry: StereoGeometry, measurement: Measurement) -> FloatArray:

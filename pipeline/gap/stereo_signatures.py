@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.gap.candidates import Candidate, Grid, Wave, frequencies, variants
 from pipeline.gap.measurement import Measurement
-from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, real_pair, seen_disparity
+from pipeline.gap.nominal_pair import NominalPair, StereoGeometry, real_pair, seen_disparities
 from pipeline.gap.residuals import Residuals
 from scene.mesh import FloatArray
 from sensors.effects import (
@@ -52,40 +52,28 @@ def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Cand
 def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | Grid]:
     """The same with each searched sine as one grid."""
     geometry, nominal = residuals.geometry, NominalPair.of(measurement)
-    found: list[Candidate | Grid] = [
-        candidate
+    varied = [
+        (effect, side, key, step)
         for effect, sets, step in _CAMERA
         for side in _SIDES
-        for candidate in _camera_variants(effect, sets, step, side, nominal, geometry, measurement)
+        for key in sorted({key for keys in sets for key in keys})
     ]
-    return [*found, *_row_jitter(geometry), *_locking(geometry)]
-
-
-def _camera_variants(
-    effect: type[Effect],
-    sets: tuple[tuple[str, ...], ...],
-    step: float,
-    side: str,
-    nominal: NominalPair,
-    geometry: StereoGeometry,
-    measurement: Measurement,
-) -> list[Candidate]:
-    base = seen_disparity(nominal, nominal.pair, geometry)
-    columns: dict[str, FloatArray] = {}
-    for name in sorted({name for names in sets for name in names}):
-        changed = real_pair(nominal, (effect(**{"camera": side, name: step}),), measurement)
-        columns[name] = (seen_disparity(nominal, changed, geometry) - base) / step
-    name = effect.model_fields["name"].default
-    return [
+    changed = (real_pair(nominal, (effect(**{"camera": side, key: step}),), measurement) for effect, side, key, step in varied)
+    base, *seen = seen_disparities(nominal, [nominal.pair, *changed], geometry)
+    columns = {(effect, side, key): (each - base) / step for (effect, side, key, step), each in zip(varied, seen, strict=True)}
+    found: list[Candidate | Grid] = [
         Candidate(
-            name,
-            np.stack([columns[key] for key in names], axis=1),
-            partial(_by_name, names),
-            names,
+            effect.model_fields["name"].default,
+            np.stack([columns[effect, side, key] for key in keys], axis=1),
+            partial(_by_name, keys),
+            keys,
             {"camera": side},
         )
-        for names in sets
+        for effect, sets, _ in _CAMERA
+        for side in _SIDES
+        for keys in sets
     ]
+    return [*found, *_row_jitter(geometry), *_locking(geometry)]
 
 
 def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
