@@ -21,6 +21,8 @@ _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
 _FINER = (1.12, 1.03)
 _MOST_POINTS = 30_000
 _FEWEST = 20
+_BLOCK_SIGMAS = 2.5
+"""By how much the blocks have to agree: six of six. No other effect puts points between the two sides of an edge."""
 _PROFILE = 0.12
 """Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
 
@@ -47,7 +49,7 @@ def find_footprint(
 
     tops = {mode: refined(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(tops, key=lambda each: float(gains(each, tops[each]).sum()))
-    tested = blocks.tested(gains(mode, tops[mode]))
+    tested = blocks.tested(gains(mode, tops[mode]), _BLOCK_SIGMAS)
     if tested is None:
         return []
     divergence = refined(partial(gains, mode), [tops[mode]], _FINER)

@@ -11,7 +11,8 @@ from pipeline.gap.cells import patches
 from pipeline.gap.entries import Named, with_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.registration import pose_of, settled
-from pipeline.gap.residuals import BoolArray, Residuals
+from pipeline.gap.residuals import OUTLIER, BoolArray, Residuals
+from pipeline.robust import nmad
 from scene.mesh import FloatArray
 
 NOT_SCORED = (
@@ -63,11 +64,18 @@ def _gain(
 ) -> float:
     """Of the log score, by residuals and their standard deviations (n,) with and without an effect, over some rows.
 
-    at: (n, 2) places on the wall; sigma: of the reference's error.
+    at: (n, 2) places on the wall; sigma: of the reference's error. What is an outlier with the effect and without has no say.
     """
+    rows = rows & (_usual(*whole) | _usual(*without))
     patch = patches(at[rows], _POINTS_PER_PATCH)
     scores = [_log_score(value[rows], spread[rows], patch, sigma) for value, spread in (whole, without)]
     return scores[0] - scores[1]
+
+
+def _usual(value: FloatArray, sigma: FloatArray) -> BoolArray:
+    """(n,) which residuals are no outliers: debris, and what fell, would move the mean of a patch."""
+    z = value / sigma
+    return np.asarray(np.abs(z) < OUTLIER * max(nmad(z), 1.0))
 
 
 def _least(expected: float) -> float:

@@ -32,12 +32,15 @@ FREE_MARGIN = 5.0
 _LEAST_SCORE = 4.0
 _LEAST_FREE_SCORE = 12.0
 """Of a free form: the reference's error is not quite as its model says, and a flexible form takes that up first."""
-_LEAST_SURFACE_SCORE, _SURFACE_RATIO = 20.0, 1.15
+_LEAST_SURFACE_SCORE, _SURFACE_RATIO = 15.0, 1.15
 """Of a form of two covariates, and how many times that of one covariate it has to score."""
 _WAVE_RATIO = 2.0
 """A wave along a covariate must score so many times what waves in slanting directions do: the reference's error has some too."""
 _WAVE_SIGMAS = 1.0
 """Standard deviations of the reference's error that a wave without a name has to have at least."""
+_KIN = 0.95
+"""Correlation from which on two covariates are one to a free form."""
+_CONSTANT = "range_offset"
 _MOST_EFFECTS = 3
 _LEADING, _LARGE, _MOST_LEADING = 0.5, 50.0, 8
 """Share of the largest gain that an effect must gain to be taken exactly too; the gain below which none is; how many at most."""
@@ -94,10 +97,14 @@ class _Set:
         return [item for item in self.tried if not item.empirical and item.name not in self.names]
 
     @property
+    def decoy(self) -> float:
+        """Score of mere places."""
+        return max([0.0, *(item.score for item in self.tried if item.name.startswith(PLACE))])
+
+    @property
     def free(self) -> Tried | None:
         """The best free form; of a covariate that changes along the wall only where it does better than mere places do."""
-        decoys = [item.score for item in self.tried if item.name.startswith(PLACE)]
-        decoy = max([0.0, *decoys])
+        decoy = self.decoy
         found = [item for item in self.tried if item.empirical and not item.name.startswith(PLACE) and _stands_out(item, decoy)]
         plain = next((item for item in found if item.candidate.form != SURFACE), None)
         if plain is None or (found[0].score > plain.score + FREE_MARGIN and found[0].score > _SURFACE_RATIO * plain.score):
@@ -275,6 +282,8 @@ class MeanSearch:
             chosen = [self._chosen(_Set(members, 0.0, ()), item) for item in members]
             chosen.append(Chosen(form.candidate, (), self.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.tried(members)
+        if best.score <= empty.decoy:  # whatever it is, no effect of the catalogue says it as well as mere places do
+            return [], empty.tried
         return [self._chosen(best, item) for item in best.members], best.tried
 
     def leading(self) -> list[Candidate]:
@@ -329,8 +338,7 @@ class MeanSearch:
                 form = state.free
                 if form is None:
                     continue
-                # more effects of the catalogue beside it only where the data ask for them too
-                if found is None or self._significant(state.score + form.score - found[0].score - found[1].score):
+                if found is None or self._adds(state, state.score + form.score - found[0].score - found[1].score, found[1]):
                     found = state, form
             assert found is not None
             return found[0].members, found[1]
@@ -339,6 +347,26 @@ class MeanSearch:
         if best.members and alone is not None and alone.score > best.score + margin:
             return (), alone
         return None
+
+    def _adds(self, state: _Set, score: float, form: Tried) -> bool:
+        """Whether the data ask for effects of the catalogue beside a free form: no form is exact, nor has it a constant, and so
+        each effect has to add more than a second form of the same covariate, or a constant, does."""
+        if not self._significant(score):
+            return False
+        kin = self._kin(form)
+        second = [
+            item.score
+            for item in self.tried((form,))
+            if item.name == _CONSTANT or (item.empirical and set(item.name.split(" and ")) <= kin)
+        ]
+        return score > len(state.members) * max([0.0, *second])
+
+    def _kin(self, form: Tried) -> set[str]:
+        """Covariates that change as that of a free form does."""
+        covariates = {name: values for name, values in self._residuals.covariates.items() if np.ptp(values) > 0}
+        parts = form.name.split(" and ")
+        alike = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
+        return {name for name, row in zip(covariates, alike, strict=False) if row.max() > _KIN}
 
     def _chosen(self, among: _Set, item: Tried) -> Chosen:
         """An effect with those that would do as well in its place beside the others."""

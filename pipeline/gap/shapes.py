@@ -55,11 +55,11 @@ class Blocks:
         """Gains (n,) by block."""
         return np.asarray(np.bincount(self.number, gains))
 
-    def tested(self, gains: FloatArray) -> tuple[float, float] | None:
+    def tested(self, gains: FloatArray, least_sigmas: float = _BLOCK_SIGMAS) -> tuple[float, float] | None:
         """Total gain and p-value of gains (n,), None where they do not convince: blocks all over the wall have to agree."""
         total, sums = float(gains.sum()), self.sums(np.clip(gains, -_MOST, _MOST))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
-        if total < _LEAST_GAIN or sigmas < _BLOCK_SIGMAS:
+        if total < _LEAST_GAIN or sigmas < least_sigmas:
             return None
         return total, max(float(np.exp(-(sigmas**2) / 2)), 1 / 2000)
 

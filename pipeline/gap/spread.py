@@ -8,9 +8,10 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pipeline.gap.cells import Cells, block_numbers
-from pipeline.gap.residuals import Residuals
+from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.tls_spread import slant
 from pipeline.robust import nmad
 from scene.keyed_random import KeyedRandom
@@ -21,6 +22,8 @@ _ALPHA = 0.004
 _LEAST_GAIN = 6.0
 _LEAST_EXCESS = 0.03
 """Added variance, as a share of the model's, below which the reference's own small errors may be meant."""
+_LEAST_BETWEEN = 0.75
+"""Share of the added variance by which neighbours must differ: an error of the reference, correlated over metres, moves both."""
 _LEAST_SHARE = 0.9
 """Of the predicted spread: less is worth a word."""
 _CLIP = 4.5
@@ -166,6 +169,8 @@ def find_spread(
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     if best.gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
         return [], tried
+    if residuals.sensor == "tls" and _between_neighbours(residuals, value, kept, best.added(forms)) < _LEAST_BETWEEN:
+        return [], tried
     pairs = [
         _Joint.fitted(squared, forms, [first, second], candidates)
         for first, second in combinations(range(len(forms)), 2)
@@ -207,6 +212,16 @@ def find_spread(
             )
         )
     return found, tried
+
+
+def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray, added: FloatArray) -> float:
+    """Share of an added variance, of the points `kept` and over the predicted one, that differences of neighbours show."""
+    at, value, predicted = residuals.at[kept], value[kept], residuals.sigma[kept] ** 2
+    other = cKDTree(at).query(at, k=2)[1][:, 1]
+    variance = predicted + predicted[other]
+    more = (added * predicted + (added * predicted)[other]) / variance
+    weight = more / (1 + more) ** 2
+    return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * more))
 
 
 def share_of_spread(residuals: Residuals, cells: Cells, value: FloatArray) -> float:
