@@ -31,6 +31,8 @@ PLANES = {"tls": ("azimuth", "zenith"), "stereo": ("image_x", "image_y")}
 """The two covariates by sensor that an error may depend on together."""
 _NODES, _GRID, _MOST_POINTS = 65, 17, 20_000
 """Of the curve of an empirical term, and of each side of a surface."""
+_FITTED = 1.1
+"""How much more the parameters scatter than the covariance says: that of the reference's error is itself fitted."""
 _WEAKEST = 20
 """Spacings of the weakest powers that tell how near they come to a limit."""
 _BEYOND = 100.0
@@ -178,7 +180,7 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
             (candidate.parameters(values + step * unit)[key] - base[key]) / step
             for step, unit in zip(steps, np.eye(len(values)), strict=True)
         ]
-        std[key] = float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
+        std[key] = _FITTED * float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
     return std
 
 

@@ -20,7 +20,7 @@ from scene.mesh import FloatArray
 DRAWS = 1999
 _ALPHA = 0.004
 _LEAST_GAIN = 6.0
-_LEAST_EXCESS = 0.03
+_LEAST_EXCESS = 0.04
 """Added variance, as a share of the model's, below which the reference's own small errors may be meant."""
 _LEAST_BETWEEN = 0.75
 """Share of the added variance by which neighbours must differ: an error of the reference, correlated over metres, moves both."""
