@@ -99,7 +99,7 @@ def _value(
     rows = place[residuals.index]
     known = rows >= 0
     value, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    pose = pose_of(found.part(rows[trained & known]))
+    pose = pose_of(found, rows[trained & known])
     value[known], sigma[known] = (found.value - found.pose @ pose)[rows[known]], found.sigma[rows[known]]
     return value, sigma
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.measurement import Measurement
-from pipeline.gap.residuals import Residuals
+from pipeline.gap.residuals import BoolArray, Residuals
 from pipeline.gap.stereo_residuals import stereo_residuals
 from pipeline.gap.tls_residuals import tls_residuals
 from pipeline.rigid import rotation_matrix
@@ -27,7 +27,7 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     kept, scale = residuals.smooth.copy(), 1.0
     value, pose = residuals.value, np.zeros(6)
     for _ in range(_ROUNDS):
-        pose = pose_of(residuals.part(kept))
+        pose = pose_of(residuals, kept)
         value = residuals.value - residuals.pose @ pose
         z = np.abs(value / residuals.sigma)
         scale = max(1.0, nmad(z[residuals.smooth], 0.0))
@@ -37,10 +37,10 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     return value, pose, scale
 
 
-def pose_of(residuals: Residuals) -> FloatArray:
-    """(6,) shift (m) and turn (rad) by weighted least squares."""
-    weighted = residuals.pose / residuals.sigma[:, None]
-    return np.asarray(np.linalg.lstsq(weighted, residuals.value / residuals.sigma, rcond=None)[0])
+def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
+    """(6,) shift (m) and turn (rad) by weighted least squares over some rows (a mask or indices)."""
+    sigma = residuals.sigma[rows]
+    return np.asarray(np.linalg.lstsq(residuals.pose[rows] / sigma[:, None], residuals.value[rows] / sigma, rcond=None)[0])
 
 
 def residuals_of(measurement: Measurement) -> Residuals:

@@ -63,7 +63,7 @@ class Showing:
     @property
     def pose(self) -> FloatArray:
         """(6,) by which the model as it is is registered."""
-        return pose_of(self.residuals.part(self.chosen))
+        return pose_of(self.residuals, self.chosen)
 
     def show(self, named: list[Named]) -> tuple[Shown, list[str]]:
         """The gap on points that no step has used, and words for effects that are taken out: those without which points that may
@@ -91,7 +91,7 @@ class Showing:
         """(n,) residuals of the same points against another model, NaN where that misses the reference; the pose (6,)."""
         trusted = self.residuals.index[self.chosen]
         _, found, there = settled(self.measurement.changed(model=model), trusted)
-        rest = pose_of(found.part(np.flatnonzero(found.smooth & np.isin(found.index, trusted))))
+        rest = pose_of(found, found.smooth & np.isin(found.index, trusted))
         value = np.full(len(self.measurement.cloud.points), np.nan)
         value[found.index] = found.value - found.pose @ rest
         return np.asarray(value[self.residuals.index]), there + rest
