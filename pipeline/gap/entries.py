@@ -32,7 +32,8 @@ PLANES = {"tls": ("azimuth", "zenith"), "stereo": ("image_x", "image_y")}
 _NODES, _GRID, _MOST_POINTS = 65, 17, 20_000
 """Of the curve of an empirical term, and of each side of a surface."""
 _FITTED = 1.1
-"""How much more the parameters scatter than the covariance says: that of the reference's error is itself fitted."""
+"""How much more the parameters scatter than the covariance says: that of the reference's error is itself fitted.
+By development cases, of whose 61 intervals of 90 % without it 52 held the truth."""
 _WEAKEST = 20
 """Spacings of the weakest powers that tell how near they come to a limit."""
 _BEYOND = 100.0

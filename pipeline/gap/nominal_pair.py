@@ -63,10 +63,8 @@ class NominalPair:
 
     def disparity(self, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]) -> FloatArray:
         """(n,) disparity of pixels of the left and of the right image, px."""
-        pixels = (tuple(on_device(mi.Float64, each) for each in pixel) for pixel in (left, right))
-        columns = zip((self.left_column, self.right_column), pixels, strict=True)
-        first, second = (column(u, v) for column, (u, v) in columns)
-        return _on_host(first - second)[0]
+        first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
+        return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
         """(n,) rectified column of pixels of the left image."""

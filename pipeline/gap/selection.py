@@ -41,6 +41,7 @@ _WAVE_SIGMAS = 1.0
 _KIN = 0.95
 """Correlation from which on two covariates are one to a free form."""
 _CONSTANT = "range_offset"
+"""The effect that is a constant."""
 _MOST_EFFECTS = 3
 _LEADING, _LARGE, _MOST_LEADING = 0.5, 50.0, 8
 """Share of the largest gain that an effect must gain to be taken exactly too; the gain below which none is; how many at most."""

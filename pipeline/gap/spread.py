@@ -169,6 +169,7 @@ def find_spread(
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     if best.gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
         return [], tried
+    # of disparities `stereo_noise` looks at neighbours, which noise on nodes moves alike too
     if residuals.sensor == "tls" and _between_neighbours(residuals, value, kept, best.added(forms)) < _LEAST_BETWEEN:
         return [], tried
     pairs = [

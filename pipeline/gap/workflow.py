@@ -236,7 +236,7 @@ def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random:
 
     first = _Attempt.of(_State.of(there, plain, held_points, *_shapes(there, plain, held_points)), random)
     found = [beside(first)]
-    if first.shapes and found[0].complexity > (0, 1):
+    if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
         untouched = np.zeros(len(held_points), dtype=bool)
         smooth = _Attempt.of(_State.of(there, plain, held_points, [], untouched), random)
         if smooth.named:

@@ -65,7 +65,7 @@ def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not
 
 
 def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None:
-    """Ranges settle by 15 mm in the first tenth of the scan, which no effect of the catalogue does."""
+    """Ranges settle by 20 mm in the first tenth of the scan, which no effect of the catalogue does."""
     write_scan(tmp_path, 6, ranges=lambda scan: scan.R + 0.02 * np.exp(-scan.share / 0.1), step_rad=0.006)
     found = diagnose(read_measurement(tmp_path))
     assert found.verdict == "unknown"
