@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.cells import patches
-from pipeline.gap.entries import Named, with_effects
+from pipeline.gap.entries import SPREADS, Named, with_effects
 from pipeline.gap.measurement import Measurement
 from pipeline.gap.registration import pose_of, settled
 from pipeline.gap.residuals import OUTLIER, BoolArray, Residuals
@@ -42,21 +42,38 @@ class Scored:
 def score_effects(
     measurement: Measurement, residuals: Residuals, named: list[Named], trained: BoolArray, reference_sigma: float
 ) -> Scored:
-    """Score each effect with all others in the model. trained: (n,) points by which to register; the others are scored."""
+    """Score each effect with all others in the model. trained: (n,) points by which to register; the others are scored.
+
+    Effects on the mean that would fail each other can make up for each other where they were fitted: what all of them gain
+    together is tested first, and without the one that matters least, an empirical term before all, where that fails.
+    """
     scored = [item for item in named if item.name.partition(".")[2] not in NOT_SCORED]
     if not scored or (~trained).sum() < 100:
         return Scored(named, [])
     whole = _value(measurement, named, residuals, trained)
-    gains, least = {}, {}
-    for item in scored:
-        without = _value(measurement, [each for each in named if each is not item], residuals, trained)
+
+    def gains(out: list[Named]) -> tuple[float, float]:
+        """Of some effects on the points that are scored, and what those that were trained let expect of them."""
+        without = _value(measurement, [each for each in named if each not in out], residuals, trained)
         known = np.isfinite(whole[0]) & np.isfinite(without[0])
         tested, learned = (_gain(whole, without, known & rows, residuals.at, reference_sigma) for rows in (~trained, trained))
-        gains[item.name] = tested
-        expected = learned * float(np.sum(known & ~trained)) / max(float(np.sum(known & trained)), 1.0)
-        least[item.name] = _LEAST_OF_SMOOTHING if item.name == "stereo.smoothing" else _least(expected)
-    failed = [item for item in named if item.name in gains and gains[item.name] <= least[item.name]]
-    return Scored([replace(item, gain=gains.get(item.name, item.gain)) for item in named if item not in failed], failed)
+        return tested, learned * float(np.sum(known & ~trained)) / max(float(np.sum(known & trained)), 1.0)
+
+    found = {item.name: gains([item]) for item in scored}
+    moving = [item for item in scored if item.name.partition(".")[2] not in SPREADS]
+    if len(moving) > 1:
+        tested, expected = gains(moving)
+        if tested <= _least(expected):
+            out = min(moving, key=lambda item: (item.kind != "empirical", found[item.name][0]))
+            left = score_effects(measurement, residuals, [each for each in named if each is not out], trained, reference_sigma)
+            return Scored(left.named, [out, *left.failed])
+    failed = [item for item in scored if found[item.name][0] <= _least_of(item, found[item.name][1])]
+    kept = [item for item in named if item not in failed]
+    return Scored([replace(item, gain=found[item.name][0]) if item.name in found else item for item in kept], failed)
+
+
+def _least_of(item: Named, expected: float) -> float:
+    return _LEAST_OF_SMOOTHING if item.name == "stereo.smoothing" else _least(expected)
 
 
 def _gain(

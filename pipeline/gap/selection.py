@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from pipeline.gap.candidates import PLACE, SURFACE, Candidate, Grid
 from pipeline.gap.cells import Cells
@@ -283,9 +282,19 @@ class MeanSearch:
             chosen = [self._chosen(_Set(members, 0.0, ()), item) for item in members]
             chosen.append(Chosen(form.candidate, (), self.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.tried(members)
+        best, chosen = self._beyond_places(best)
         if best.score <= empty.decoy:  # whatever it is, no effect of the catalogue says it as well as mere places do
             return [], empty.tried
-        return [self._chosen(best, item) for item in best.members], best.tried
+        return chosen, best.tried
+
+    def _beyond_places(self, found: _Set) -> tuple[_Set, list[Chosen]]:
+        """A set without effects that, beside its others, say no more than mere places do beside all of them."""
+        chosen = [self._chosen(found, item) for item in found.members]
+        least = min(chosen, key=lambda each: each.score, default=None)
+        if least is None or least.score > found.decoy:
+            return found, chosen
+        members = tuple(item for item, each in zip(found.members, chosen, strict=True) if each is not least)
+        return self._beyond_places(_Set(members, found.score - least.score, self.tried(members)))
 
     def leading(self) -> list[Candidate]:
         """Effects of the catalogue that are large and explain much by themselves, each variant for itself, best first."""
@@ -345,9 +354,15 @@ class MeanSearch:
             return found[0].members, found[1]
         alone = empty.free
         margin = FREE_MARGIN if len(best.members) < 2 else 0.0
-        if best.members and alone is not None and alone.score > best.score + margin:
+        if best.members and alone is not None and alone.score > max(best.score, self._score(best.members)) + margin:
             return (), alone
         return None
+
+    def _score(self, members: tuple[Tried, ...]) -> float:
+        """Of effects together, their periods at the top of the likelihood: the steps of the search cost a strong sine some."""
+        columns = [column for member in members for column in self._columns(member.candidate)]
+        with_them, without = (self.equations.log_likelihood(base)[:, 0].max() for base in ([*self._base, *columns], self._base))
+        return float(with_them - without - sum(member.gain - member.score for member in members))
 
     def _adds(self, state: _Set, score: float, form: Tried) -> bool:
         """Whether the data ask for effects of the catalogue beside a free form: no form is exact, nor has it a constant, and so
@@ -380,19 +395,20 @@ class MeanSearch:
     def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> Fit:
         """Pose (the columns of `Residuals.pose`) and some candidates, at their most likely covariance."""
         pose, turned = self._fixed.some(self._base), np.linalg.inv(self._turn)
-        known = turned.T @ (self._pose_precision[:, None] * turned)
         if not candidates:
+            known = turned.T @ (self._pose_precision[:, None] * turned)
             found = fitted(self.model.fine, pose, self.value, known)
             return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
         matrix = self._matrix(candidates, slopes)
         columns = pose.beside(self.model.project(self._without_pose(matrix)))
-        widths = [candidate.columns.shape[1] + (slope is not None) for candidate, slope in _with_slopes(candidates, slopes)]
-        typical = np.concatenate([precision_of(each, width) for each, width in zip(candidates, widths, strict=True)])
-        found = fitted(self.model.fine, columns, self.value, block_diag(known, np.diag(typical)))
-        # the columns were fitted without what the pose explains of them, and the pose by orthonormal ones
+        # the columns are fitted without what the pose explains of them, and the pose by orthonormal ones
         back = np.block(
             [[turned, -turned @ (self._pose.T @ matrix)], [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])]]
         )
+        widths = [candidate.columns.shape[1] + (slope is not None) for candidate, slope in _with_slopes(candidates, slopes)]
+        typical = [precision_of(each, width) for each, width in zip(candidates, widths, strict=True)]
+        precision = np.concatenate([self._pose_precision, *typical])
+        found = fitted(self.model.fine, columns, self.value, back.T @ (precision[:, None] * back))
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
     def reference_sigma(self, chosen: list[Chosen]) -> float:

@@ -18,7 +18,8 @@ from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
 _FEWEST_POINTS = 100
-_WORSE_SIGMAS = 2.0
+_BY_VALUES = ("tls.range_quantization", "stereo.pixel_locking")
+"""Effects that measured values show by where they crowd, of which the means and spreads of patches say little."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,12 @@ class Shown:
 
     @property
     def is_worse(self) -> bool:
-        """Whether the model predicts worse with the effects than without them, beyond chance.
+        """Whether the model predicts no better with the effects than without them.
 
         Of losses that is no judge: a shrub before the held-out blocks has more to say than a few drops.
         """
         gap = self.gap
-        return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before + _WORSE_SIGMAS * gap.error
+        return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
 
 
 @dataclass(frozen=True)
@@ -66,12 +67,18 @@ class Showing:
         return pose_of(self.residuals, self.chosen)
 
     def show(self, named: list[Named]) -> tuple[Shown, list[str]]:
-        """The gap on points that no step has used, and words for effects that are taken out: those without which points that may
-        be looked at are predicted best, as long as the gap is larger with the effects than without."""
+        """The gap on points that no step has used, and words for effects that are taken out.
+
+        As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
+        one goes without which those are predicted best.
+        """
         shown, words = self._of(named, self.tested), []
         while shown.is_worse:
-            fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in shown.named]
-            best = min(fewer, key=lambda each: each.gap.after if each.gap else np.inf)
+            doubtful = [item for item in shown.named if item.name not in _BY_VALUES]
+            fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in doubtful]
+            best = min(fewer, key=_score, default=shown)
+            if best is shown or _score(best) >= _score(self._of(shown.named, self.learned)):
+                break
             out = next(item for item in shown.named if item not in best.named)
             words.append(f"{out.name} dropped: with it the model predicts worse")
             shown = self._of(best.named, self.tested)
@@ -108,3 +115,7 @@ class Showing:
         part = self.residuals.part(places[thinned(len(places))])
         random = self.random.child("verify")
         return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.largest, random)
+
+
+def _score(shown: Shown) -> float:
+    return shown.gap.after if shown.gap else np.inf

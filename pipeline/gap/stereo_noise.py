@@ -105,9 +105,11 @@ class _Form:
 def told_apart(found: list[SpreadFound], part: Residuals, value: FloatArray, model: StereoModel) -> list[SpreadFound]:
     """Noise that was taken for white, named by how neighbours differ; a class of both where that does not tell.
 
+    Noise on nodes seems to change with any covariate, as few of them have one value of it: it goes before an empirical term.
     value: (n,) residuals without the mean effects found.
     """
-    return [_named(each, part, value, model) if each.name == "parallax_noise" else each for each in found]
+    named = [_named(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
+    return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
 
 
 def find_nodes(part: Residuals, value: FloatArray, model: StereoModel, random: KeyedRandom) -> SpreadFound | None:

@@ -1,4 +1,5 @@
-"""What is no evidence for an effect: debris in blocks that are held out, an error of the reference, what a free form misses."""
+"""What is no evidence for an effect: debris in blocks that are held out, an error of the reference, what a free form misses,
+what another effect makes up for."""
 
 from __future__ import annotations
 
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 from gap_cases import Array, Scan, smooth_noise, write_scan
 
+from pipeline.gap.candidates import Candidate
 from pipeline.gap.cells import Cells, held_out_blocks
 from pipeline.gap.entries import Named
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.measurement import read_measurement
 from pipeline.gap.registration import registered, settled
+from pipeline.gap.selection import MeanSearch, Tried
 from pipeline.gap.spread import find_spread
 from pipeline.gap.workflow import diagnose, few
 from scene.keyed_random import KeyedRandom
@@ -70,3 +73,48 @@ def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None
     found = diagnose(read_measurement(tmp_path))
     assert found.verdict == "unknown"
     assert [effect.kind for effect in found.effects] == ["empirical"]
+
+
+def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) -> None:
+    """Without either the other would be 20 mm off; together they put 2 mm where there is nothing."""
+    write_scan(tmp_path, 8, step_rad=0.007)
+    there, residuals, _ = settled(read_measurement(tmp_path))
+    held_out = held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    incidence = np.linspace(0.0, 1.4, 141)
+    against = -0.022 * (1 / np.cos(incidence) - 1)
+    form = {"covariate": "incidence", "along": {"low": 0.0, "high": 1.4}, "values_m": [against.tolist()]}
+    named = [
+        Named("tls.range_empirical", "empirical", {"name": "range_empirical", **form}, {}, (), 0.001, 30.0),
+        Named(
+            "tls.range_incidence_bias", "physical", {"name": "range_incidence_bias", "coefficient_m": 0.02}, {}, (), 0.001, 9.0
+        ),
+    ]
+    scored = score_effects(there, residuals, named, ~held_out, 0.0004)
+    assert not scored.named
+    assert [item.name for item in scored.failed] == ["tls.range_empirical", "tls.range_incidence_bias"]
+
+
+class _Scripted(MeanSearch):
+    """A search in which one effect says much, a second something beside it, and places along the wall always as much."""
+
+    def __init__(self, places: float) -> None:
+        self._places = places
+
+    def tried(self, members: tuple[Tried, ...]) -> tuple[Tried, ...]:
+        scores = {"collimation": 40.0, "range_scale": 28.0 if members else 18.0, "place along 30": self._places}
+        known = {member.name for member in members}
+        found = [
+            Tried(name, name.startswith("place"), score, score, Candidate(name, np.zeros((1, 1)), lambda _: {}, ()))
+            for name, score in scores.items()
+            if name not in known
+        ]
+        return tuple(sorted(found, key=lambda item: -item.score))
+
+    def p_value(self, score: float) -> float:
+        return 0.001
+
+
+@pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (35.0, {"collimation"}), (45.0, set())])
+def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) -> None:
+    chosen, _ = _Scripted(places).select()
+    assert {each.candidate.name for each in chosen} == named

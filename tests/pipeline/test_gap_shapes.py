@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,20 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
     assert found.name == kind
     # of 64 px nodes there are some 80 on the wall: their own standard deviation varies by 8 %
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
+
+
+@pytest.mark.parametrize(("kind", "seed", "empirical"), [("parallax_noise", 2, True), ("regularization_noise", 4, False)])
+def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str, seed: int, empirical: bool) -> None:
+    """Of few nodes some are noisier by chance, whatever covariate they are sorted by; white noise keeps its empirical term."""
+    there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
+    part = residuals.part(residuals.smooth)
+    value = registered(part)[0]
+    spread, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    assert isinstance(there.model, StereoModel)
+    described = [replace(each, name="spread by disparity", empirical=True) for each in spread]
+    (found,) = told_apart(described, part, value, there.model)
+    assert found.empirical == empirical
+    assert found.name == ("spread by disparity" if empirical else kind)
 
 
 def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(tmp_path: Path) -> None:

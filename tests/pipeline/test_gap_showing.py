@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from gap_cases import write_scan
 
 from pipeline.gap.cells import Cells, held_out_blocks
@@ -15,12 +16,12 @@ from pipeline.gap.showing import Showing
 from scene.keyed_random import KeyedRandom
 
 
-def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> None:
-    """Ranges grow with the incidence angle; beside that a noise is named that is not there, ten times the true one."""
-    write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
-    there, residuals, _ = settled(read_measurement(tmp_path))
+def _showing(folder: Path, coefficient_m: float) -> Showing:
+    """What a gap is measured with, of ranges that grow with the incidence angle."""
+    write_scan(folder, 8, ranges=lambda scan: scan.R + coefficient_m * (1 / scan.cos_i - 1), step_rad=0.007)
+    there, residuals, _ = settled(read_measurement(folder))
     held_out = held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
-    showing = Showing(
+    return Showing(
         measurement=there,
         residuals=residuals,
         chosen=np.flatnonzero(residuals.smooth & ~held_out),
@@ -31,13 +32,26 @@ def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> N
         largest=20.0,
         random=KeyedRandom(1),
     )
-    true, wrong = (
-        Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
-        for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_noise", "sigma_m", 0.03))
-    )
-    shown, words = showing.show([wrong, true])
+
+
+def _named(name: str, key: str, value: float) -> Named:
+    return Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
+
+
+def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> None:
+    """Beside a true effect a noise is named that is not there, ten times the true one."""
+    true, wrong = _named("range_incidence_bias", "coefficient_m", 0.01), _named("range_noise", "sigma_m", 0.03)
+    shown, words = _showing(tmp_path, 0.01).show([wrong, true])
     assert shown.named == [true]
-    assert len(words) == 1
-    assert words[0].startswith("tls.range_noise dropped")
+    assert words == ["tls.range_noise dropped: with it the model predicts worse"]
     assert shown.gap is not None
     assert (shown.gap.closed or 0.0) > 0.8
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value", "kept"), [("range_noise", "sigma_m", 0.0015, 0), ("range_incidence_bias", "coefficient_m", 0.003, 1)]
+)
+def test_an_effect_that_does_little_harm_is_taken_out_too(tmp_path: Path, name: str, key: str, value: float, kept: int) -> None:
+    """Half as much noise again, no more than chance would make of it, goes; what is there, and as small, stays."""
+    shown, _ = _showing(tmp_path, 0.003).show([_named(name, key, value)])
+    assert len(shown.named) == kept
