@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,17 @@ from gap_cases import write_scan
 from benchmarks.gap_challenge import stereo_cases
 from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_challenge.strength import Target
+from pipeline.gap.candidates import Candidate
 from pipeline.gap.cells import Cells, held_out_blocks
 from pipeline.gap.entries import Named
+from pipeline.gap.families import families_of
 from pipeline.gap.held_out import score_effects
 from pipeline.gap.mean_model import MeanModel, fitted
 from pipeline.gap.measurement import read_measurement
 from pipeline.gap.registration import settled
+from pipeline.gap.selection import MeanSearch
 from pipeline.gap.workflow import diagnose
+from scene.keyed_random import KeyedRandom
 
 
 class _Strong(Target):
@@ -60,6 +65,23 @@ def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
         found = fitted(white, columns, value, np.array([[known]]))
         assert found.coefficients[0] == pytest.approx(right / (gram + known), rel=1e-6)
         assert found.covariance[0, 0] == pytest.approx(1 / (gram + known), rel=1e-6)
+
+
+def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> None:
+    """A column of which the data say next to nothing, 0.2 in size before there are data, beside one that overlaps with it."""
+    write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.012)
+    there, residuals, _ = settled(read_measurement(tmp_path))
+    part = residuals.part(residuals.smooth)
+    families = families_of(there, part)
+    bias = next(each for each in families if isinstance(each, Candidate) and each.name == "range_incidence_bias")
+    rng = np.random.default_rng(1)
+    faint = 1e-7 * (bias.columns[:, :1] + rng.standard_normal((len(part), 1)))
+    precision = np.concatenate([np.zeros(6), [25.0]])
+    search = MeanSearch(replace(part, pose=np.concatenate([part.pose, faint], axis=1)), families, KeyedRandom(1), precision)
+    found = search.fit([bias])
+    assert abs(found.coefficients[6]) < 0.01
+    assert found.covariance[6, 6] == pytest.approx(0.2**2, rel=1e-3)
+    assert found.coefficients[7] == pytest.approx(0.01, abs=5 * np.sqrt(found.covariance[7, 7]))
 
 
 def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path: Path) -> None:
