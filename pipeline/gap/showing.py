@@ -70,11 +70,12 @@ class Showing:
         """The gap on points that no step has used, and words for effects that are taken out.
 
         As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
-        one goes without which those are predicted best.
+        one goes without which those are predicted best. What is described, not named, stays: without it nothing would be said
+        to be wrong.
         """
         shown, words = self._of(named, self.tested), []
         while shown.is_worse:
-            doubtful = [item for item in shown.named if item.name not in _BY_VALUES]
+            doubtful = [item for item in shown.named if item.kind == "physical" and item.name not in _BY_VALUES]
             fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in doubtful]
             best = min(fewer, key=_score, default=shown)
             if best is shown or _score(best) >= _score(self._of(shown.named, self.learned)):
