@@ -366,14 +366,14 @@ class MeanSearch:
 
     def _adds(self, state: _Set, score: float, form: Tried) -> bool:
         """Whether the data ask for effects of the catalogue beside a free form: no form is exact, nor has it a constant, and so
-        each effect has to add more than a second form of the same covariate, or a constant, does."""
+        each effect has to add more than a second form of the same covariate, one of two covariates, or a constant, does."""
         if not self._significant(score):
             return False
         kin = self._kin(form)
         second = [
             item.score
             for item in self.tried((form,))
-            if item.name == _CONSTANT or (item.empirical and set(item.name.split(" and ")) <= kin)
+            if item.name == _CONSTANT or item.candidate.form == SURFACE or (item.empirical and item.name in kin)
         ]
         return score > len(state.members) * max([0.0, *second])
 

@@ -3,6 +3,7 @@ what another effect makes up for."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,17 +96,16 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) 
 
 
 class _Scripted(MeanSearch):
-    """A search in which one effect says much, a second something beside it, and places along the wall always as much."""
+    """A search whose scores, by name and form ("" of an effect), are those of a script for each set of names that is known."""
 
-    def __init__(self, places: float) -> None:
-        self._places = places
+    def __init__(self, scores: Callable[[set[str]], dict[tuple[str, str], float]]) -> None:
+        self._scores = scores
 
     def tried(self, members: tuple[Tried, ...]) -> tuple[Tried, ...]:
-        scores = {"collimation": 40.0, "range_scale": 28.0 if members else 18.0, "place along 30": self._places}
         known = {member.name for member in members}
         found = [
-            Tried(name, name.startswith("place"), score, score, Candidate(name, np.zeros((1, 1)), lambda _: {}, ()))
-            for name, score in scores.items()
+            Tried(name, bool(form), score, score, Candidate(name, np.zeros((1, 1)), lambda _: {}, (), {}, bool(form), form))
+            for (name, form), score in self._scores(known).items()
             if name not in known
         ]
         return tuple(sorted(found, key=lambda item: -item.score))
@@ -113,8 +113,28 @@ class _Scripted(MeanSearch):
     def p_value(self, score: float) -> float:
         return 0.001
 
+    def _kin(self, form: Tried) -> set[str]:
+        return {form.name}
+
 
 @pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (35.0, {"collimation"}), (45.0, set())])
 def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) -> None:
-    chosen, _ = _Scripted(places).select()
+    """One effect says much, a second something beside it, and places along the wall always as much."""
+
+    def scores(known: set[str]) -> dict[tuple[str, str], float]:
+        return {("collimation", ""): 40.0, ("range_scale", ""): 28.0 if known else 18.0, ("place along 30", "wave"): places}
+
+    chosen, _ = _Scripted(scores).select()
+    assert {each.candidate.name for each in chosen} == named
+
+
+@pytest.mark.parametrize(("surface", "named"), [(10.0, {"camera_shift", "radius"}), (35.0, {"radius"})])
+def test_an_effect_beside_a_free_form_says_more_than_a_form_of_two_covariates(surface: float, named: set[str]) -> None:
+    """A bump in the picture is no function of the radius alone: what that misses an effect takes up, and a surface does too."""
+
+    def scores(known: set[str]) -> dict[tuple[str, str], float]:
+        form = 70.0 if "camera_shift" in known else 60.0
+        return {("camera_shift", ""): 20.0, ("radius", "smooth"): form, ("image_x and image_y", "surface"): surface}
+
+    chosen, _ = _Scripted(scores).select()
     assert {each.candidate.name for each in chosen} == named
