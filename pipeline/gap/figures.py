@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from pipeline.gap.in_words import with_unit
 from pipeline.gap.pictures import png
@@ -24,6 +26,8 @@ _BEFORE, _AFTER, _NAMED = "#D55E00", "#0072B2", "black"
 _COLUMNS = 3
 _CROWDED = ("edge_step",)
 """Covariates of which most values lie near zero, the rest over decades."""
+_MANY = 300.0
+"""Span of a logarithmic axis from which on it has a number per decade, else two."""
 
 
 def maps_figure(found: Diagnosis) -> bytes:
@@ -97,13 +101,21 @@ def profiles_figure(found: Diagnosis) -> bytes:
         for panel in (upper, lower):
             panel.tick_params(labelsize=7)
             if name in _CROWDED:
-                panel.set_xscale("log")
+                _log_axis(panel, float(middle[-1] / middle[0]))
         if number == 0:
             upper.legend(fontsize=7)
     for panel in panels.ravel():
         if not panel.has_data():
             panel.set_visible(False)
     return png(figure)
+
+
+def _log_axis(panel: Axes, ratio: float) -> None:
+    """Few and plain numbers along x, which spans `ratio`."""
+    panel.set_xscale("log")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if ratio < _MANY else (1.0,)))
+    panel.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    panel.xaxis.set_minor_formatter(NullFormatter())
 
 
 def gap_figure(gap: Gap) -> bytes:
