@@ -101,7 +101,7 @@ def profiles_figure(found: Diagnosis) -> bytes:
         for panel in (upper, lower):
             panel.tick_params(labelsize=7)
             if name in _CROWDED:
-                _log_axis(panel, float(middle[-1] / middle[0]))
+                _log_axis(panel)
         if number == 0:
             upper.legend(fontsize=7)
     for panel in panels.ravel():
@@ -110,10 +110,11 @@ def profiles_figure(found: Diagnosis) -> bytes:
     return png(figure)
 
 
-def _log_axis(panel: Axes, ratio: float) -> None:
-    """Few and plain numbers along x, which spans `ratio`."""
+def _log_axis(panel: Axes) -> None:
+    """Few and plain numbers along x."""
     panel.set_xscale("log")
-    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if ratio < _MANY else (1.0,)))
+    low, high = panel.get_xlim()
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < _MANY * low else (1.0,)))
     panel.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     panel.xaxis.set_minor_formatter(NullFormatter())
 

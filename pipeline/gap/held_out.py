@@ -44,8 +44,8 @@ def score_effects(
 ) -> Scored:
     """Score each effect with all others in the model. trained: (n,) points by which to register; the others are scored.
 
-    Effects on the mean that would fail each other can make up for each other where they were fitted: what all of them gain
-    together is tested first, and without the one that matters least, an empirical term before all, where that fails.
+    Effects on the mean may only make up for each other, and then each seems to be needed. So what all of them gain together is
+    tested first; where that fails, the one that matters least goes, an empirical term before any other.
     """
     scored = [item for item in named if item.name.partition(".")[2] not in NOT_SCORED]
     if not scored or (~trained).sum() < 100:

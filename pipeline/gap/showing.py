@@ -74,15 +74,16 @@ class Showing:
         to be wrong.
         """
         shown, words = self._of(named, self.tested), []
+        learned = self._of(named, self.learned) if shown.is_worse else shown
         while shown.is_worse:
             doubtful = [item for item in shown.named if item.kind == "physical" and item.name not in _BY_VALUES]
             fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in doubtful]
-            best = min(fewer, key=_score, default=shown)
-            if best is shown or _score(best) >= _score(self._of(shown.named, self.learned)):
+            best = min(fewer, key=_score, default=learned)
+            if _score(best) >= _score(learned):
                 break
             out = next(item for item in shown.named if item not in best.named)
             words.append(f"{out.name} dropped: with it the model predicts worse")
-            shown = self._of(best.named, self.tested)
+            shown, learned = self._of(best.named, self.tested), best
         return shown, words
 
     def _of(self, named: list[Named], rows: BoolArray) -> Shown:

@@ -30,7 +30,8 @@ _CLIP = 4.5
 _LEAST_LEFT = 0.3
 """Share of a point's variance that its cell's plane must leave."""
 _CLASS_MARGIN = 5.0
-"""Scores within this of the best belong to its class: more than for the mean, as a few steep parts of a wall decide."""
+"""Scores within this of the best belong to its class: more than for the mean, as a few steep blocks decide. In three development
+scans the right one was 9 to 15 ahead of its nearest, and that by 1.0 to 1.4 times what the blocks' sums scatter."""
 _FREE_MARGIN, _FREE_GAIN, _FREE_BLOCK_SIGMAS = 6.0, 15.0, 2.0
 _SECOND_GAIN = 3.0
 _BINS = 8
