@@ -21,16 +21,16 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from pipeline.bundled import bundled_config
-from pipeline.config import load_config
-from pipeline.difference import raster_grid
-from pipeline.look import look, reconstruct
-from pipeline.noise.calibrate import calibrate_material
-from pipeline.noise.inputs import Material
-from pipeline.noise.maps import noise_map
-from pipeline.noise.parameters import parameters
-from pipeline.progress import Progress
-from pipeline.site import prepare_site
+from pipeline.calibrate.calibrate import calibrate_material
+from pipeline.calibrate.inputs import Material
+from pipeline.calibrate.maps import noise_map
+from pipeline.calibrate.parameters import parameters
+from pipeline.change.difference import raster_grid
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import load_config
+from pipeline.report.progress import Progress
+from pipeline.run.acquisition import look, reconstruct
+from pipeline.run.site import prepare_site
 from scene.backend import dr
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster

@@ -12,13 +12,13 @@ import argparse
 import numpy as np
 from measure import bare_cast, medians
 
-from pipeline.bundled import bundled_config
-from pipeline.config import load_config
-from pipeline.difference import raster_grid
-from pipeline.noise.maps import noise_map
-from pipeline.noise.reobserve import Reobserver
-from pipeline.noise.windows import choose_windows
-from pipeline.site import prepare_site
+from pipeline.calibrate.maps import noise_map
+from pipeline.calibrate.reobserve import Reobserver
+from pipeline.calibrate.windows import choose_windows
+from pipeline.change.difference import raster_grid
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import load_config
+from pipeline.run.site import prepare_site
 from scene.backend import mi
 from scene.keyed_random import KeyedRandom
 from scene.upload import on_device, vectors_on_device

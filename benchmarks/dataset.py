@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bundled import bundled_config
+from pipeline.config.bundled import bundled_config
 from pipeline.dataset.cluster import runs
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs

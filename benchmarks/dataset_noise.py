@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bundled import bundled_config
-from pipeline.config import SensorName
+from pipeline.calibrate.maps import noise_map
+from pipeline.change.difference import statistics
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import SensorName
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs, simulation_of
-from pipeline.difference import statistics
-from pipeline.noise.maps import noise_map
-from pipeline.site import Site, prepare_site
+from pipeline.run.site import Site, prepare_site
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
 

@@ -1,7 +1,7 @@
 """Detection probability of niches: the closed form of `scarpsim inspect` against simulated observations of a flat wall.
 
 To reach: the standardised difference of each row within +-3.3 (one row in a thousand lies outside by chance).
-Rows at 45 degrees with a handful of points per niche may miss it: see the limits in pipeline/planning/detectability.py.
+Rows at 45 degrees with a handful of points per niche may miss it: see the limits in pipeline/precision/detectability.py.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from measure import peak_memory_gb
 
-from pipeline.planning.detectability import PlanningConfig
 from pipeline.planning.trials import Trials, detection_trials
+from pipeline.precision.detectability import PlanningConfig
 from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh

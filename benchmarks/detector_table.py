@@ -23,11 +23,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.change.robust import nmad
 from pipeline.detect.evaluate import Score, evaluate
 from pipeline.detect.run import BASELINE, LOWEST_SCORE, detect
 from pipeline.formats.atomic import write_text
 from pipeline.formats.geotiff import read_tiff
-from pipeline.robust import nmad
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- table -->", "<!-- end of table -->"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from measure import bare_cast, medians, peak_memory_gb, seconds
 
-from pipeline.annotate import AnnotationConfig, LabelledImage, coco
-from pipeline.difference import cast_raster, surface_raster
-from pipeline.mesh import SurfaceConfig, mesh_observation
+from pipeline.change.annotate import AnnotationConfig, LabelledImage, coco
+from pipeline.change.difference import cast_raster, surface_raster
+from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from scene.backend import VARIANT, mi
 from scene.grid import Grid
 from scene.raycast import RayCaster

@@ -18,12 +18,12 @@ import numpy as np
 from carve import time_bare
 from measure import bare_cast, bare_test, medians, peak_memory_gb
 
-from pipeline.bundled import bundled_config
-from pipeline.config import SensorName, load_config
-from pipeline.epoch import observe_epoch, observe_reference
-from pipeline.products import write_epoch, write_reference
-from pipeline.progress import Progress
-from pipeline.site import Site, prepare_site
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import SensorName, load_config
+from pipeline.report.progress import Progress
+from pipeline.run.epoch import observe_epoch, observe_reference
+from pipeline.run.products import write_epoch, write_reference
+from pipeline.run.site import Site, prepare_site
 from scene.backend import VARIANT, dr, mi
 from scene.blocks import place_blocks
 from scene.grid import Grid

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from measure import peak_memory_gb, seconds
 
-from pipeline.gap.measurement import read_measurement
-from pipeline.gap.registration import residuals_of
-from pipeline.gap.workflow import diagnose
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.naming.workflow import diagnose
+from pipeline.gap.residuals.registration import residuals_of
 
 KINDS = {"tls": "vertical_index", "stereo": "focal_length"}
 

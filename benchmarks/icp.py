@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 import open3d as o3d
 
-from pipeline.closest_points import ReferenceSurface
-from pipeline.register import IcpConfig, Registration, fit, register
-from pipeline.rigid import RigidTransform
+from pipeline.registration.closest_points import ReferenceSurface
+from pipeline.registration.register import IcpConfig, Registration, fit, register
+from pipeline.registration.rigid import RigidTransform
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 

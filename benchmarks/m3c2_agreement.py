@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from pycocotools import mask
 
-from pipeline.bundled import bundled_config
-from pipeline.config import load_config
-from pipeline.difference import statistics
+from pipeline.change.difference import statistics
+from pipeline.change.m3c2 import core_grid
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import load_config
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.m3c2 import core_grid
-from pipeline.run import simulate
+from pipeline.run.simulation import simulate
 
 COLUMNS = (
     "sensor, direction",

@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from measure import peak_memory_gb
 
-from pipeline.bundled import bundled_config
-from pipeline.config import SimulationConfig, load_config
-from pipeline.difference import statistics
-from pipeline.noise.maps import noise_map, with_model
-from pipeline.site import Site, prepare_site
+from pipeline.calibrate.maps import noise_map, with_model
+from pipeline.change.difference import statistics
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import SimulationConfig, load_config
+from pipeline.run.site import Site, prepare_site
 from scene.config import load_yaml, parse
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from measure import peak_memory_gb, seconds
 
-from pipeline.depth_maps import DepthMap
-from pipeline.difference import DifferenceConfig, cast_raster, difference, raster_grid, statistics, surface_raster
-from pipeline.mesh import SurfaceConfig, mesh_observation
-from pipeline.reconstruct import FusionConfig, colmap_surface
+from pipeline.change.difference import DifferenceConfig, cast_raster, difference, raster_grid, statistics, surface_raster
+from pipeline.surface.depth_maps import DepthMap
+from pipeline.surface.mesh import SurfaceConfig, mesh_observation
+from pipeline.surface.reconstruct import FusionConfig, colmap_surface
 from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh

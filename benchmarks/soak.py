@@ -17,10 +17,10 @@ from typing import Self
 
 import numpy as np
 
-from pipeline.bundled import bundled_config
-from pipeline.config import SensorName, load_config
-from pipeline.progress import Progress
-from pipeline.run import simulate
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import SensorName, load_config
+from pipeline.report.progress import Progress
+from pipeline.run.simulation import simulate
 
 SMALL = (
     "wall={style: glendale, width_m: 6, height_m: 4, resolution_m: 0.1}",

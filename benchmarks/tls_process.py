@@ -73,10 +73,10 @@ def report(name: str, found: dict[str, float]) -> None:
 def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     """One process: mesh file to LAS; or, in another, the rate of the observation and the bias of the beam, as JSON."""
     marks = [("start", psutil.Process().create_time()), ("import", 0.0)]
-    from pipeline.config import SimulationConfig
+    from pipeline.config.simulation import SimulationConfig
     from pipeline.formats.laz import write_laz
-    from pipeline.recorded_points import recorded_points
-    from pipeline.site import prepare_site
+    from pipeline.run.recorded_points import recorded_points
+    from pipeline.run.site import prepare_site
     from scene.backend import dr
     from scene.config import parse
     from scene.keyed_random import KeyedRandom
@@ -151,10 +151,10 @@ def bias(scanner, caster, random) -> dict[str, float]:
 
 def soak() -> None:
     """Carve, observe, mesh, register and difference, a hundred times; the memory held after each ten epochs."""
-    from pipeline.config import SimulationConfig
-    from pipeline.epoch import observe_epoch, observe_reference
-    from pipeline.progress import Progress
-    from pipeline.site import prepare_site
+    from pipeline.config.simulation import SimulationConfig
+    from pipeline.report.progress import Progress
+    from pipeline.run.epoch import observe_epoch, observe_reference
+    from pipeline.run.site import prepare_site
     from scene.config import parse
     from scene.keyed_random import KeyedRandom
 

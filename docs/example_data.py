@@ -21,7 +21,8 @@ from scene.keyed_random import KeyedRandom
 from scene.procedural import ProceduralWall
 from scene.raycast import RayCaster
 from sensors.camera import axis_rotation
-from sensors.effects import Effect, RangeIncidenceBias
+from sensors.effects.base import Effect
+from sensors.effects.range_incidence_bias import RangeIncidenceBias
 from sensors.model import TlsModel
 from sensors.placement import PoseSigma, RigConfig, StationConfig, Target
 from sensors.tls import LaserScanner, ScannerConfig

@@ -33,7 +33,8 @@ from scene.mesh import FloatArray, TriangleMesh
 from scene.procedural import ProceduralWall
 from scene.raycast import RayCaster
 from scene.yaml_text import parse_yaml
-from sensors.effects import FURTHER_STEREO_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS, Effect
+from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS
+from sensors.effects.base import Effect
 from sensors.model import StereoModel, TlsModel, TlsNoise
 from sensors.observation import Observation
 from sensors.placement import RigConfig, StationConfig, Target
@@ -248,7 +249,7 @@ def _palette_png(figure: Figure) -> bytes:
 def index() -> str:
     """The list of all pages."""
     lines = ["# The effects", "", "Written by `docs/make_gallery.py`; do not edit."]
-    for title, effects in (("Laser scanner", TLS_EFFECTS), ("Stereo", (*STEREO_EFFECTS, *FURTHER_STEREO_EFFECTS))):
+    for title, effects in (("Laser scanner", TLS_EFFECTS), ("Stereo", (*STEREO_EFFECTS, *FURTHER_EFFECTS))):
         lines += ["", f"## {title}", ""]
         for effect in effects:
             name = f"{effect.sensor}.{effect.model_fields['name'].default}"
@@ -259,7 +260,7 @@ def index() -> str:
 def main(wanted: list[str]) -> None:
     """Write the pages and pictures of the effects named, `sensor.name`, or of all."""
     stage = Stage(ProceduralWall(style="glendale", resolution_m=0.1).mesh(KeyedRandom(SEED)))
-    for effect in (*TLS_EFFECTS, *STEREO_EFFECTS, *FURTHER_STEREO_EFFECTS):
+    for effect in (*TLS_EFFECTS, *STEREO_EFFECTS, *FURTHER_EFFECTS):
         name = f"{effect.sensor}.{effect.model_fields['name'].default}"
         if wanted and name not in wanted:
             continue

@@ -23,13 +23,13 @@ import yaml
 from make_gap_pages import FOLDER, small_png
 
 from pipeline.formats.cameras import write_cameras_yaml
+from pipeline.formats.measurement import read_measurement
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.in_words import paragraph
-from pipeline.gap.measurement import read_measurement
-from pipeline.gap.report import summary, write
-from pipeline.gap.where import where
-from pipeline.gap.workflow import Diagnosis, diagnose
+from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.report.covariate_ranking import where
+from pipeline.gap.report.in_words import paragraph
+from pipeline.gap.report.report import summary, write
 from scene.frame import WallFrame
 from scene.illumination import IlluminationConfig
 from scene.keyed_random import KeyedRandom

@@ -24,22 +24,24 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.config import SimulationConfig
+from pipeline.config.simulation import SimulationConfig
+from pipeline.formats.measurement import Measurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.figures import gap_figure, maps_figure
-from pipeline.gap.identifiability import ALIKE, Identifiability, identifiability
-from pipeline.gap.in_words import VERDICTS, paragraph
-from pipeline.gap.measurement import Measurement, read_measurement
-from pipeline.gap.planned import planned_survey
-from pipeline.gap.registration import residuals_of
-from pipeline.gap.report import summary
-from pipeline.gap.residuals import Residuals
-from pipeline.gap.where import bins, where
-from pipeline.gap.workflow import Diagnosis, diagnose
+from pipeline.gap.naming.verdict import VERDICTS
+from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.report.covariate_ranking import bins, where
+from pipeline.gap.report.figures import gap_figure, maps_figure
+from pipeline.gap.report.in_words import paragraph
+from pipeline.gap.report.report import summary
+from pipeline.gap.residuals.registration import residuals_of
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
+from pipeline.gap.survey.planned import planned_survey
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.procedural import ProceduralWall
-from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS, Effect
+from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
+from sensors.effects.base import Effect
 from sensors.model import StereoModel, TlsModel
 from sensors.placement import RigConfig, StationConfig, Target
 from sensors.stereo import REDUCTION
@@ -311,22 +313,27 @@ def verdicts() -> dict[str, Verdict]:
             _case(seed=13, ranges=lambda scan: scan.R + 0.002),
         ),
         "unknown": Verdict(
-            "The model is rejected, and a free form of a covariate explains clearly more (a score higher by 5) than any effect of"
-            " the catalogue, so the nearest name would be wrong.",
+            "The model is rejected, and a free form of a covariate explains clearly more (a score higher by 5) than any "
+            "effect of the catalogue, so the nearest name would be wrong; or nothing that was tried holds on held-out "
+            "blocks, and still the gap lies above the floor by more than its uncertainty or what remains has a p-value of"
+            " 0.01 or less: then the report says where and how large.",
             "Read along which covariate it goes and in what form; the empirical term in model_after.yaml lets simulations go on."
             " Outside the covariate's range that was measured it says nothing.",
             "Ranges that jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
         ),
         "no_gap": Verdict(
-            "No candidate is more than chance would give. Registration is a nuisance and is reported, regions where rock moved"
-            " are set aside and listed under `scene_changes`: neither is a gap.",
+            "Nothing was named, the gap is within its uncertainty of the floor, and what remains has a p-value above "
+            "0.01. Registration is a nuisance and is reported, regions where rock moved are set aside and listed under "
+            "`scene_changes`: neither is a gap. A model that predicts more spread than there is is told so, with the "
+            "noise that would fit (`lower_noise` under `remaining`).",
             "Nothing has to be added. How large an effect could hide: `scarpsim gap MEASUREMENT --identifiability`.",
             "Nothing but noise, a pose slightly off, a reference wrong by fractions of a millimetre, lost returns.",
             _case(seed=1),
         ),
         "insufficient_data": Verdict(
-            "Fewer than 800 points lie on smooth parts of the reference, where a residual has a meaning.",
+            "Fewer than 800 points lie on smooth parts of the reference, where a residual has a meaning; or nothing was "
+            "named and too few of them are held out to measure a gap.",
             "Scan more finely, or bring a reference that covers what was scanned.",
             "A scan in steps of 0.05 rad.",
             _case(seed=1, step_rad=0.05),

@@ -136,12 +136,12 @@ def playground() -> Iterator[None]:
 
 
 def answer(mistake: Mistake) -> tuple[int, str, str]:
-    """Exit code, what was on stdout, and the message on stderr without progress."""
+    """Exit code, what was on stdout, and the message on stderr without progress, with paths as in the working folder."""
     shutil.rmtree("out", ignore_errors=True)
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = cli.main([*mistake.words, "--quiet"] if mistake.words[0] == "simulate" else list(mistake.words))
-    return code, out.getvalue(), err.getvalue().strip()
+    return code, out.getvalue(), err.getvalue().strip().replace(f"{Path.cwd()}/", "")
 
 
 def page(answers: dict[Mistake, str]) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scene.blocks import Blocks
 from scene.errors import InputError
 from scene.footprint import faces_under
-from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh, area_normals
 from scene.slivers import mend
 from scene.solid import Piece, boundary, close, piece, prism_volumes, solid, split
 
@@ -183,7 +183,7 @@ def _surface(
 def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
     """(n, 3) weights of the corners (n, 3, 3) at points (n, 3) in their triangles, within [0, 1]."""
     to_corner = corners - points[:, None]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = area_normals(corners)
     parts = np.cross(np.roll(to_corner, -1, axis=1), np.roll(to_corner, -2, axis=1))
     weights = np.clip(np.einsum("nij,nj->ni", parts, normal), 0.0, None)
     return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)

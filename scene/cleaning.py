@@ -98,15 +98,21 @@ def part_edges(mesh: TriangleMesh) -> Mended:
 
 
 def rewind(mesh: TriangleMesh, where: str) -> Mended:
-    """Flip the triangles wound against the larger part of their piece of surface.
+    """Flip the triangles wound against the larger part of their piece of surface."""
+    odd = wound_otherwise(mesh, where)
+    return (flipped(mesh, odd), f"{int(odd.sum())} triangles wound the other way round") if odd.any() else (mesh, "")
+
+
+def wound_otherwise(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
+    """(m,) the triangles wound against the larger part of their piece of surface; vertices must be welded.
 
     Each triangle stands twice in a graph, as it is and flipped; neighbours are joined so that the windings agree. A piece
-    whose two copies are connected has only one side.
+    whose two copies are connected has only one side. Triangles are no neighbours over an edge that more than two share.
     """
     count = len(mesh.faces)
     pair, same = _neighbours(mesh)
     if not same.any():
-        return mesh, ""
+        return np.zeros(count, bool)
     flip, none = same * count, np.zeros(len(same), np.int64)
     links = np.concatenate([pair + np.stack([none, flip], axis=1), pair + np.stack([none + count, count - flip], axis=1)])
     label = groups(links, 2 * count)
@@ -115,7 +121,7 @@ def rewind(mesh: TriangleMesh, where: str) -> Mended:
     size = np.bincount(label[:count], minlength=label.max() + 1)
     minor = size[label[:count]] < size[label[count:]]
     tie = (size[label[:count]] == size[label[count:]]) & (label[:count] > label[count:])
-    return flipped(mesh, minor | tie), f"{int(np.sum(minor | tie))} triangles wound the other way round"
+    return minor | tie
 
 
 def part_vertices(mesh: TriangleMesh) -> Mended:
@@ -251,9 +257,10 @@ def groups(pairs: NDArray[np.integer], count: int) -> Index:
 
 
 def _twins(edges: Index) -> tuple[Index, Index]:
-    """The two places of each number that stands twice in `edges`."""
+    """The two places of each number that stands twice, and no oftener, in `edges`."""
     order = np.argsort(edges, kind="stable")
-    twin = np.flatnonzero(edges[order[1:]] == edges[order[:-1]])
+    again = np.concatenate([[False], edges[order[1:]] == edges[order[:-1]], [False]])
+    twin = np.flatnonzero(again[1:-1] & ~again[:-2] & ~again[2:])
     return order[twin], order[twin + 1]
 
 

@@ -47,6 +47,8 @@ def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
 
 def load_yaml(path: Path) -> Any:
     """Read a YAML file (`parse_yaml` says which YAML); unreadable or malformed files are InputErrors."""
+    if "\0" in str(path):
+        raise InputError("is no file's path, it holds a null character", where=repr(str(path)))
     try:
         return parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:

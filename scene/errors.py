@@ -1,4 +1,4 @@
-"""The one error that a person can mend: wrong input or a wrong config."""
+"""The error that a person can mend, wrong input or a wrong config; and the one that lies outside of the program."""
 
 from __future__ import annotations
 
@@ -20,6 +20,13 @@ class InputError(ValueError):
         if remedy:
             parts.append(remedy)
         super().__init__(" ".join("; ".join(parts).splitlines()))
+
+
+class OutsideError(RuntimeError):
+    """Something outside of the program failed that was not the input's fault, such as its worker processes.
+
+    Commands print it as one message and exit with 1.
+    """
 
 
 def nearest(word: str, words: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Rock walls read from mesh files, cleaned."""
+"""Surfaces read from mesh files: rock walls, which are mended, and references, which stay as they are."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from scene.cleaning import clean, flipped
+from scene.cleaning import clean, drop_unused, flipped
 from scene.config import Config
 from scene.errors import InputError, nearest
 from scene.mesh import TriangleMesh
 from scene.ply import read_elements
+from scene.rounding import check_rounding
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
 """A wall smaller or larger than this is likely to be in another unit."""
+_FARTHEST_M = 1e8
+"""No coordinate system of the earth reaches so far: geocentric coordinates are up to 6.4e6 m, northings up to 1e7 m."""
 _ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 _COLOURS = ("red", "green", "blue")
 _TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
@@ -32,17 +35,19 @@ class ImportedWall(Config):
 
     mesh: Path = Field(description="mesh file (ply, obj, stl, off, glb, ...), in the survey's coordinates")
     unit: Literal["m", "cm", "mm", "ft"] = Field("m", description="of the file's coordinates")
-    flipped: bool = Field(False, description="the file's triangles are clockwise seen from the sensors' side")
+    flipped: bool = Field(
+        False,
+        description="the file's triangles are clockwise seen from the sensors' side; told by itself where the sensor's place is "
+        "given in coordinates",
+    )
     albedo: float | None = Field(
-        None, ge=0.0, le=1.0, description="of the whole wall; the luminance of the vertex colours if not given"
+        None, ge=0.0, le=1.0, description="of the whole wall; if not given the file's own, or the luminance of its vertex colours"
     )
 
     def load(self) -> tuple[TriangleMesh, tuple[str, ...]]:
         """The cleaned mesh in the world frame, m, and what was mended. Raises InputError where the file cannot be used."""
         where = str(self.mesh)
-        mesh = _read(self.mesh)
-        _check_finite(mesh, where)
-        mesh = mesh.with_vertices(mesh.vertices * _METRES[self.unit])
+        mesh, notes = read_mesh(self.mesh, self.unit)
         self._check_extent(mesh)
         origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres: taken off and added again without loss
         mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where)
@@ -50,12 +55,10 @@ class ImportedWall(Config):
             mesh = flipped(mesh, np.ones(len(mesh.faces), bool))
         if self.albedo is not None:
             mesh = replace(mesh, vertex_albedo=np.full(len(mesh.vertices), self.albedo, np.float32))
-        return mesh.with_vertices(mesh.vertices + origin), repairs
+        return mesh.with_vertices(mesh.vertices + origin), (*repairs, *notes)
 
     def _check_extent(self, mesh: TriangleMesh) -> None:
-        used = np.zeros(len(mesh.vertices), dtype=bool)
-        used[mesh.faces] = True
-        extent = max(float(np.ptp(column[used])) for column in mesh.vertices.T)
+        extent = _extent(mesh)
         if not _SMALLEST_M <= extent <= _LARGEST_M:
             likely = [unit for unit, metres in _METRES.items() if 2 <= extent / _METRES[self.unit] * metres <= 1000]
             remedy = f"set `unit` to {' or '.join(likely)} if that is the file's unit" if likely else "check the file"
@@ -65,6 +68,38 @@ class ImportedWall(Config):
                 allowed=f"{_SMALLEST_M} m to {_LARGEST_M:.0f} m",
                 remedy=remedy,
             )
+
+
+def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """A surface as known, m, and notes. Its vertices are as in the file: cleaning would move what is measured against it.
+
+    Raises InputError where the file cannot be used.
+    """
+    mesh, notes = read_mesh(path)
+    if (extent := _extent(mesh)) > _LARGEST_M:
+        size = f"the surface is {extent:.4g} m in size"
+        raise InputError(size, where=str(path), allowed=f"up to {_LARGEST_M:.0f} m", remedy="give it in metres, cut to the scene")
+    mesh, words = drop_unused(mesh)
+    return mesh, (*notes, *([words] if words else []))
+
+
+def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...]]:
+    """The triangles of a file, m, and notes on their coordinates.
+
+    Raises InputError where the file cannot be read, and for coordinates that are not finite, no place on earth or rounded away.
+    """
+    where, metres = str(path), _METRES[unit]
+    mesh = _read(path)
+    _check_coordinates(mesh, metres, where)
+    notes = check_rounding(mesh, metres, where)
+    return (mesh if metres == 1 else mesh.with_vertices(mesh.vertices * metres)), notes
+
+
+def _extent(mesh: TriangleMesh) -> float:
+    """The longest side of the box about all triangles, m."""
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces] = True
+    return max(float(np.ptp(column[used])) for column in mesh.vertices.T)
 
 
 def _read(path: Path) -> TriangleMesh:
@@ -95,9 +130,9 @@ def _read(path: Path) -> TriangleMesh:
 
 
 def _plain_ply(path: Path) -> TriangleMesh | None:
-    """A PLY file of triangles, at most with colours of 8 bits per vertex; None where there is more to it, for trimesh to read.
+    """A PLY file of triangles, at most with an albedo or colours of 8 bits per vertex; None where there is more to it.
 
-    The same mesh as trimesh's, without the second that the import of trimesh takes.
+    That is for trimesh to read; the same mesh as trimesh's, without the second that the import of trimesh takes.
     """
     try:
         elements = read_elements(path)
@@ -112,7 +147,8 @@ def _plain_ply(path: Path) -> TriangleMesh | None:
         return None
     if faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
         return None
-    albedo = _luminance(np.stack(colours, axis=1)) if len(colours) == 3 else None
+    albedo = vertex["albedo"].astype(np.float32) if "albedo" in vertex else None
+    albedo = _luminance(np.stack(colours, axis=1)) if albedo is None and len(colours) == 3 else albedo
     return TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), albedo)
 
 
@@ -134,15 +170,22 @@ def _format(path: Path) -> str:
     return kind
 
 
-def _check_finite(mesh: TriangleMesh, where: str) -> None:
-    bad = np.logical_not(np.isfinite(mesh.vertices).all(axis=1))
-    if bad.any():
-        first = int(np.argmax(bad))
+def _check_coordinates(mesh: TriangleMesh, metres: float, where: str) -> None:
+    finite = np.all(np.isfinite(mesh.vertices), axis=1)
+    _require(finite, mesh, "are not finite", where, "finite coordinates")
+    near = np.all(np.abs(mesh.vertices) <= _FARTHEST_M / metres, axis=1)
+    _require(near, mesh, "are no place on earth", where, f"coordinates of up to {_FARTHEST_M:.0e} m")
+
+
+def _require(good: NDArray[Any], mesh: TriangleMesh, problem: str, where: str, allowed: str) -> None:
+    """Raise InputError that names the first vertex that is not good (n,)."""
+    if not good.all():
+        first = int(np.argmin(good))
         coordinates = ", ".join(f"{value:g}" for value in mesh.vertices[first])
         raise InputError(
-            f"{int(bad.sum())} of {len(mesh.vertices)} vertices are not finite, the first is vertex {first} at ({coordinates})",
+            f"{int(np.sum(~good))} of {len(good)} vertices {problem}, the first is vertex {first} at ({coordinates})",
             where=where,
-            allowed="finite coordinates",
+            allowed=allowed,
             remedy="remove these vertices and the triangles that use them",
         )
 

@@ -17,6 +17,11 @@ _CHUNK = 1 << 18
 """Faces worked on at a time, which bounds the memory of intermediates."""
 
 
+def area_normals(corners: FloatArray) -> FloatArray:
+    """(n, 3) normals of triangles by their corners (n, 3, 3), twice as long as their areas."""
+    return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
 @dataclass(frozen=True)
 class TriangleMesh:
     """Triangles with shared vertices, counter-clockwise seen from outside (from the sensors' side of a wall).
@@ -39,6 +44,15 @@ class TriangleMesh:
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
         """The same triangles over moved vertices."""
         return replace(self, vertices=vertices)
+
+    def corners(self, faces: NDArray[np.integer] | slice = slice(None)) -> FloatArray:
+        """(k, 3, 3) corners of some faces, or of all."""
+        return self.vertices[self.faces[faces]]
+
+    def face_normals(self, faces: NDArray[np.integer] | slice = slice(None)) -> FloatArray:
+        """(k, 3) unit normals of some faces, or of all; 0 for a face without an area."""
+        normal = area_normals(self.corners(faces))
+        return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
     def vertex_normals(self) -> FloatArray:
         """(n, 3) unit normals, outside: the sum of the adjacent faces' normals weighted by area; NaN for an unused vertex."""

@@ -33,6 +33,9 @@ _AROUND = ((1.0, 0.0), (-0.5, 0.75**0.5), (-0.5, -(0.75**0.5)))
 _ROUNDING = 1e-11
 """Of barycentric coordinates in float64: a ray through an edge goes through at least one of its faces."""
 
+_SIGHTS = 4096
+"""Lines of sight that tell which side of a surface is seen."""
+
 
 @dataclass(frozen=True)
 class Hits:
@@ -185,6 +188,17 @@ class RayCaster:
         face = dr.select(hits.valid, mi.Int32(hits.face), -1)
         dr.eval(distance, face)
         return np.array(distance), np.array(face)
+
+    def sides_seen(self, position: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+        """The faces that lines of sight from `position` (3,) meet first, and which of them are met from behind.
+
+        The lines go to some thousands of the mesh's vertices.
+        """
+        vertices = self.mesh.vertices[:: max(len(self.mesh.vertices) // _SIGHTS, 1)]
+        sight = vertices - position
+        _, face = self.cast(position, sight)
+        met = face >= 0
+        return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
     def look_down(self, grid: Grid) -> tuple[Hits, mi.Array3f64]:
         """Cast one ray per pixel centre of `grid` along -z from above the mesh, row by row; returns hits and points."""

@@ -4,32 +4,33 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from scene.config import Config
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
 from sensors.camera import Side
-from sensors.effects import (
-    AffinitySkew,
-    AngleNoise,
-    CameraKappa,
-    CameraOmega,
-    CameraPhi,
-    CameraShift,
-    FocalLength,
-    ParallaxNoise,
-    PrincipalPointX,
-    PrincipalPointY,
-    RadialDistortion,
-    RangeNoise,
-    RangeNoiseProportional,
-    RegularizationNoise,
-    StereoEffect,
-    TangentialDistortion,
-    TlsEffect,
-)
+from sensors.effects import StereoEffect, TlsEffect
+from sensors.effects.affinity_skew import AffinitySkew
+from sensors.effects.angle_noise import AngleNoise
 from sensors.effects.base import Effect, Stage
+from sensors.effects.camera_kappa import CameraKappa
+from sensors.effects.camera_omega import CameraOmega
+from sensors.effects.camera_phi import CameraPhi
+from sensors.effects.camera_shift import CameraShift
+from sensors.effects.focal_length import FocalLength
+from sensors.effects.matching_noise import MatchingNoise
+from sensors.effects.parallax_noise import ParallaxNoise
+from sensors.effects.principal_point_x import PrincipalPointX
+from sensors.effects.principal_point_y import PrincipalPointY
+from sensors.effects.radial_distortion import RadialDistortion
+from sensors.effects.range_noise import RangeNoise
+from sensors.effects.range_noise_proportional import RangeNoiseProportional
+from sensors.effects.regularization_noise import RegularizationNoise
+from sensors.effects.tangential_distortion import TangentialDistortion
+from sensors.pulses import PulseGeometry
 
 
 class TlsNoise(Config):
@@ -52,6 +53,10 @@ class TlsModel(Config):
         if sum(effect.stage == Stage.FOOTPRINT for effect in self.effects) > 1:
             raise ValueError("a scanner has one beam: name beam_divergence once")
         return self
+
+    def variance(self, at: PulseGeometry) -> FloatArray:
+        """(n,) variance of a recorded range that the model predicts, m2."""
+        return np.asarray(sum((effect.variance(at) for effect in self.chain()), np.zeros(len(at))))
 
     def chain(self) -> tuple[Effect, ...]:
         """The base noise and the effects, as one list of effects."""
@@ -147,6 +152,25 @@ class StereoModel(Config):
     sensor: Literal["stereo"] = "stereo"
     noise: StereoNoise = StereoNoise()
     effects: tuple[StereoEffect, ...] = Field((), description="effects of the catalogue beyond the base noise")
+
+    @property
+    def matching_noise(self) -> tuple[MatchingNoise, ...]:
+        """What makes disparities scatter, by a known semivariogram: the base noise, and effects of that kind."""
+        noise = self.noise
+        base = (
+            ParallaxNoise(sigma_px=noise.parallax_sigma_px),
+            RegularizationNoise(sigma_px=noise.regularization_sigma_px, step_px=noise.regularization_step_px),
+        )
+        return (*base, *(effect for effect in self.effects if isinstance(effect, MatchingNoise)))
+
+    @property
+    def variance(self) -> float:
+        """Variance of a disparity that the model predicts, px2, on average over the image."""
+        return sum(effect.total_variance for effect in self.matching_noise)
+
+    def semivariogram(self, lag: FloatArray) -> FloatArray:
+        """(k,) semivariogram of a disparity that the model predicts, px2, at `lag` ((k, 2), px)."""
+        return np.asarray(sum((effect.semivariogram(lag) for effect in self.matching_noise), np.zeros(len(lag))))
 
     def chain(self, random: KeyedRandom) -> tuple[Effect, ...]:
         """The base noise and the effects, as one list of effects; the orientation is drawn from `random`."""

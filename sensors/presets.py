@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from scene.config import Config
-from sensors.effects import BeamDivergence
+from sensors.effects.beam_divergence import BeamDivergence
 from sensors.model import TlsModel, TlsNoise
 from sensors.tls import ScannerConfig
 

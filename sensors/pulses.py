@@ -7,9 +7,42 @@ from typing import Any
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
+from sensors.functions import Functions
 
 REFERENCE_RANGE_M = 100.0
 """Received power is relative to a target of albedo 1, hit squarely, at this range."""
+
+
+_STEEPEST = 10.0
+"""1 / cos i counts as no larger than this (84 degrees): published figures end at 80 degrees, and a ray that grazes a facet by
+less would be off by metres."""
+
+
+def slant(cos_incidence: Any, m: Functions) -> Any:
+    """(n,) 1 / cos i - 1, what a slanting surface adds to the length of an echo; m: functions of host or device arrays."""
+    return 1 / m.select(cos_incidence < 1 / _STEEPEST, 1 / _STEEPEST, cos_incidence) - 1
+
+
+@dataclass(frozen=True)
+class PulseGeometry:
+    """What the equations of a laser scanner's effects look at, n pulses: (n,) arrays of the host or of the device.
+
+    azimuth, zenith: recorded, rad; range_m: true, m; cos_incidence; power: received, relative; line: scan line; share: of the
+    scan's duration; by_azimuth, by_zenith: slopes of the true range by the direction, m/rad. None: not known.
+    """
+
+    azimuth: Any
+    zenith: Any
+    range_m: Any = None
+    cos_incidence: Any = None
+    power: Any = None
+    line: Any = None
+    share: Any = None
+    by_azimuth: Any = None
+    by_zenith: Any = None
+
+    def __len__(self) -> int:
+        return len(self.azimuth)
 
 
 @dataclass(frozen=True)
@@ -49,6 +82,14 @@ class Pulses:
     def uniforms(self, random: KeyedRandom) -> mi.Array4f:
         """Four independent numbers in [0, 1) per pulse."""
         return random.uniforms(self.pulse_key, self.line_key)
+
+    def geometry(self) -> PulseGeometry:
+        """What equations look at, in double precision; what is not traced yet is None."""
+        wide = {
+            name: None if value is None else mi.Float64(value)
+            for name, value in (("cos_incidence", self.cos_incidence), ("power", self.power), ("line", self.line))
+        }
+        return PulseGeometry(self.azimuth, self.zenith, range_m=self.true_range, share=self.share, **wide)
 
     def with_angle_error(self, azimuth: Any = 0.0, zenith: Any = 0.0) -> Pulses:
         """Recorded minus emitted direction grows by `azimuth` and `zenith`, rad: it leaves by as much on the other side."""

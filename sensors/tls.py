@@ -25,6 +25,7 @@ from sensors.footprint import Beam, Echo
 from sensors.model import TlsModel
 from sensors.observation import FurtherReturns, Observation, packed
 from sensors.placement import EXACT_POSE, PoseSigma
+from sensors.polar import polar
 from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction, tangents
 from sensors.returns import MOST_RETURNS, Recorded, further_returns
 
@@ -332,7 +333,7 @@ _CHUNK = 1 << 20
 
 def _angles(local: FloatArray) -> list[list[float]]:
     """Smallest and largest azimuth, then zenith, of (n, 3) points in the scanner's frame, rad."""
-    angles = np.arctan2(local[:, 1], local[:, 0]), np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+    _, *angles = polar(local)
     return [[angle.min(), angle.max()] for angle in angles]
 
 

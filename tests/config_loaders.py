@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import load_config
+from pipeline.config.presets import read_preset
+from pipeline.config.simulation import load_config
 from pipeline.dataset.config import load_dataset_config
 from pipeline.detect.config import load_train_config
-from pipeline.gap.measurement import MeasurementConfig
-from pipeline.presets import read_preset
+from pipeline.formats.measurement import MeasurementConfig
 from scene.config import load_yaml, parse
 
 LOADERS: dict[str, Callable[[Path], Any]] = {

@@ -6,7 +6,7 @@ that function. The reference is the wall plus an error that is correlated over m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,6 +96,7 @@ def write_scan(
     ranges: Callable[[Scan], Array] | None = None,
     lost: Callable[[Scan], Array] | None = None,
     fall: tuple[float, float, float] | None = None,
+    blocks: Sequence[tuple[int, int, float]] = (),
     step_rad: float = 0.0045,
     intensity: bool = True,
     epochs: int = 1,
@@ -103,7 +104,7 @@ def write_scan(
 ) -> None:
     """A laser scan, or epochs of it whose poses are off each for itself. angles: (azimuth, zenith, line) to recorded minus true
     angles; ranges: recorded ranges; lost: returns lost; fall: x, z and depth of a niche of 1.2 m that the reference does not
-    have."""
+    have; blocks: column, row and depth of nodes that lie deeper than in the reference: pyramids of volume depth x STEP^2."""
     rng = np.random.default_rng(seed)
     shape = int(WIDTH / STEP) + 1, int(HEIGHT / STEP) + 1
     nodes = 0.5 * smooth_noise(shape, 9.0, rng) + 0.08 * smooth_noise(shape, 2.5, rng)
@@ -111,6 +112,8 @@ def write_scan(
     real = nodes.copy()
     if fall is not None:
         real += fall[2] * ((np.abs(x - fall[0]) < 0.6) & (np.abs(z - fall[1]) < 0.6))
+    for column, row, depth in blocks:
+        real[column, row] += depth
     wall = Field(real)
     position, turn = np.array([WIDTH * 0.42, -34.0, 2.5]), 0.01
     azimuth = np.arange(0.5 * np.pi - 0.62, 0.5 * np.pi + 0.68, step_rad)

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import example_data
 import howtos
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
+
+from pipeline.formats.laz import read_laz
+from scene.config import load_yaml, parse
+from sensors.model import TlsModel
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -89,6 +96,56 @@ def test_a_how_to_works_as_it_is_written(page: str, tmp_path: Path, monkeypatch:
         example_data.measurement(Path("my_measurement"), step_rad=0.012)
     howtos.carry_out(page, FURTHER[page])
     assert Path(howtos.PICTURES[page]).is_file()
+    CLAIMS[page]()
+
+
+def read(path: str) -> Any:
+    return json.loads(Path(path).read_text())
+
+
+def a_site_is_simulated() -> None:
+    """Both sensors on the mesh, the scanner that was named, and results in the survey's coordinates."""
+    for sensor in ("stereo", "tls"):
+        assert Path(read(f"runs/{sensor}/run.json")["config"]["wall"]["mesh"]).name == "wall.ply"
+        points = read_laz(Path(f"runs/{sensor}/epoch_001/points_world.laz")).points
+        assert np.abs(points.mean(axis=0) - example_data.ORIGIN).max() < 30
+    config = read("runs/tls/run.json")["config"]
+    assert config["scanner"]["name"] == "RIEGL VZ-400i"
+    assert [effect["name"] for effect in config["sensor"][-1]["effects"]] == ["beam_divergence"]
+
+
+def a_set_is_made() -> None:
+    assert {path.name for path in Path("sets/my_set").iterdir()} >= {"dataset.json", "train", "val", "test"}
+
+
+def sensors_are_compared() -> None:
+    assert "riegl_vz400i" in Path("comparison/comparison.json").read_text()
+    assert read("plan/plan.json")["config"]["scanner"]["name"] == "RIEGL VZ-400i"
+    assert read("plan/plan.json")["config"]["planning"]["block_size_m"] == [0.2]
+
+
+def the_calibrated_model_is_simulated() -> None:
+    (model,) = read("runs/calibrated/run.json")["config"]["sensor"]
+    assert model == parse(TlsModel, load_yaml(Path("calibration/calibrated.yaml")), "calibrated").model_dump(mode="json")
+    assert model["noise"]["range_sigma_m"] != TlsModel().noise.range_sigma_m
+
+
+def what_the_gap_names_is_simulated() -> None:
+    (model,) = read("runs/with_the_effect/run.json")["config"]["sensor"]
+    assert model == parse(TlsModel, load_yaml(Path("diagnosis/model_after.yaml")), "after").model_dump(mode="json")
+    assert [f"tls.{effect['name']}" for effect in model["effects"]] == [
+        each["name"] for each in read("diagnosis/gap.json")["effects"]
+    ]
+
+
+CLAIMS = {
+    "own_site": a_site_is_simulated,
+    "training_set": a_set_is_made,
+    "compare_sensors": sensors_are_compared,
+    "calibrate": the_calibrated_model_is_simulated,
+    "missing_effect": what_the_gap_names_is_simulated,
+}
+"""What the pages say that their commands do."""
 
 
 def test_the_effect_of_the_page_on_adding_one_is_an_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

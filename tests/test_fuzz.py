@@ -18,6 +18,7 @@ from config_loaders import LOADERS
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+from pipeline.config.overrides import apply_overrides
 from pipeline.formats.camera_files import read_lens, read_oriented
 from pipeline.formats.cameras import read_cameras_yaml, write_cameras_yaml
 from pipeline.formats.colmap import read_map, write_map
@@ -29,7 +30,6 @@ from pipeline.formats.opencv import write_opencv
 from pipeline.formats.ply import read_ply, read_ply_points, write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import read_xyz, write_xyz
-from pipeline.overrides import apply_overrides
 from scene.config import load_yaml
 from scene.errors import InputError
 from scene.grid import Grid

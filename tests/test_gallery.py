@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sensors.effects import FURTHER_STEREO_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS
+from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS
 
-EFFECTS = (*TLS_EFFECTS, *STEREO_EFFECTS, *FURTHER_STEREO_EFFECTS)
+EFFECTS = (*TLS_EFFECTS, *STEREO_EFFECTS, *FURTHER_EFFECTS)
 FOLDER = Path(__file__).parents[1] / "docs" / "effects"
 
 

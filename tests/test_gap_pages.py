@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pipeline.gap.in_words import VERDICTS
+from pipeline.gap.naming.verdict import VERDICTS
 from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
 
 FOLDER = Path(__file__).parents[1] / "docs" / "gap"

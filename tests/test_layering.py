@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -67,9 +68,9 @@ def test_layers_import_downwards_only(folder: str) -> None:
     ("folder", "line"),
     [
         ("scene", "from sensors.tls import Scanner"),
-        ("scene", "import pipeline.run"),
+        ("scene", "import pipeline.run.simulation"),
         ("scene", "def late():\n    from pipeline import run"),
-        ("sensors", "from pipeline.run import simulate"),
+        ("sensors", "from pipeline.run.simulation import simulate"),
         ("sensors", "from scene.carve import carve"),
         ("sensors", "from scene import blocks"),
     ],
@@ -104,7 +105,61 @@ def test_help_loads_nothing_heavy(words: list[str]) -> None:
 
 def test_reading_a_config_loads_none_of_the_slow_libraries() -> None:
     """What a step alone needs is imported by that step; scipy and trimesh together would take longer than all the rest."""
-    program = "import sys, pipeline.config, pipeline.site; print(*sys.modules)"
+    program = "import sys, pipeline.config.simulation, pipeline.run.site; print(*sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
     slow = {"scipy", "trimesh", "open3d", "matplotlib", "laspy", "pycocotools", "tensorflow"}
     assert slow & set(result.stdout.split()) == set()
+
+
+def folder_of(module: tuple[str, ...]) -> str:
+    """The room of a module: `pipeline.gap.mean` of pipeline.gap.mean.selection, `sensors` of sensors.effects.wobble."""
+    return ".".join(module[:-1]) if module[0] == "pipeline" else module[0]
+
+
+def room_edges(imports: dict[tuple[str, ...], Imports]) -> dict[str, set[str]]:
+    """Which rooms each room imports from, by the imports of all its modules, late ones included."""
+    edges: dict[str, set[str]] = {folder_of(module): set() for module in imports}
+    for module, found in imports.items():
+        for path in found:
+            known = next((path[:size] for size in (len(path), len(path) - 1) if path[:size] in imports), None)
+            if known is not None and folder_of(known) != folder_of(module):
+                edges[folder_of(module)].add(folder_of(known))
+    return edges
+
+
+def modules() -> dict[tuple[str, ...], Imports]:
+    return {
+        file.relative_to(ROOT).with_suffix("").parts: imports_of(file.read_text())
+        for folder in ("scene", "sensors", "pipeline")
+        for file in sources(folder)
+        if file.name != "__init__.py"
+    }
+
+
+def test_no_rooms_need_each_other() -> None:
+    """Raises CycleError, which names the rooms, where one does."""
+    order = list(TopologicalSorter(room_edges(modules())).static_order())
+    assert order.index("scene") < order.index("sensors") < order.index("pipeline.run") < order.index("pipeline.cli")
+
+
+def test_the_rule_sees_rooms_that_need_each_other() -> None:
+    imports: dict[tuple[str, ...], Imports] = {
+        ("pipeline", "a", "one"): {("pipeline", "b", "two", "Two")},
+        ("pipeline", "b", "two"): set(),
+        ("pipeline", "b", "three"): {("pipeline", "a", "one", "One")},
+    }
+    with pytest.raises(CycleError):
+        list(TopologicalSorter(room_edges(imports)).static_order())
+
+
+def test_no_file_of_the_pipeline_lies_outside_a_room() -> None:
+    assert [file.name for file in (ROOT / "pipeline").glob("*.py")] == ["__init__.py"]
+
+
+@pytest.mark.parametrize("file", sources("pipeline"), ids=lambda file: str(file.relative_to(ROOT)))
+def test_nothing_in_the_pipeline_is_decided_by_the_name_of_an_effect(file: Path) -> None:
+    """What is known of an effect stands on its class; an algorithm that is made for one effect names the class."""
+    names = {path.stem for path in (ROOT / "sensors" / "effects").glob("*.py")}
+    names |= {f"{sensor}.{name}" for sensor in ("tls", "stereo") for name in names}
+    written = {node.value for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Constant)}
+    assert written & names == set()

@@ -58,9 +58,9 @@ def test_it_runs_where_there_is_no_checkout(wheel: Path, tmp_path: Path) -> None
         archive.extractall(tmp_path / "site")
     program = (
         f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r})\n"
-        "import pipeline.bundled\n"
+        "import pipeline.config.bundled\n"
         "from pipeline.cli.main import main\n"
-        "print(pipeline.bundled.configs_folder())\n"
+        "print(pipeline.config.bundled.configs_folder())\n"
         "sys.exit(main(['init', '--site', 'bulga', '--scanner', 'leica_p50', '--out', 'site.yaml']))"
     )
     work = tmp_path / "work"

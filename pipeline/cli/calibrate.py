@@ -36,20 +36,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.bundled import bundled_config, config_path
+    from pipeline.calibrate.calibrate import calibrate
+    from pipeline.calibrate.inputs import config_of, sensor_of
+    from pipeline.calibrate.report import summary
+    from pipeline.calibrate.write import RECORD_FILE, write
     from pipeline.cli.simulate import new_folder
-    from pipeline.config import load_config
-    from pipeline.noise.calibrate import calibrate
-    from pipeline.noise.inputs import config_of, sensor_of
-    from pipeline.noise.write import RECORD_FILE, write
-    from pipeline.progress import shown_progress
-    from pipeline.report.calibration import summary
+    from pipeline.config.bundled import bundled_config, config_path
+    from pipeline.config.simulation import load_config
+    from pipeline.formats.atomic import empty_folder
+    from pipeline.report.progress import shown_progress
 
     given = config_path("sites", arguments.config) if arguments.config else config_of(arguments.measured)
+    out = empty_folder(arguments.out or new_folder(Path("runs"), "calibrate"))
     path = given or bundled_config("", "demo")
     config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)
     sensor = arguments.sensor or sensor_of(arguments.measured, config)
     with shown_progress(quiet=arguments.quiet) as progress:
+        progress.plan({"report": 5.0})
         result = calibrate(config, sensor, arguments.measured, progress, with_greedy=not arguments.no_greedy)
-        report = write(arguments.out or new_folder(Path("runs"), "calibrate"), config, result, arguments.measured)
+        with progress.stage("report"):
+            report = write(out, config, result, arguments.measured)
     return Answer(f"{summary(result)}\nreport: {report}", recorded(report, RECORD_FILE))

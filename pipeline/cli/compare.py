@@ -12,6 +12,8 @@ SUMMARY = "compare sensors on one wall and the same blocks: noise, level of dete
 EXAMPLE = """  scarpsim compare my_site.yaml
   scarpsim compare my_site.yaml riegl_vz400i glendale_high --epochs 8 --sizes-m 0.05 0.5 --measured my_epochs --out comparison"""
 
+MOST_EPOCHS = 999
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -23,7 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--measured", type=Path, nargs="+", default=[], metavar="FOLDER", help="measured epochs to put beside")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
-    parser.add_argument("--epochs", type=at_least(1), default=6, metavar="N", help="epochs in which rocks fall (default: 6)")
+    parser.add_argument(
+        "--epochs", type=at_least(1, at_most=MOST_EPOCHS), default=6, metavar="N", help="epochs in which rocks fall (default: 6)"
+    )
     parser.add_argument(
         "--blocks",
         type=one_of("sweep", "config"),
@@ -40,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random numbers (default: the first config's)")
     parser.add_argument(
+        "--own-step",
+        action="store_true",
+        help="scanner presets scan with their own angular step (default: all with that of the first config)",
+    )
+    parser.add_argument(
         "--set",
         action="append",
         default=[],
@@ -52,16 +61,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
+    from pipeline.compare.comparison import compare_sensors
+    from pipeline.compare.report import COMPARISON_FILE, summary, write_comparison
+    from pipeline.compare.sensors_compared import contestants
     from pipeline.formats.atomic import empty_folder
-    from pipeline.noise.comparison import compare_sensors
-    from pipeline.noise.contestants import contestants
-    from pipeline.progress import shown_progress
-    from pipeline.report.comparison import COMPARISON_FILE, summary, write_comparison
+    from pipeline.report.progress import shown_progress
 
-    sensors = contestants(arguments.configs, arguments.overrides, arguments.seed)
+    sensors = contestants(arguments.configs, arguments.overrides, arguments.seed, own_step=arguments.own_step)
     out = empty_folder(arguments.out or new_folder(Path("runs"), "compare"))
     sizes = tuple(arguments.sizes_m) if arguments.blocks == "sweep" else None
     with shown_progress(quiet=arguments.quiet) as progress:
+        progress.plan({"report": 6.0})
         comparison = compare_sensors(sensors, arguments.measured, arguments.epochs, sizes, progress)
-    report = write_comparison(out, comparison)
+        with progress.stage("report"):
+            report = write_comparison(out, comparison)
     return Answer(f"{summary(comparison)}\nreport: {report}", recorded(report, COMPARISON_FILE))

@@ -21,6 +21,9 @@ EXAMPLE = """  scarpsim dataset configs/datasets/small.yaml --out sets/small --w
   scarpsim dataset split sets/small --by sensor,noise --out sets/parts"""
 
 
+_BY = "sensor,noise,size"
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "words", nargs="+", metavar="CONFIG | verify DIR | merge DIR ... | split DIR", help="what to make, or what to do with it"
@@ -32,9 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
-    parser.add_argument(
-        "--by", default="sensor,noise,size", metavar="KEYS", help="split: one set for each combination (default: %(default)s)"
-    )
+    parser.add_argument("--by", metavar="KEYS", help=f"split: one set for each combination (default: {_BY})")
     parser.add_argument("--report-only", action="store_true", help="verify: do not make damaged tiles again; exit with 1")
     add_output_options(parser)
 
@@ -43,6 +44,13 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.workers and arguments.scheduler:
         raise InputError("are given both", where="--workers and --scheduler", remedy="give one of them")
     action, *folders = arguments.words
+    for option, given, goes_with in (
+        ("--by", arguments.by is not None, "split"),
+        ("--report-only", arguments.report_only, "verify"),
+    ):
+        if given and action != goes_with:
+            remedy = f"write scarpsim dataset {goes_with} DIR, or leave it out"
+            raise InputError(f"goes with {goes_with}, not with '{action}'", where=option, remedy=remedy)
     if action == "verify":
         return _verify(arguments, _one(folders, "verify"))
     if action == "merge":
@@ -56,10 +64,10 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def _make(arguments: argparse.Namespace, path: Path) -> Answer:
     out = _out(arguments)
-    from pipeline.bundled import config_path
+    from pipeline.config.bundled import config_path
     from pipeline.dataset.config import load_dataset_config
     from pipeline.dataset.run import Workers, make_dataset
-    from pipeline.progress import shown_progress
+    from pipeline.report.progress import shown_progress
 
     config = load_dataset_config(config_path("datasets", path), arguments.overrides, arguments.seed)
     arguments.kept = f"what was finished is in {out} and usable; the same command goes on"
@@ -71,7 +79,7 @@ def _make(arguments: argparse.Namespace, path: Path) -> Answer:
 
 def _verify(arguments: argparse.Namespace, folder: Path) -> Answer:
     from pipeline.dataset.run import Workers, verify_dataset
-    from pipeline.progress import shown_progress
+    from pipeline.report.progress import shown_progress
 
     workers = Workers(arguments.workers or 0, arguments.scheduler or "")
     with shown_progress(quiet=arguments.quiet) as progress:
@@ -96,7 +104,7 @@ def _split(arguments: argparse.Namespace, folder: Path) -> Answer:
     out = _out(arguments)
     from pipeline.dataset.combine import split_dataset
 
-    parts = list(split_dataset(folder, out, arguments.by.split(",")))
+    parts = list(split_dataset(folder, out, (arguments.by or _BY).split(",")))
     return Answer("\n".join(part.summary() for part in parts), lambda: {"sets": [_document(part) for part in parts]})
 
 

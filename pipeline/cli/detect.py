@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
     from pipeline.detect.run import BASELINE, CONFIDENCES, checked_confidences, detect
-    from pipeline.progress import shown_progress
+    from pipeline.report.progress import shown_progress
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
     out = arguments.out or new_folder(Path("runs"), "detect")

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from pipeline.cli.answer import Answer, recorded
-from pipeline.cli.parser import add_output_options, at_least, one_of
+from pipeline.cli.parser import add_output_options, at_least, between, one_of
 
 SUMMARY = "find where a measurement and the model disagree, name the effect, add it, show the gap shrink"
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reference-error",
-        type=float,
+        type=between(0.0, 100.0),
         metavar="M",
         help="with --identifiability: error of the known surface, correlated over 3 m (default: 0.001 tls, 0.005 stereo)",
     )
@@ -49,10 +49,10 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
-    from pipeline.gap.measurement import read_measurement
-    from pipeline.gap.report import summary, write
-    from pipeline.gap.workflow import STEPS, diagnose
-    from pipeline.progress import shown_progress
+    from pipeline.formats.measurement import read_measurement
+    from pipeline.gap.naming.workflow import STEPS, diagnose
+    from pipeline.gap.report.report import summary, write
+    from pipeline.report.progress import shown_progress
 
     weights = {**STEPS, "report": 2.0}
     steps = iter(weights)
@@ -71,9 +71,9 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
 
 
 def _identifiability(arguments: argparse.Namespace, out: Path) -> Answer:
-    from pipeline.gap.identifiability import identifiability, table
-    from pipeline.gap.identifiability_report import in_words, write_identifiability
-    from pipeline.gap.surveys import surveys
+    from pipeline.gap.report.identifiability_report import in_words, write_identifiability
+    from pipeline.gap.survey.identifiability import identifiability, table
+    from pipeline.gap.survey.surveys import surveys
 
     wanted = surveys(arguments.measurement, arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]

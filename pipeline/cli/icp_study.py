@@ -13,6 +13,9 @@ SUMMARY = "find the settings of ICP that suit a run, against the true transform"
 EXAMPLE = """  scarpsim icp-study runs/my_site
   scarpsim icp-study my_site.yaml --sensor stereo --epochs 2 --offset-m 0.05 --out study"""
 
+MOST_OFFSET_M = 100.0
+"""More than any epoch is off that somebody set up with a map in hand, and than ICP could take."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -20,8 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="of a config (default: its first)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
-    parser.add_argument("--epochs", type=at_least(1), default=1, metavar="N", help="epochs to register (default: 1)")
-    parser.add_argument("--repeats", type=at_least(1), default=3, metavar="N", help="random subsets for each ratio (default: 3)")
+    parser.add_argument(
+        "--epochs", type=at_least(1, at_most=9999), default=1, metavar="N", help="epochs to register (default: 1)"
+    )
+    parser.add_argument(
+        "--repeats", type=at_least(1, at_most=9999), default=3, metavar="N", help="random subsets for each ratio (default: 3)"
+    )
     parser.add_argument(
         "--offset-m", type=float, default=0.03, metavar="M", help="put each epoch off by a known motion first (default: 0.03)"
     )
@@ -33,23 +40,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.bundled import config_path
     from pipeline.cli.simulate import new_folder
-    from pipeline.config import load_config
+    from pipeline.config.bundled import config_path
+    from pipeline.config.simulation import load_config
     from pipeline.formats.atomic import empty_folder
-    from pipeline.noise.icp_study import simulated_surfaces, study, surfaces_of_run
-    from pipeline.progress import shown_progress
-    from pipeline.register import IcpConfig
-    from pipeline.report.icp_study import summary, write_icp_study
+    from pipeline.icp_study.report import summary, write_icp_study
+    from pipeline.icp_study.study import simulated_surfaces, study, surfaces_of_run
+    from pipeline.registration.register import IcpConfig
+    from pipeline.report.progress import shown_progress
     from scene.keyed_random import KeyedRandom
 
-    if not arguments.offset_m >= 0:
-        raise InputError(f"got {arguments.offset_m:g}", where="--offset-m", allowed="0 m or more")
+    if not 0 <= arguments.offset_m <= MOST_OFFSET_M:
+        raise InputError(f"got {arguments.offset_m:g}", where="--offset-m", allowed=f"0 to {MOST_OFFSET_M:g} m")
     out = empty_folder(arguments.out or new_folder(Path("runs"), "icp_study"))
     with shown_progress(quiet=arguments.quiet) as progress:
         if arguments.source.is_dir():
-            config, sensor, surfaces = surfaces_of_run(arguments.source)
-            surfaces = surfaces[: arguments.epochs + 1]
+            config, sensor, surfaces = surfaces_of_run(arguments.source, arguments.epochs)
         else:
             config = load_config(config_path("sites", arguments.source), arguments.overrides, arguments.sensor, arguments.seed)
             sensor = arguments.sensor or config.sensor_names()[0]

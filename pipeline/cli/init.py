@@ -1,4 +1,4 @@
-"""`scarpsim init`: write a complete, commented config to start from."""
+"""`scarpsim init`: write a short config to start from, all further keys in its comments."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options
 from scene.errors import InputError
 
-SUMMARY = "write a complete config with every key explained"
+SUMMARY = "write a short config to start from, with every further key in a comment"
 EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml
   simulate --sensor tls --config my_site.yaml
   scarpsim init --dataset small --out my_set.yaml"""
@@ -28,9 +28,9 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.dataset and (arguments.site or arguments.scanner):
         raise InputError("stands beside --site or --scanner", where="--dataset", remedy="a data set's walls name their sites")
     kind = "dataset" if arguments.dataset else "simulation"
-    text = _dataset(arguments.dataset) if arguments.dataset else _simulation(arguments.site, arguments.scanner)
+    text = _dataset(arguments.dataset) if arguments.dataset else simulation_text(arguments.site, arguments.scanner)
+    from pipeline.cli.json_schema import schema_line, schema_name, schema_text
     from pipeline.formats.atomic import write_text
-    from pipeline.schema import schema_line, schema_name, schema_text
 
     schema = out.parent / schema_name(kind)
     try:
@@ -46,21 +46,21 @@ def run(arguments: argparse.Namespace) -> Answer:
     return Answer(told, lambda: {"file": str(out), "schema": str(schema), "command": command})
 
 
-def _simulation(site: str | None, scanner: str | None) -> str:
-    from pipeline.bundled import bundled_config
-    from pipeline.commented import commented_yaml
-    from pipeline.config import SimulationConfig
+def simulation_text(site: str | None, scanner: str | None) -> str:
+    from pipeline.config.bundled import bundled_config
+    from pipeline.config.commented import commented_yaml
+    from pipeline.config.simulation import SimulationConfig
     from scene.config import load_yaml, parse
 
     source = bundled_config("sites", site) if site else bundled_config("", "demo")
-    values = load_yaml(source) or {}
+    values = load_yaml(source)
     if scanner:
-        models = [model for model in values.get("sensor", []) if model.get("sensor") != "tls"]
-        values |= {"scanner": scanner, "sensor": models}
-    return commented_yaml(parse(SimulationConfig, values, str(source)))
+        models = [model for model in values["sensor"] if model["sensor"] != "tls"]
+        values |= {"scanner": {"preset": scanner, **values["scanner"]}, "sensor": models}
+    return commented_yaml(parse(SimulationConfig, values, str(source)), values)
 
 
 def _dataset(name: str) -> str:
-    from pipeline.bundled import bundled_config
+    from pipeline.config.bundled import bundled_config
 
     return bundled_config("datasets", name).read_text(encoding="utf-8")

@@ -32,14 +32,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.bundled import config_path
     from pipeline.cli.simulate import new_folder
-    from pipeline.config import load_config
+    from pipeline.config.bundled import config_path
+    from pipeline.config.simulation import load_config
+    from pipeline.formats.atomic import empty_folder
     from pipeline.planning.inspect import PLAN_FILE, inspect, write_plans
-    from pipeline.report.plan import summary
+    from pipeline.planning.report import summary
 
     config = load_config(config_path("sites", arguments.config), arguments.overrides, arguments.sensor, arguments.seed)
     sensors = [arguments.sensor] if arguments.sensor else config.sensor_names()
+    out = empty_folder(arguments.out or new_folder(Path("runs"), "inspect"))
     plans = inspect(config, sensors)
-    report = write_plans(arguments.out or new_folder(Path("runs"), "inspect"), config, plans)
+    report = write_plans(out, config, plans)
     return Answer("\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]), recorded(report, PLAN_FILE))

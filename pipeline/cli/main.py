@@ -34,7 +34,7 @@ from pipeline.cli import (
 from pipeline.cli import simulate as simulate_command
 from pipeline.cli.answer import Answer, as_json
 from pipeline.cli.parser import Parser
-from scene.errors import InputError, nearest
+from scene.errors import InputError, OutsideError, nearest
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 _BAD_PLACES = {
@@ -154,6 +154,8 @@ def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str
     """The message and the exit code of an error; the only place where errors become exit codes."""
     if isinstance(error, InputError):
         return str(error), WRONG_INPUT
+    if isinstance(error, OutsideError):
+        return str(error), FAILED
     if isinstance(error, KeyboardInterrupt):
         kept = getattr(arguments, "kept", "")
         return f"interrupted; {kept}" if kept else "interrupted", INTERRUPTED

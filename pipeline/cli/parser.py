@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from typing import NoReturn
 
@@ -60,16 +61,32 @@ def one_of(*allowed: str) -> Callable[[str], str]:
     return check
 
 
-def at_least(smallest: int) -> Callable[[str], int]:
-    """An argument's type: a whole number not below `smallest`."""
+def between(low: float, high: float) -> Callable[[str], float]:
+    """An argument's type: a number within two limits, which are allowed too."""
+
+    def check(text: str) -> float:
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not low <= number <= high:
+            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: a number from {low:g} to {high:g}")
+        return number
+
+    return check
+
+
+def at_least(smallest: int, *, at_most: int | None = None) -> Callable[[str], int]:
+    """An argument's type: a whole number not below `smallest` and not above `at_most`."""
+    allowed = f"a whole number from {smallest}" + ("" if at_most is None else f" to {at_most}")
 
     def check(text: str) -> int:
         try:
             number = int(text)
         except ValueError:
             number = smallest - 1
-        if number < smallest:
-            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: a whole number from {smallest}")
+        if number < smallest or (at_most is not None and number > at_most):
+            raise argparse.ArgumentTypeError(f"got '{text[:40]}'; allowed: {allowed}")
         return number
 
     return check

@@ -25,6 +25,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.schema import schema_text
+    from pipeline.cli.json_schema import schema_text
 
     return Answer(schema_text(arguments.kind).rstrip("\n"))

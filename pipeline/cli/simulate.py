@@ -43,10 +43,10 @@ def run(arguments: argparse.Namespace) -> Answer:
     out = arguments.out or new_folder(Path("runs"), arguments.sensor)
     if arguments.threads:
         _use_threads(arguments.threads)
-    from pipeline import run as pipeline_run
-    from pipeline.bundled import bundled_config, config_path
-    from pipeline.config import load_config
-    from pipeline.progress import shown_progress
+    from pipeline.config.bundled import bundled_config, config_path
+    from pipeline.config.simulation import load_config
+    from pipeline.report.progress import shown_progress
+    from pipeline.run import simulation as pipeline_run
 
     path = config_path("sites", arguments.config) if arguments.config else bundled_config("", "demo")
     config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)

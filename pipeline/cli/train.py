@@ -32,17 +32,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.bundled import bundled_config, config_path
+    from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detect.config import load_train_config
     from pipeline.detect.data import CocoFolder
     from pipeline.detect.keras_backend import keras_ready
-    from pipeline.progress import shown_progress
+    from pipeline.report.progress import shown_progress
 
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
     path = config_path("detectors", arguments.config) if arguments.config else bundled_config("detectors", "light")
     config = load_train_config(path, overrides)
     for split in ("train", "val"):
-        CocoFolder(arguments.data_set / split)  # a mistake there should not wait for TensorFlow
+        CocoFolder(arguments.data_set / split).check_images()  # a mistake there should not wait for TensorFlow
     keras_ready()
     from pipeline.detect.training import train
 

@@ -12,22 +12,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-from pipeline.annotate import BLOCK_CATEGORY
-from pipeline.dataset.card import write_card
-from pipeline.dataset.folder import (
-    CHECKSUMS,
-    SHARDS,
-    Damage,
-    Record,
-    read_dataset_file,
-    read_shard,
-    sha256,
-    shard_name,
-    tile_files,
-)
+from pipeline.change.annotate import BLOCK_CATEGORY
+from pipeline.dataset.card import README, write_card
+from pipeline.dataset.folder import CHECKSUMS, Damage, found_damage, tile_files
 from pipeline.dataset.plan import SPLITS, Split
+from pipeline.dataset.records import SHARDS, Record, read_dataset_file, read_shard, shard_name
 from pipeline.dataset.statistics import SetStatistics
 from pipeline.formats.atomic import write_text, writing
+from pipeline.formats.checksum import sha256
 
 ANNOTATIONS = "annotations.json"
 
@@ -80,19 +72,26 @@ def shards(folder: Path, dataset: Record) -> Iterator[Record]:
 
 
 def assembled_damages(folder: Path) -> list[Damage]:
-    """What is missing or damaged of the files that `assemble` writes."""
+    """What is missing or damaged of the files that `assemble` writes, the list of checksums among them."""
     path = folder / CHECKSUMS
-    if not path.exists():
-        return [Damage(Path(CHECKSUMS), "missing")]
-    found = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        digest, _, name = line.partition("  ")
-        if name.endswith(".tif") or name.startswith(SHARDS):  # the shards know their tiles, and themselves
-            continue
-        if not name or not (folder / name).is_file():
-            found.append(Damage(Path(name or CHECKSUMS), "missing" if name else "damaged"))
-        elif sha256(folder / name) != digest:
-            found.append(Damage(Path(name), "damaged"))
+    if not path.is_file():
+        return [Damage(Path(CHECKSUMS), "a folder" if path.is_dir() else "missing")]
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    listed = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+    known = _known_digests(folder)
+    if any(listed.get(name, "") != (digest or listed.get(name)) for name, digest in known.items()):
+        return [Damage(Path(CHECKSUMS), "damaged")]
+    others = [name for name in listed if not name.startswith(f"{SHARDS}/") and not name.endswith(".tif")]  # shards know theirs
+    return [each for name in others for each in found_damage(folder, name, listed[name], CHECKSUMS)]
+
+
+def _known_digests(folder: Path) -> dict[str, str]:
+    """What the list of checksums has to hold as far as the shards tell: tiles and shards with their checksums, "" of the rest."""
+    dataset = read_dataset_file(folder)
+    found: dict[str, str] = {README: ""}
+    for record in shards(folder, dataset):
+        shard = f"{SHARDS}/{shard_name(record['source'], record['epoch']['index'])}"
+        found |= {**dict(tile_files(record)), shard: sha256(folder / shard), f"{record['epoch']['split']}/{ANNOTATIONS}": ""}
     return found
 
 
@@ -139,7 +138,7 @@ def _write_coco(
     separator = "\n"
     for record in records:
         statistics.add(record)
-        digests.update({str(name): digest for name, digest in tile_files(record)})
+        digests.update(tile_files(record))
         for tile in record["tiles"]:
             ids.image += 1
             images.append(_compact(_image(record, tile, ids.image)))

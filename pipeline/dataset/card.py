@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.dataset.plan import SPLITS
 from pipeline.dataset.statistics import SIZE_EDGES_M, SetStatistics
 from pipeline.formats.atomic import write_bytes, write_text
+from pipeline.formats.inside import inside
 
 README, CARD = "README.md", "card"
 _LOADING = """## Loading
@@ -54,7 +55,7 @@ def write_card(
     folder: Path, dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str], *, complete: bool
 ) -> list[str]:
     """Write README.md and the pictures; digests: of the files so far, by name. Returns the names of what was written."""
-    from pipeline.report.dataset_figures import noise_figure, sizes_figure
+    from pipeline.dataset.figures import noise_figure, sizes_figure
 
     pictures = {
         f"{CARD}/sizes.png": sizes_figure(_sizes(statistics), SIZE_EDGES_M),
@@ -156,13 +157,13 @@ def _noise(statistics: SetStatistics) -> dict[str, list[float]]:
 
 def _samples(folder: Path, statistics: SetStatistics) -> Iterator[tuple[str, bytes]]:
     """A picture for each sensor: levels of noise down, classes of sizes across."""
+    from pipeline.dataset.figures import SampleTile, samples_figure
     from pipeline.dataset.loaders import masks_of
     from pipeline.formats.geotiff import read_tiff
-    from pipeline.report.dataset_figures import SampleTile, samples_figure
 
     def shown(key: tuple[str, str, str]) -> SampleTile:
         sample = statistics.samples[key]
-        values = read_tiff(folder / sample.file)
+        values = read_tiff(inside(folder, sample.file, folder))
         masks = masks_of(sample.tile["annotations"], values.shape)
         return SampleTile(f"{sample.cell[2]}, {key[1]}, {key[2]}", values, np.any(masks, axis=0, keepdims=False), sample.noise_m)
 

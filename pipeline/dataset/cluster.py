@@ -1,30 +1,44 @@
-"""The epochs of a set on Dask's distributed: local processes, or the scheduler at an address. Queue and retries are Dask's."""
+"""The epochs of a set on Dask's distributed: local processes, or the scheduler at an address. Queue and retries are Dask's.
+
+Local processes speak TLS with keys that exist in memory for one job alone, so that no other user of the machine can hand them
+work; there is no dashboard. A scheduler of the user's is as open or closed as the user set it up.
+"""
 
 from __future__ import annotations
 
 import logging
+import multiprocessing.resource_tracker
 import os
+import signal
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from pipeline.dataset.worker import Order, fill_run
-from scene.errors import InputError
+from scene.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
-    from distributed import Client, LocalCluster
+    from distributed import Client, Future, LocalCluster
 
+Run = list[Order]
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _CONNECT_S = 20
+_LOOK_S, _LOST_S = 5.0, 15.0
+"""How often it is asked who works, and how long nobody may."""
+_CLOSE_S = 20.0
+_STARTS = 3
+"""Times that local workers are started, all of which died."""
 _LONGEST_RUN = 8
 """Epochs that a worker makes before it reports; what a killed worker costs at most."""
 _RUNS_EACH = 2
 """For each worker at least, so that the last to finish is not far behind."""
 
 
-def runs(orders: Sequence[Order], workers: int) -> list[list[Order]]:
+def runs(orders: Sequence[Order], workers: int) -> list[Run]:
     """Orders in runs of neighbours that share a stage, which a worker then sets up once; of equal lengths within a stage."""
     longest = min(max(len(orders) // (_RUNS_EACH * workers), 1), _LONGEST_RUN)
     found = []
@@ -35,67 +49,180 @@ def runs(orders: Sequence[Order], workers: int) -> list[list[Order]]:
     return found
 
 
+class _LostError(Exception):
+    """All workers, or the scheduler, are gone."""
+
+
 def fill_on_cluster(orders: list[Order], count: int, scheduler: str) -> Iterator[dict[str, Any]]:
     """What each order took, in the order in which they are done; count: local workers, or scheduler: an address.
 
     Local workers share the cores; those of a scheduler have as many threads as Dask gave them, and must see the folder under the
-    same path. Raises InputError for a scheduler that does not answer, and for an epoch whose workers die again and again.
+    same path. Raises InputError for a scheduler that does not answer; OutsideError for an epoch whose workers die again and
+    again, and where nobody is left to work.
     """
+    _require_distributed("--scheduler" if scheduler else "--workers")
+    starts = 1 if scheduler else _STARTS
+    for start in range(1, starts + 1):
+        finished: set[int] = set()
+        try:
+            for number, taken in _fill(orders, count, scheduler):
+                finished.add(number)
+                yield taken
+            return
+        except _LostError as lost:
+            if start == starts:
+                raise OutsideError(f"{lost}; what was finished is kept, the same command goes on") from None
+        orders = [order for number, order in enumerate(orders) if number not in finished]
+
+
+def _require_distributed(where: str) -> None:
     try:
-        from distributed import KilledWorker, as_completed
-    except ImportError:
-        where, remedy = "--scheduler" if scheduler else "--workers", "install it: pip install 'scarpsim[dataset]'"
-        raise InputError("needs Dask's distributed, which is not installed", where=where, remedy=remedy) from None
+        import cryptography  # noqa: F401
+        import distributed  # noqa: F401
+    except ImportError as error:
+        remedy = "install them: pip install 'scarpsim[dataset]'"
+        raise InputError(f"needs Dask's distributed and cryptography ({error})", where=where, remedy=remedy) from None
+
+
+def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The index in `orders` of each that is done, and what it took."""
     with ExitStack() as stack:
-        client = _remote(stack, scheduler) if scheduler else _local(stack, count)
+        cluster = None if scheduler else _local(stack, count)
+        client = _client(stack, cluster) if cluster else _remote(stack, scheduler)
         threads = 0 if scheduler else _threads_each(count)
+        index = {(order.source, order.index): number for number, order in enumerate(orders)}
         given = runs([replace(order, threads=threads) for order in orders], count or max(len(client.nthreads()), 1))
         keys = [f"epochs-{run[0].job}-{run[0].source}-{run[0].index:06d}" for run in given]
+        run_of = dict(zip(keys, given, strict=True))
+        for future, taken in _results(client, client.map(fill_run, given, key=keys), cluster):
+            for order, each in zip(run_of[future.key], taken, strict=True):
+                yield index[order.source, order.index], each
+
+
+def _results(
+    client: Client, futures: list[Future], cluster: LocalCluster | None
+) -> Iterator[tuple[Future, list[dict[str, Any]]]]:
+    """Each future with its result as it is done; nobody keeps it, as Dask would make the epochs of a dead worker again for it."""
+    from distributed import KilledWorker, wait
+
+    pending, at_work = set(futures), time.monotonic()
+    while pending:
         try:
-            # nobody keeps the futures: Dask would make the epochs of a dead worker again for the sake of its results
-            for future, taken in as_completed(client.map(fill_run, given, key=keys), with_results=True):
-                future.release()
-                yield from taken
+            done = wait(pending, timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
+            results = [(future, future.result(timeout=_CONNECT_S)) for future in done]
+        except TimeoutError:
+            at_work = time.monotonic() if (_has_workers(cluster) if cluster else _answers(client)) else at_work
+            if time.monotonic() - at_work > _LOST_S:
+                raise _LostError("all workers have died" if cluster else "the scheduler does not answer any more") from None
+            continue
         except KilledWorker as error:
-            raise InputError(
-                f"workers died while making {error.task}", where="dataset", remedy="see that each has 2.5 GB of memory or more"
-            ) from None
+            remedy = "see that each has 2.5 GB of memory or more, then the same command goes on"
+            raise OutsideError(f"workers died while making {error.task}; {remedy}") from None
+        except CancelledError:
+            raise _LostError("the scheduler is gone") from None
+        at_work = time.monotonic()
+        for future, taken in results:
+            pending.discard(future)
+            future.release()
+            yield future, taken
+
+
+def _answers(client: Client) -> bool:
+    """Whether the user's scheduler does; its workers may come and go."""
+    try:
+        client.sync(client.scheduler.ncores, callback_timeout=_LOOK_S)
+    except (OSError, TimeoutError):
+        return False
+    return True
+
+
+def _has_workers(cluster: LocalCluster) -> bool:
+    """Whether the scheduler runs and a worker's process lives; Dask starts killed ones again, but not one killed at its start."""
+    return cluster.scheduler.status.name == "running" and any(nanny.is_alive() for nanny in list(cluster.workers.values()))
 
 
 def _threads_each(count: int) -> int:
     return max(1, len(os.sched_getaffinity(0)) // count)
 
 
-def _local(stack: ExitStack, count: int) -> Client:
+def _local(stack: ExitStack, count: int) -> LocalCluster:
     """Workers on this machine, one thread of Dask's each. Dask's memory limit is off: it takes the ray tracer's for a leak."""
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import LocalCluster, Security
 
-    pools = dict.fromkeys(_POOLS, str(_threads_each(count)))
-    stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": pools, "distributed.worker.memory.spill": False}))
-    cluster = LocalCluster(
-        n_workers=count,
-        threads_per_worker=1,
-        memory_limit=0,
-        dashboard_address=None,
-        silence_logs=logging.CRITICAL,
+    stack.enter_context(
+        dask.config.set(
+            {
+                "distributed.nanny.pre-spawn-environ": dict.fromkeys(_POOLS, str(_threads_each(count))),
+                "distributed.worker.memory.spill": False,
+                "distributed.scheduler.http.routes": [],  # what is left of the dashboard's server tells nothing
+                "distributed.worker.http.routes": [],
+            }
+        )
     )
+    try:
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            memory_limit=0,
+            loop=stack.enter_context(_deaf_loop()),
+            security=Security.temporary(),
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            silence_logs=logging.CRITICAL,
+        )
+    except (RuntimeError, OSError, TimeoutError) as error:
+        raise _LostError(f"the workers do not start ({error})") from None
     stack.callback(_closed, cluster)
-    return stack.enter_context(Client(cluster))
+    return cluster
 
 
-def _closed(cluster: LocalCluster) -> None:
-    """Stop the workers. One that does not end in time, on a busy machine, ends with this process; its epochs are made."""
+def _client(stack: ExitStack, cluster: LocalCluster) -> Client:
+    from distributed import Client
+
+    client = Client(cluster)
+    stack.callback(_closed, client)
+    return client
+
+
+@contextmanager
+def _deaf_loop() -> Iterator[Any]:
+    """An event loop in a thread that no interrupt reaches, nor the processes that are started from it.
+
+    A Ctrl-C goes to all processes of a terminal; this one hears it and stops the workers, each of which would print a traceback.
+    """
+    from distributed.utils import LoopRunner
+
+    multiprocessing.resource_tracker.ensure_running()  # its start would let interrupts through again
+    runner = LoopRunner()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        runner.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        yield runner.loop
+    finally:
+        with suppress(TimeoutError):
+            runner.stop()
+
+
+def _closed(each: LocalCluster | Client) -> None:
+    """Stop it. A worker that does not end in time, on a busy machine, ends with this process; its epochs are made."""
     with suppress(TimeoutError):
-        cluster.close()
+        each.close(timeout=_CLOSE_S)
 
 
 def _remote(stack: ExitStack, address: str) -> Client:
+    """The user's scheduler; for tls:// Dask takes the certificates from its own configuration (docs/dataset.md)."""
     from distributed import Client
 
     try:
-        return stack.enter_context(Client(address, timeout=_CONNECT_S))
-    except (OSError, ValueError) as error:
+        client = Client(address, timeout=_CONNECT_S)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
-            f"no scheduler answers at '{address}' ({error})", where="--scheduler", remedy="give the address that it printed"
+            f"no scheduler answers at '{address}' ({error})",
+            where="--scheduler",
+            remedy="give the address that it printed, and for tls:// the certificates (docs/dataset.md)",
         ) from None
+    stack.callback(_closed, client)
+    return client

@@ -9,8 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.dataset.assemble import assemble, shards
-from pipeline.dataset.folder import Record, is_free, locked, read_dataset_file, sha256, shard_name, tile_files, write_shard
-from pipeline.dataset.run import DatasetSummary, write_dataset_file
+from pipeline.dataset.folder import tile_files
+from pipeline.dataset.records import SHARDS, Record, read_dataset_file, shard_name, write_dataset_file, write_shard
+from pipeline.dataset.run import DatasetSummary
+from pipeline.formats.checksum import sha256
+from pipeline.formats.inside import inside
+from pipeline.formats.lock import is_free, locked
 from scene.errors import InputError, nearest
 
 KEYS = ("sensor", "noise", "size", "wall", "split")
@@ -88,11 +92,13 @@ def _copy(folder: Path, out: Path, record: Record, before: str, after: str) -> N
         if "truth_file_name" in image:
             parent, _, name = image["truth_file_name"].rpartition("/")
             image["truth_file_name"] = f"{parent}/{after}{name.removeprefix(before)}"
-    for source, (target, digest) in zip(old, tile_files(record), strict=True):
-        (out / target).parent.mkdir(parents=True, exist_ok=True)
-        if not (folder / source).exists() or sha256(shutil.copyfile(folder / source, out / target)) != digest:
-            raise InputError("is missing or damaged", where=str(folder / source), remedy="verify its set")
-    write_shard(out, shard_name(record["source"], record["epoch"]["index"]), record)
+    shard = shard_name(record["source"], record["epoch"]["index"])
+    for name, (new, digest) in zip(old, tile_files(record), strict=True):
+        source, target = inside(folder, name, folder / SHARDS / shard), inside(out, new, folder / SHARDS / shard)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if not source.is_file() or sha256(shutil.copyfile(source, target)) != digest:
+            raise InputError("is missing or damaged", where=str(source), remedy="verify its set")
+    write_shard(out, shard, record)
 
 
 def _finish(out: Path, name: str, sources: dict[str, Any], epochs: dict[str, list[int]]) -> DatasetSummary:

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import Field, StringConstraints, ValidationError, field_validator, model_validator
 
-from pipeline.annotate import AnnotationConfig
-from pipeline.bundled import bundled_config
-from pipeline.config import SensorModel, SensorName, SimulationConfig, load_config
-from pipeline.overrides import apply_overrides
-from pipeline.presets import is_path, model_file
-from pipeline.tiles import TileConfig
+from pipeline.change.annotate import AnnotationConfig
+from pipeline.change.tiles import TileConfig
+from pipeline.config.bundled import bundled_config
+from pipeline.config.overrides import apply_overrides
+from pipeline.config.presets import is_path, model_file
+from pipeline.config.simulation import SensorModel, SensorName, SimulationConfig, load_config
 from scene.blocks import RockfallConfig
 from scene.config import Config, load_yaml, parse
 from scene.errors import InputError, nearest
@@ -24,11 +24,14 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9.-]*$", 
 """A word that can stand in a file name, between underscores."""
 
 
+_Factor = Annotated[float, Field(ge=0)]
+
+
 class ScaledModel(Config):
     """A sensor model, all of whose noise is multiplied by a factor. In a file `model` may be a bundled name or a file."""
 
     model: SensorModel
-    scale: float | dict[str, float] = Field(1.0, description="factor of every sigma and mean of the noise, one or by wall")
+    scale: _Factor | dict[str, _Factor] = Field(1.0, description="factor of every sigma and mean of the noise, one or by wall")
 
     def on(self, wall: str) -> StereoModel | TlsModel:
         """The model with its noise scaled for a wall."""
@@ -102,6 +105,13 @@ class DatasetConfig(Config):
     )
     truth: bool = Field(False, description="the true difference of each tile too, in a folder `truth`")
 
+    @field_validator("sensors")
+    @classmethod
+    def _each_once(cls, sensors: tuple[SensorName, ...]) -> tuple[SensorName, ...]:
+        if len(set(sensors)) < len(sensors):
+            raise ValueError("names a sensor twice")
+        return sensors
+
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:
         known: dict[str, Mapping[str, Any]] = {"walls": self.walls, "noise": self.noise, "sizes": self.sizes}
@@ -130,6 +140,17 @@ class DatasetConfig(Config):
                 missing = [wall for wall in part.walls if isinstance(model.scale, dict) and wall not in model.scale]
                 if missing:
                     raise ValueError(f"noise.{noise}.{sensor}.scale has no factor for the wall {missing[0]}")
+                _scales(model, part.walls, f"noise.{noise}.{sensor}.scale")
+
+
+def _scales(model: ScaledModel, walls: Sequence[str], key: str) -> None:
+    for wall in walls:
+        try:
+            model.on(wall)
+        except ValidationError as error:
+            wrong = error.errors()[0]
+            name = ".".join(map(str, wrong["loc"]))
+            raise ValueError(f"{key} takes {name} out of its bounds on the wall {wall}: {wrong['msg']}") from None
 
 
 def load_dataset_config(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> DatasetConfig:
@@ -155,9 +176,12 @@ def load_dataset_config(path: Path, overrides: Sequence[str] = (), seed: int | N
 
 def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
     sources = values["sources"]
-    if len(sources) != 1:
-        raise InputError(f"is of a set merged of {len(sources)}", where=str(path), remedy="make each of its sources")
-    return dict(next(iter(sources.values()))["config"])
+    configs = [each.get("config") for each in sources.values() if isinstance(each, dict)] if isinstance(sources, dict) else []
+    if len(configs) > 1:
+        raise InputError(f"is of a set merged of {len(configs)}", where=str(path), remedy="make each of its sources")
+    if not configs or not isinstance(configs[0], dict):
+        raise InputError("is damaged: it holds no config", where=str(path), remedy="take the config that the set was made with")
+    return dict(configs[0])
 
 
 def _wall(values: Any, where: str, folder: Path) -> Any:

@@ -9,23 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.annotate import block_annotations
-from pipeline.config import SimulationConfig
+from pipeline.change.annotate import block_annotations
+from pipeline.change.difference import SurfaceRaster, cast_raster, difference, surface_raster
+from pipeline.change.tiles import Tile, tiles
+from pipeline.config.simulation import SimulationConfig
 from pipeline.dataset.config import DatasetConfig
 from pipeline.dataset.plan import (
     PlannedEpoch,
     blocks_on,
+    check_filled,
     random_of_epoch,
     random_of_reference,
     random_of_wall,
     region,
     simulation_of,
 )
-from pipeline.difference import SurfaceRaster, cast_raster, difference, surface_raster
-from pipeline.epoch import Epoch, Reference, observe_epoch, observe_reference
-from pipeline.progress import Progress
-from pipeline.site import Site, prepare_site
-from pipeline.tiles import Tile, tiles
+from pipeline.report.progress import Progress
+from pipeline.run.epoch import Epoch, Reference, observe_epoch, observe_reference
+from pipeline.run.site import Site, prepare_site
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import WALL
@@ -100,18 +101,32 @@ def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progr
         stage = stages.of(epoch, progress)
         grid = stage.reference.raster.grid
         where = region(epoch.split, config.validation_region, grid, config.tiles)
+        check_filled(epoch.split, where, grid, config.tiles)
         simulation = with_count(simulation_of(config, epoch), blocks_on(config, epoch.size, grid))
         found, draw = _observed(config, simulation, epoch, stage, progress)
     except InputError as error:
         raise InputError(str(error), where=epoch.name) from None
     with progress.stage("tiles"):
         truth = None if stage.true is None else true_difference(stage.true, found)
-        cut = [tile for tile in _cut(config, found, grid, truth) if where.holds(tile.tile)]
+        cut = [tile for tile in _cut(config, found, grid, truth) if where.holds(tile.tile.column, config.tiles.size_px)]
     if not cut:
-        raise InputError(
-            "no tile has enough data", where=epoch.name, remedy="lower tiles.minimum_valid_share, or take a larger wall"
-        )
+        raise no_tile(config, epoch, found.difference, grid)
     return MadeEpoch({**_record(config, epoch, found, simulation), "draw": draw}, cut)
+
+
+def no_tile(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np.float32], grid: Grid) -> InputError:
+    """What to say where the wall fills the tiles, but the sensor does not. values: (h, w) of the difference map, m."""
+    every = config.tiles.model_copy(update={"minimum_valid_share": 0.0})
+    where = region(epoch.split, config.validation_region, grid, config.tiles)
+    blank = np.zeros(values.shape, np.int32)
+    cut = [tile for tile in tiles(values, blank, grid, every) if where.holds(tile.column, every.size_px)]
+    best, whole = max(tile.valid_share for tile in cut), np.count_nonzero(np.isfinite(values)) / values.size
+    return InputError(
+        f"no tile has enough data: the fullest of {len(cut)} has it in {best:.0%} of its pixels, the whole map in {whole:.0%}",
+        where=epoch.name,
+        allowed=f"{config.tiles.minimum_valid_share:.0%} (tiles.minimum_valid_share)",
+        remedy="let the sensor see more of the wall (place, field of view), use a coarser difference.gsd_m, or lower the share",
+    )
 
 
 def _observed(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
+from pipeline.formats.coco import read_coco
 from pipeline.formats.geotiff import read_tiff
+from pipeline.formats.inside import inside
 from scene.errors import InputError, nearest
 
 if TYPE_CHECKING:
@@ -53,13 +54,13 @@ class Tiles(Sequence[Sample]):
                 raise InputError(
                     f"unknown filter '{key}'", where="Tiles", allowed=", ".join(FILTERS), remedy=nearest(key, FILTERS)
                 )
-        content = _read(self.folder / "annotations.json")
-        self.records = [image for image in content["images"] if all(image[key] == value for key, value in filters.items())]
+        content = read_coco(self.folder / "annotations.json")
+        self.records = [image for image in content.images if all(image.get(key) == value for key, value in filters.items())]
         if not self.records:
-            present = {key: sorted({image[key] for image in content["images"]}) for key in filters}
+            present = {key: sorted({str(image[key]) for image in content.images if key in image}) for key in filters}
             raise InputError(f"no tile has {filters}", where=str(self.folder), allowed=str(present))
         self._annotations: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in self.records}
-        for annotation in content["annotations"]:
+        for annotation in content.annotations:
             if annotation["image_id"] in self._annotations:
                 self._annotations[annotation["image_id"]].append(annotation)
 
@@ -71,10 +72,10 @@ class Tiles(Sequence[Sample]):
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
         record = self.records[index]
-        values = read_tiff(self.folder / record["file_name"])
+        values = read_tiff(self._path(record["file_name"]))
         valid = ~np.isnan(values)
         annotations = self._annotations[record["id"]]
-        truth = read_tiff(self.folder / record["truth_file_name"]) if "truth_file_name" in record else None
+        truth = read_tiff(self._path(record["truth_file_name"])) if "truth_file_name" in record else None
         return Sample(
             image=np.where(valid, values, np.float32(0)),
             valid=valid,
@@ -84,6 +85,9 @@ class Tiles(Sequence[Sample]):
             record=record,
             annotations=annotations,
         )
+
+    def _path(self, name: Any) -> Path:
+        return inside(self.folder, name, self.folder / "annotations.json")
 
     def __iter__(self) -> Iterator[Sample]:
         return (self[index] for index in range(len(self)))
@@ -125,13 +129,3 @@ def _for_tensorflow(sample: Sample) -> dict[str, Any]:
         "masks": sample.masks,
         "image_id": np.int64(sample.record["id"]),
     }
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        where, remedy = str(path), "give the folder of a split, such as my_set/train"
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy=remedy) from None
-    except ValueError:
-        raise InputError("is damaged", where=str(path), remedy="run `scarpsim dataset verify` on the set") from None

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from pipeline.config import SensorName, SimulationConfig
+from pipeline.change.tiles import TileConfig, starts_of_tiles
+from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
-from pipeline.tiles import Tile, TileConfig
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
@@ -98,8 +98,9 @@ class Region:
     first: int
     end: float
 
-    def holds(self, tile: Tile) -> bool:
-        return self.first <= tile.column and tile.column + tile.grid.width <= self.end
+    def holds(self, column: int, size: int) -> bool:
+        """Whether a tile of `size` px from `column` on lies in it."""
+        return self.first <= column and column + size <= self.end
 
 
 def region(split: Split, share: float, grid: Grid, config: TileConfig) -> Region:
@@ -109,16 +110,50 @@ def region(split: Split, share: float, grid: Grid, config: TileConfig) -> Region
     along the wall, so both see all of them. Tests use the whole wall. Raises InputError where a wall has too few columns.
     """
     step = config.size_px - config.overlap_px
-    columns = len(range(0, max(grid.width - config.overlap_px, 1), step))
+    columns = len(starts_of_tiles(grid.width, config))
     if split == "test" or share == 0:
         return Region(0, float("inf"))
     kept = round(share * columns)
     if not 0 < kept < columns:
         raise InputError(
-            f"{share:g} of {columns} columns of tiles is {'none' if kept == 0 else 'all'} of them",
+            f"{share:g} of {columns} columns of tiles is {'none' if kept == 0 else 'all'} of them, as the difference maps are "
+            f"{grid.width} px wide (gsd {grid.gsd:.3g} m) and a tile {config.size_px} px",
             where="validation_region",
             allowed="0, or a share that leaves both training and validation a column",
             remedy="use smaller tiles, a finer gsd or a longer wall",
         )
     boundary = (columns - kept) * step
     return Region(0, boundary) if split == "train" else Region(boundary, float("inf"))
+
+
+def check_filled(split: Split, where: Region, grid: Grid, config: TileConfig) -> None:
+    """Raise InputError where no tile of a split can have enough pixels with data, as the wall or its part is too small for one.
+
+    where: the split's columns on a wall with the difference maps `grid`.
+    """
+    filled, whole = (_most_filled(part, grid, config) for part in (where, Region(0, float("inf"))))
+    if filled >= config.minimum_valid_share and filled > 0:
+        return
+    wall = f"the difference maps are {grid.width} x {grid.height} px (gsd {grid.gsd:.3g} m)"
+    tile = f"a tile of {config.size_px} px {{}}, and tiles.minimum_valid_share is {config.minimum_valid_share:g}"
+    if whole < config.minimum_valid_share:
+        raise InputError(
+            f"{wall}, which fill {tile.format(f'to {whole:.0%} at most')}",
+            where="tiles",
+            remedy="use smaller tiles (tiles.size_px), a finer difference.gsd_m or a larger wall",
+        )
+    columns = f"{max(min(where.end, grid.width) - where.first, 0):.0f} px"
+    part = "the validation region" if split == "val" else f"what the validation region leaves to {split}"
+    raise InputError(
+        f"{wall}, and {part} is {columns} wide: it fills {tile.format(f'to {filled:.0%} at most')}",
+        where="validation_region",
+        remedy="change the share, or use smaller tiles (tiles.size_px), a finer difference.gsd_m or a longer wall",
+    )
+
+
+def _most_filled(where: Region, grid: Grid, config: TileConfig) -> float:
+    """The largest share of a tile within a region that lies on the wall, 0 where no tile lies in the region."""
+    size = config.size_px
+    starts = (column for column in starts_of_tiles(grid.width, config) if where.holds(column, size))
+    width = max((min(size, grid.width - column) for column in starts), default=0)
+    return width * min(size, grid.height) / size**2

@@ -6,6 +6,7 @@ workers and retries are Dask's business: an epoch that a dead worker left is mad
 
 from __future__ import annotations
 
+import os
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,23 +15,17 @@ from typing import Any
 
 from pipeline.dataset.assemble import assemble, assembled_damages
 from pipeline.dataset.config import DATASET_FILE, DatasetConfig
-from pipeline.dataset.folder import (
-    SCHEMA,
-    Damage,
-    damages,
-    fingerprint,
-    is_free,
-    locked,
-    read_dataset_file,
-    remove_leftovers,
-    shard_name,
-)
+from pipeline.dataset.folder import Damage, damages, discard_unbegun, fingerprint, remove_leftovers, require_no_folders
 from pipeline.dataset.plan import planned_epochs
+from pipeline.dataset.records import read_dataset_file, shard_name, write_dataset_file
 from pipeline.dataset.worker import Order, fill, makers, require_same_makers
-from pipeline.formats.atomic import write_json
-from pipeline.progress import Progress
+from pipeline.formats.lock import is_free, locked
+from pipeline.report.progress import Progress
 from scene.config import parse
-from scene.errors import InputError
+from scene.errors import InputError, OutsideError
+
+_MOST_WORKERS = 16
+"""Local processes for each core."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +34,13 @@ class Workers:
 
     count: int = 0
     scheduler: str = ""
+
+    def check(self) -> None:
+        """Raise InputError for more local processes than the machine can start."""
+        cores = len(os.sched_getaffinity(0))
+        if self.count > _MOST_WORKERS * cores:
+            allowed = f"1 to {_MOST_WORKERS * cores} here, {_MOST_WORKERS} for each of {cores} cores"
+            raise InputError(f"got {self.count:,}", where="--workers", allowed=allowed)
 
 
 @dataclass
@@ -66,9 +68,14 @@ def make_dataset(
     folder in use or of another set. On an interrupt what is finished is put together before KeyboardInterrupt goes on.
     """
     progress = progress or Progress()
+    workers.check()
     with locked(out):
         _claim(out, config, command)
-        return _complete(out, workers, progress)
+        try:
+            return _complete(out, workers, progress)
+        except (InputError, OutsideError):
+            discard_unbegun(out)
+            raise
 
 
 def verify_dataset(
@@ -76,6 +83,7 @@ def verify_dataset(
 ) -> DatasetSummary:
     """Read every byte of a set, and make again what is missing or damaged; with repair=False only report it."""
     progress = progress or Progress()
+    workers.check()
     read_dataset_file(folder)
     with locked(folder):
         if repair:
@@ -104,14 +112,6 @@ def _claim(out: Path, config: DatasetConfig, command: str) -> None:
     write_dataset_file(out, config.name, {source: entry}, {source: [epoch.index for epoch in planned_epochs(config)]})
 
 
-def write_dataset_file(
-    folder: Path, name: str, sources: dict[str, Any], epochs: dict[str, list[int]], *, complete: bool = False
-) -> None:
-    """Write dataset.json. sources: config, versions, command, prefix of file names, by fingerprint; epochs: the set's."""
-    head = {"schema": SCHEMA, "name": name, "fingerprint": "-".join(sources), "complete": complete}
-    write_json(folder / DATASET_FILE, {**head, "sources": sources, "epochs": epochs})
-
-
 def _find_damage(folder: Path, progress: Progress) -> dict[tuple[str, int], list[Damage]]:
     """What is wrong with each epoch of the set that is not whole."""
     epochs = [(source, index) for source, indices in read_dataset_file(folder)["epochs"].items() for index in indices]
@@ -133,9 +133,13 @@ def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSumm
     found = _find_damage(folder, progress)
     damage = [each for problems in found.values() for each in problems if known["complete"] or not each.is_missing_shard]
     summary = DatasetSummary(folder, damage=damage + (assembled_damages(folder) if known["complete"] else []))
+    require_no_folders(folder, [*summary.damage, *(each for problems in found.values() for each in problems)])
+    stages = {source: _stages(known, source, folder) for source in {source for source, _ in found}}
+    unplanned = [index for source, index in found if index >= len(stages[source])]
+    if unplanned:
+        raise InputError(f"holds epoch {unplanned[0]}, which its config does not plan", where=str(folder / DATASET_FILE))
     write_dataset_file(folder, known["name"], known["sources"], known["epochs"])
     job = uuid.uuid4().hex
-    stages = {source: _stages(known, source, folder) for source in {source for source, _ in found}}
     orders = [Order(str(folder.absolute()), job, source, index, stages[source][index]) for source, index in found]
     try:
         with progress.stage("epochs") as stage:
@@ -154,8 +158,13 @@ def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSumm
 
 
 def _stages(known: dict[str, Any], source: str, folder: Path) -> list[tuple[str, str, str, int]]:
-    """The stage of every epoch of a source."""
-    config = parse(DatasetConfig, known["sources"][source]["config"], str(folder / DATASET_FILE))
+    """The stage of every epoch of a source; raises InputError where it cannot be made here as it was."""
+    entry, where = known["sources"][source], str(folder / DATASET_FILE)
+    require_same_makers(entry, where)
+    config = parse(DatasetConfig, entry["config"], where)
+    if fingerprint(config) != source:
+        remedy = "put dataset.json, and the files that it names, back as they were"
+        raise InputError(f"the config of {source} is not the one that its epochs were made with", where=where, remedy=remedy)
     return [epoch.stage for epoch in planned_epochs(config)]
 
 

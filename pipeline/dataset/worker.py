@@ -14,11 +14,15 @@ from typing import Any
 
 from pipeline.dataset.config import DatasetConfig
 from pipeline.dataset.epoch import EpochTile, MadeEpoch, Stages, make_epoch
-from pipeline.dataset.folder import SCHEMA, STAGING, TRUTH, read_dataset_file, sha256, shard_name, write_shard
+from pipeline.dataset.folder import STAGING, TRUTH
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs
+from pipeline.dataset.records import SCHEMA, SHARDS, read_dataset_file, shard_name, write_shard
+from pipeline.formats.atomic import explained, give_name, to_disk
+from pipeline.formats.checksum import sha256
 from pipeline.formats.geotiff import write_geotiff
-from pipeline.progress import Progress
-from pipeline.provenance import versions
+from pipeline.formats.inside import inside
+from pipeline.report.progress import Progress
+from pipeline.report.provenance import versions
 from scene.backend import VARIANT, dr
 from scene.config import parse
 from scene.errors import InputError
@@ -125,15 +129,20 @@ def _stage_name(name: str) -> str:
 def _store(folder: Path, order: Order, prefix: str, epoch: PlannedEpoch, made: MadeEpoch) -> None:
     staging = folder / STAGING / order.job / f"{order.source}_{order.index:06d}"
     entries = [_write_tile(staging, prefix, epoch, tile) for tile in made.tiles]
-    for entry in entries:
-        for name in _names(entry):
-            (folder / epoch.split / name).parent.mkdir(parents=True, exist_ok=True)
-            (staging / name).replace(folder / epoch.split / name)
+    for name in (name for entry in entries for name in _names(entry)):
+        final = inside(folder, f"{epoch.split}/{name}", folder)
+        with explained(final):
+            final.parent.mkdir(parents=True, exist_ok=True)
+            (staging / name).replace(final)
+    for each in {(folder / epoch.split / name).parent for entry in entries for name in _names(entry)}:
+        to_disk(each)
     record = {"schema": SCHEMA, "source": order.source, **made.record, "tiles": entries}
-    write_shard(staging, shard_name(order.source, order.index), record)
-    final = folder / "shards" / shard_name(order.source, order.index)
-    final.parent.mkdir(exist_ok=True)
-    (staging / "shards" / final.name).replace(final)
+    name = shard_name(order.source, order.index)
+    write_shard(staging, name, record)
+    final = inside(folder, f"{SHARDS}/{name}", folder)
+    with explained(final):
+        final.parent.mkdir(exist_ok=True)
+        give_name(staging / SHARDS / name, final)
 
 
 def _names(entry: dict[str, Any]) -> Iterator[str]:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from pipeline.overrides import apply_overrides
+from pipeline.config.overrides import apply_overrides
 from scene.config import Config, load_yaml, parse
 
 Loss = Literal["proposal_class", "proposal_box", "class", "box", "mask"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,7 +14,9 @@ from pycocotools import mask as coco_mask
 
 from pipeline.detect.config import DetectorConfig, TrainingConfig
 from pipeline.detect.normalisation import normalised
+from pipeline.formats.coco import read_coco
 from pipeline.formats.geotiff import read_tiff
+from pipeline.formats.inside import inside
 from scene.errors import InputError
 
 Batch = dict[str, NDArray[Any]]
@@ -37,48 +38,53 @@ class Labelled:
 class CocoFolder:
     """A folder with `annotations.json` and the TIFF images that it names."""
 
-    def __init__(self, folder: Path) -> None:
-        """Raises InputError where annotations.json is absent, is not COCO, or names no image."""
+    def __init__(self, folder: Path, *, masks: bool = True) -> None:
+        """masks: each annotation needs one. Raises InputError for all that `read_coco` does."""
+        content = read_coco(folder / "annotations.json", masks=masks)
         self.folder = folder
-        path = folder / "annotations.json"
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            self.images: list[dict[str, Any]] = sorted(content["images"], key=lambda image: image["id"])
-            self.annotations: list[dict[str, Any]] = content["annotations"]
-        except OSError as error:
-            raise InputError(
-                f"cannot be read ({error.strerror})",
-                where=str(path),
-                remedy="give a folder that `scarpsim dataset` or `simulate` made",
-            ) from None
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"is no COCO annotation file ({error!r})", where=str(path), remedy="make it again") from None
-        if not self.images:
-            raise InputError("names no image", where=str(path), remedy="make the data set again")
+        self.images = sorted(content.images, key=lambda image: image["id"])
+        self.annotations = content.annotations
         self._of: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in self.images}
         for annotation in self.annotations:
-            if annotation["image_id"] not in self._of:
-                raise InputError(f"annotation {annotation.get('id')} is of an image that is not there", where=str(path))
             self._of[annotation["image_id"]].append(annotation)
+
+    def check_images(self) -> None:
+        """Read every image once; raises InputError for the first that is damaged or of another size than annotated."""
+        for index in range(len(self)):
+            self._difference(index)
 
     def __len__(self) -> int:
         return len(self.images)
 
+    def path(self, image: dict[str, Any]) -> Path:
+        """The file of an entry of `images`; raises InputError for one outside of the folder."""
+        return inside(self.folder, image.get("file_name"), self.folder / "annotations.json")
+
     def labelled(self, index: int) -> Labelled:
-        """The image at `index` with its blocks; raises InputError for a damaged file and a size other than annotated."""
+        """The image at `index` with its blocks, those of which it shows a pixel.
+
+        Raises InputError for a damaged file and a size other than annotated.
+        """
+        difference = self._difference(index)
+        labels = np.zeros(difference.shape, np.int32)
+        boxes: list[tuple[float, float, float, float]] = []
+        for annotation in self._of[self.images[index]["id"]]:
+            if annotation["area"] == 0:
+                continue
+            x, y, width, height = annotation["bbox"]
+            boxes.append((y, x, y + height, x + width))
+            labels[coco_mask.decode(annotation["segmentation"]) > 0] = len(boxes)
+        return Labelled(difference, labels, np.array(boxes, np.float32).reshape(-1, 4))
+
+    def _difference(self, index: int) -> NDArray[np.float32]:
         image = self.images[index]
-        path = self.folder / image["file_name"]
+        path = self.path(image)
         difference = read_tiff(path)
         if difference.shape != (image["height"], image["width"]):
             allowed = f"{image['height']} x {image['width']} px as annotated"
-            raise InputError(f"has {difference.shape[0]} x {difference.shape[1]} px", where=str(path), allowed=allowed)
-        labels = np.zeros(difference.shape, np.int32)
-        boxes = []
-        for number, annotation in enumerate(self._of[image["id"]], start=1):
-            labels[coco_mask.decode(_compressed(annotation["segmentation"])) > 0] = number
-            x, y, width, height = annotation["bbox"]
-            boxes.append((y, x, y + height, x + width))
-        return Labelled(difference, labels, np.array(boxes, np.float32).reshape(-1, 4))
+            problem = f"has {difference.shape[0]} x {difference.shape[1]} px"
+            raise InputError(problem, where=str(path), allowed=allowed, remedy="give the image that was annotated")
+        return difference
 
 
 def batches(
@@ -156,10 +162,3 @@ def window(labelled: Labelled, size: int, random: np.random.Generator | None) ->
         numbers[labels],
         np.clip(shifted, 0, size, dtype=np.float32),
     )
-
-
-def _compressed(segmentation: dict[str, Any]) -> dict[str, Any]:
-    """Run lengths as pycocotools decodes them, from its own or the plain form."""
-    if isinstance(segmentation["counts"], list):
-        return dict(coco_mask.frPyObjects(segmentation, *segmentation["size"]))
-    return segmentation

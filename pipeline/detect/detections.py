@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.annotate import BLOCK_CATEGORY, run_length_encoding
+from pipeline.change.annotate import BLOCK_CATEGORY, run_length_encoding
 
 _COVERED = 0.6
-"""Of two detections that share more than this part of the smaller one, the better stays."""
+"""Most of a detection's pixels: of two that share more than this part of the smaller one, the better stays."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,17 @@ class Detection:
     def area_px(self) -> int:
         """Pixels of the mask."""
         return int(np.count_nonzero(self.mask))
+
+    @property
+    def bounds(self) -> tuple[int, int, int, int]:
+        """First and last row and column of the mask in the map, the last not in it, px."""
+        height, width = self.mask.shape
+        return self.row, self.row + height, self.column, self.column + width
+
+    def pixels_within(self, bounds: tuple[int, int, int, int]) -> int:
+        """Pixels of the mask inside `bounds`, given as the own ones are."""
+        top, bottom, left, right = (max(edge, 0) for edge in np.subtract(bounds, np.repeat((self.row, self.column), 2)))
+        return int(np.count_nonzero(self.mask[top:bottom, left:right]))
 
     def moved(self, row: int, column: int) -> Detection:
         """The same in a larger frame, in which this one's pixel (0, 0) is (row, column)."""
@@ -57,21 +68,51 @@ def cropped(mask: NDArray[np.bool_], row: int, column: int, score: float) -> Det
     return Detection(row + int(rows[0]), column + int(columns[0]), inner, score)
 
 
+def united(items: Sequence[Detection]) -> Detection:
+    """All their pixels as one detection, with the best of their scores."""
+    bounds = np.array([item.bounds for item in items])
+    (top, left), (bottom, right) = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
+    mask = np.zeros((bottom - top, right - left), bool)
+    for item, (first, last, begin, end) in zip(items, bounds - np.repeat((top, left), 2), strict=True):
+        mask[first:last, begin:end] |= item.mask
+    return Detection(int(top), int(left), mask, max(item.score for item in items))
+
+
 def without_doubles(found: Iterable[Detection]) -> list[Detection]:
     """Best first; a detection that shares most of its pixels, or of the other's, with a better one is left out."""
+    ranked = sorted(found, key=lambda item: (-item.score, item.row, item.column))
     kept: list[Detection] = []
-    for candidate in sorted(found, key=lambda item: (-item.score, item.row, item.column)):
-        if all(_shared(candidate, better) <= _COVERED * min(candidate.area_px, better.area_px) for better in kept):
+    bounds = np.empty((len(ranked), 4), np.int64)
+    for candidate in ranked:
+        near = [kept[index] for index in np.flatnonzero(bounds_overlap(bounds[: len(kept)], candidate.bounds)).tolist()]
+        if all(shared_pixels(candidate, better) <= _COVERED * min(candidate.area_px, better.area_px) for better in near):
+            bounds[len(kept)] = candidate.bounds
             kept.append(candidate)
     return kept
 
 
-def _shared(left: Detection, right: Detection) -> int:
+def not_mostly_in(found: Iterable[Detection], others: Sequence[Detection]) -> list[Detection]:
+    """Those of `found` that share most of their pixels with none of the others."""
+    bounds = np.array([item.bounds for item in others]).reshape(-1, 4)
+
+    def covered(item: Detection) -> bool:
+        near = [others[index] for index in np.flatnonzero(bounds_overlap(bounds, item.bounds)).tolist()]
+        return any(shared_pixels(item, other) > _COVERED * item.area_px for other in near)
+
+    return [item for item in found if not covered(item)]
+
+
+def bounds_overlap(bounds: NDArray[np.int64], other: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+    """(n,) which of the bounds (n, 4), as `Detection.bounds`, share pixels with another's."""
+    top, bottom, left, right = bounds.T
+    return np.asarray((top < other[1]) & (other[0] < bottom) & (left < other[3]) & (other[2] < right))
+
+
+def shared_pixels(one: Detection, other: Detection) -> int:
     """Pixels of both masks."""
-    top, bottom = max(left.row, right.row), min(left.row + left.mask.shape[0], right.row + right.mask.shape[0])
-    first, last = max(left.column, right.column), min(left.column + left.mask.shape[1], right.column + right.mask.shape[1])
+    top, bottom = max(one.row, other.row), min(one.bounds[1], other.bounds[1])
+    first, last = max(one.column, other.column), min(one.bounds[3], other.bounds[3])
     if top >= bottom or first >= last:
         return 0
-    parts = (item.mask[top - item.row : bottom - item.row, first - item.column : last - item.column] for item in (left, right))
-    one, other = parts
-    return int(np.count_nonzero(one & other))
+    masks = [item.mask[top - item.row : bottom - item.row, first - item.column : last - item.column] for item in (one, other)]
+    return int(np.count_nonzero(masks[0] & masks[1]))

@@ -19,6 +19,7 @@ from pycocotools.cocoeval import COCOeval
 
 CONFIDENCES, THRESHOLDS = (0.9, 0.95, 0.99), (0.25, 0.75)
 Overlap = Literal["segm", "bbox"]
+_KEYS = ("image_id", "category_id", "segmentation", "bbox", "area", "iscrowd", "score")
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def evaluate(
     thresholds: Sequence[float] = THRESHOLDS,
     kind: Overlap = "segm",
 ) -> list[Score]:
-    """Scores of COCO predictions against COCO annotations, for every group, confidence and overlap.
+    """Scores of COCO predictions against COCO annotations, as `read_coco` gives them, for every group, confidence and overlap.
 
     groups: image ids by name; all images as one group by default. kind: overlap of masks or of boxes.
     """
@@ -118,13 +119,18 @@ def coco_metrics(truth: Mapping[str, Any], predictions: Sequence[Mapping[str, An
         return dict.fromkeys(names, 0.0)
     with contextlib.redirect_stdout(io.StringIO()):
         reference = COCO()
-        reference.dataset = dict(truth)
+        reference.dataset = {**truth, "annotations": _numbered(truth["annotations"])}
         reference.createIndex()
-        assessment = COCOeval(reference, reference.loadRes([dict(item) for item in predictions]), kind)
+        assessment = COCOeval(reference, reference.loadRes(_numbered(predictions)), kind)
         assessment.evaluate()
         assessment.accumulate()
         assessment.summarize()
     return {name: float(value) for name, value in zip(names, assessment.stats, strict=True)}
+
+
+def _numbered(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The entries with ids from 1, as COCOeval takes an id of 0 for no match, and without keys of others', such as captions."""
+    return [{"id": number, **{key: entry[key] for key in _KEYS if key in entry}} for number, entry in enumerate(entries, start=1)]
 
 
 @dataclass(frozen=True)
@@ -153,12 +159,7 @@ def _image_pairs(blocks: list[Mapping[str, Any]], found: list[Mapping[str, Any]]
 
 
 def _shape(item: Mapping[str, Any], kind: Overlap) -> Any:
-    if kind == "bbox":
-        return [float(value) for value in item["bbox"]]
-    segmentation = item["segmentation"]
-    if isinstance(segmentation["counts"], list):
-        return coco_mask.frPyObjects(segmentation, *segmentation["size"])
-    return segmentation
+    return [float(value) for value in item["bbox"]] if kind == "bbox" else item["segmentation"]
 
 
 def _score(group: str, confidence: float, threshold: float, images: Iterable[_Pairs]) -> Score:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.annotate import BLOCK_CATEGORY
+from pipeline.change.annotate import BLOCK_CATEGORY
 from pipeline.detect.detections import Detection
 from pipeline.formats.atomic import write_json, write_text
 from scene.grid import Grid

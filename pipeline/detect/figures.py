@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,12 +19,15 @@ from numpy.typing import NDArray
 from pipeline.detect.detections import Detection
 from pipeline.detect.normalisation import nmad
 from pipeline.formats.atomic import writing
+from pipeline.report.plain_text import plain_text
 from scene.grid import Grid
 
 _PANELS = {"Total": ("loss",), "Class": ("class", "proposal_class"), "Box": ("box", "proposal_box"), "Mask": ("mask",)}
 _TRAINING, _VALIDATION = "#0072B2", "#D55E00"
 _SCALE_SIGMAS = 6.0
 _WIDEST_PX = 2400
+_LOW_IN = 4.5
+"""Below this height of the figure the label of a colour bar has no room beside the map."""
 _MOST_NUMBERED = 200
 _MOST_MARKED = 30
 """Up to this many epochs each has a marker, as one alone makes no line."""
@@ -54,7 +58,9 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
     limit = 1e3 * max(_SCALE_SIGMAS * nmad(difference), 1e-4)
     extent = (grid.x_min, grid.x_min + grid.width * grid.gsd, grid.y_max - grid.height * grid.gsd, grid.y_max)
     width = 10.0
-    figure = Figure(figsize=(width, 0.9 + width * grid.height / grid.width * 0.85), dpi=140, layout="constrained")
+    height = 0.9 + width * grid.height / grid.width * 0.85
+    low = height < _LOW_IN
+    figure = Figure(figsize=(width, height + 0.6 * low), dpi=140, layout="constrained")
     axes = figure.subplots()
     axes.set_facecolor("#b5b5b5")
     image = axes.imshow(shown, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
@@ -66,7 +72,9 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
             axes.plot(np.append(x, x[0]), np.append(y, y[0]), color="black", linewidth=0.9)
         if number <= _MOST_NUMBERED:
             axes.annotate(f"{number}", (float(x.max()), float(y.max())), fontsize=6)
-    bar = figure.colorbar(image, ax=axes, label="reference minus epoch, mm", shrink=0.8, extend=_cut_off(shown, limit))
+    place: dict[str, Any] = {"location": "bottom", "aspect": 45} if low else {"location": "right"}
+    label = "reference minus epoch, mm; missing rock positive"
+    bar = figure.colorbar(image, ax=axes, label=label, shrink=0.8, extend=_cut_off(shown, limit), **place)
     bar.ax.tick_params(labelsize=8)
     axes.set(
         xlabel="x along the wall, m",
@@ -83,5 +91,5 @@ def _cut_off(values: NDArray[np.floating], limit: float) -> str:
 
 
 def _write(figure: Figure, path: Path) -> None:
-    with writing(path) as temporary:
+    with writing(path) as temporary, plain_text(figure):
         FigureCanvasAgg(figure).print_figure(temporary, metadata={"Software": None})

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.detect.detections import Detection, cropped, without_doubles
+from pipeline.detect.detections import Detection, cropped
 from pipeline.detect.normalisation import nmad, normalised
+from pipeline.detect.seams import Part, Tile, part, without_seams
 
 _BATCH = 4
 
@@ -19,25 +20,21 @@ def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0
     """The blocks in a difference map (h, w), m, NaN where there are no data, best first.
 
     model: a MaskRCNN. Tiles overlap by a half of their side, so that every block of up to that size lies whole in one of them;
-    a block that a tile's inner border cuts is left to the tile that sees it whole, unless it is larger than the overlap.
+    `seams` says what becomes of the blocks that a tile's inner border cuts.
     """
     size = model.size
     noise = nmad(difference)
-    found: list[Detection] = []
-    places = list(tile_places(difference.shape, size))
-    for first in range(0, len(places), _BATCH):
-        group = places[first : first + _BATCH]
-        images = [normalised(_tile(difference, place, size), model.config.normalisation, noise) for place in group]
+    parts: list[Part] = []
+    tiles = [Tile(row, column, size, difference.shape) for row, column in tile_places(difference.shape, size)]
+    for first in range(0, len(tiles), _BATCH):
+        group = tiles[first : first + _BATCH]
+        images = [normalised(_pixels(difference, tile), model.config.normalisation, noise) for tile in group]
         images += [images[0]] * (_BATCH - len(images))  # one shape, one compiled function
         answers = model.predict_on_batch({"image": np.stack(images)})
-        for number, (row, column) in enumerate(group):
+        for number, tile in enumerate(group):
             answer = {name: values[number] for name, values in answers.items()}
-            found += [
-                item.moved(row, column)
-                for item in _in_tile(answer, minimum_score, size, (difference.shape[0] - row, difference.shape[1] - column))
-                if not _cut(item, row, column, size, difference.shape)
-            ]
-    return without_doubles(found)
+            parts += [part(item, tile) for item in _in_tile(answer, minimum_score, tile)]
+    return without_seams(parts)
 
 
 def tile_places(shape: tuple[int, ...], size: int) -> Iterator[tuple[int, int]]:
@@ -71,28 +68,20 @@ def _starts(length: int, size: int) -> list[int]:
     return [round(number * (length - size) / (count - 1)) for number in range(count)]
 
 
-def _tile(difference: NDArray[np.float32], place: tuple[int, int], size: int) -> NDArray[np.float32]:
-    row, column = place
-    cut = difference[row : row + size, column : column + size]
-    missing = [(0, size - length) for length in cut.shape]
+def _pixels(difference: NDArray[np.float32], tile: Tile) -> NDArray[np.float32]:
+    """(size, size) what the tile shows, NaN beyond the map."""
+    cut = difference[tile.row : tile.row + tile.size, tile.column : tile.column + tile.size]
+    missing = [(0, tile.size - length) for length in cut.shape]
     return np.pad(cut, missing, constant_values=np.nan)
 
 
-def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, size: int, held: tuple[int, int]) -> Iterator[Detection]:
+def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, tile: Tile) -> Iterator[Detection]:
+    """What the network found in the tile, in the map's frame."""
+    top, bottom, left, right = tile.bounds
     for box, score, mask in zip(answer["boxes"], answer["scores"], answer["masks"], strict=True):
         if score < minimum_score:
             return
-        row, column, pixels = paste(mask, box, size)
-        item = cropped(pixels[: max(held[0] - row, 0), : max(held[1] - column, 0)], row, column, float(score))
+        row, column, pixels = paste(mask, box, tile.size)
+        item = cropped(pixels[: max(bottom - top - row, 0), : max(right - left - column, 0)], row, column, float(score))
         if item is not None:
-            yield item
-
-
-def _cut(item: Detection, row: int, column: int, size: int, shape: tuple[int, ...]) -> bool:
-    """Whether a border of the tile at (row, column) that is not the map's own cuts a block that a neighbour sees whole."""
-    for start, length, begin, whole in zip((item.row, item.column), item.mask.shape, (row, column), shape, strict=True):
-        low, high = start, start + length
-        touches = (low <= begin and begin > 0) or (high >= begin + size and begin + size < whole)
-        if touches and length < size // 2:
-            return True
-    return False
+            yield item.moved(top, left)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import robust
+from pipeline.change import robust
 from pipeline.detect.config import NormalisationConfig
 
 Image = NDArray[np.float32]

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.bundled import configs_folder
+from pipeline.config.bundled import configs_folder
 from pipeline.detect import baseline, events
 from pipeline.detect.data import CocoFolder
 from pipeline.detect.detections import Detection
 from pipeline.detect.figures import write_overlay
 from pipeline.formats.geotiff import read_geotiff, write_geotiff
-from pipeline.progress import Progress
+from pipeline.report.progress import Progress
 from scene.errors import InputError
 
 BASELINE, DEFAULT = "baseline", "default"
@@ -61,7 +61,8 @@ def find_inputs(places: Sequence[Path]) -> list[Input]:
     result: list[Input] = []
     for place in places:
         if (place / "annotations.json").is_file():
-            result += [Input(place / image["file_name"], image["file_name"], image) for image in CocoFolder(place).images]
+            folder = CocoFolder(place, masks=False)
+            result += [Input(folder.path(image), image["file_name"], image) for image in folder.images]
             continue
         files = sorted(place.glob("difference_*.tif")) if place.is_dir() else [place]
         if not files:
@@ -85,34 +86,61 @@ def detect(
     """Find the blocks in difference maps (GeoTIFF, m); returns the events at the lowest of the confidences.
 
     Writes to `out`: detections.json, everything above a score of 0.05, for `scarpsim evaluate`; for each confidence c
-    detections_c.json and events_c.csv; for the lowest also a raster of masks and an overlay picture per map.
+    detections_c.json and events_c.csv; for the lowest also a raster of masks and an overlay picture per map. Nothing is written
+    before every map is searched.
     """
     inputs, progress = find_inputs(places), progress or Progress()
     with progress.stage("network"):
         find = detector(model)
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    found_events: list[events.Event] = []
-    progress.plan({"detection": 1.0})
+    results: list[_Result] = []
+    progress.plan({"detection": 1.0, "results": 0.2 if pictures else 0.01})
     with progress.stage("detection"):
-        for number, item in enumerate(inputs):
-            difference, grid = read_geotiff(item.path)
-            found = find(difference)
-            images.append({**item.image, "height": difference.shape[0], "width": difference.shape[1]})
-            annotations += [
-                each.annotation(len(annotations) + count, images[-1]["id"], difference.shape)
-                for count, each in enumerate(found, start=1)
-            ]
-            sure = [each for each in found if each.score >= min(confidences)]
-            found_events += [events.event(each, count, item.name, difference, grid) for count, each in enumerate(sure, start=1)]
-            if pictures:
-                stem = re.sub(r"[^\w.-]+", "_", item.name.rsplit(".", 1)[0])
-                write_geotiff(out / f"{stem}_masks.tif", events.label_raster(sure, difference.shape), grid)
-                write_overlay(difference, grid, sure, out / f"{stem}_detections.png")
-            progress.advance((number + 1) / len(inputs))
-        events.write_coco(images, annotations, out / "detections.json")
-        for confidence in confidences:
-            chosen = [each for each in annotations if each["score"] >= confidence]
-            events.write_coco(images, chosen, out / f"detections_{confidence:g}.json")
-            events.write_events([each for each in found_events if each.score >= confidence], out / f"events_{confidence:g}.csv")
-    return found_events
+        for number, item in enumerate(inputs, start=1):
+            results.append(_searched(item, find, min(confidences)))
+            progress.advance(number / len(inputs))
+    with progress.stage("results"):
+        _write(results, confidences, out)
+        for number, result in enumerate(results if pictures else [], start=1):
+            _write_pictures(result, min(confidences), out)
+            progress.advance(number / len(results))
+    return [event for result in results for event in result.events]
+
+
+@dataclass(frozen=True)
+class _Result:
+    """What was found in a map of `shape`, px, best first; events: of those from the lowest confidence on."""
+
+    item: Input
+    shape: tuple[int, ...]
+    found: list[Detection]
+    events: list[events.Event]
+
+
+def _searched(item: Input, find: Detector, lowest: float) -> _Result:
+    difference, grid = read_geotiff(item.path)
+    found = find(difference)
+    sure = [each for each in found if each.score >= lowest]
+    told = [events.event(each, count, item.name, difference, grid) for count, each in enumerate(sure, start=1)]
+    return _Result(item, difference.shape, found, told)
+
+
+def _write(results: Sequence[_Result], confidences: Sequence[float], out: Path) -> None:
+    """The detections as COCO, all and from each confidence on, and the tables of events."""
+    images = [{**each.item.image, "height": each.shape[0], "width": each.shape[1]} for each in results]
+    pairs = [(image["id"], result.shape, each) for image, result in zip(images, results, strict=True) for each in result.found]
+    annotations = [each.annotation(count, number, shape) for count, (number, shape, each) in enumerate(pairs, start=1)]
+    told = [event for result in results for event in result.events]
+    events.write_coco(images, annotations, out / "detections.json")
+    for confidence in confidences:
+        chosen = [each for each in annotations if each["score"] >= confidence]
+        events.write_coco(images, chosen, out / f"detections_{confidence:g}.json")
+        events.write_events([each for each in told if each.score >= confidence], out / f"events_{confidence:g}.csv")
+
+
+def _write_pictures(result: _Result, lowest: float, out: Path) -> None:
+    """The raster of masks and the overlay of a map, which is read again: all maps together may not fit the memory."""
+    difference, grid = read_geotiff(result.item.path)
+    sure = [each for each in result.found if each.score >= lowest]
+    stem = re.sub(r"[^\w.-]+", "_", result.item.name.rsplit(".", 1)[0])
+    write_geotiff(out / f"{stem}_masks.tif", events.label_raster(sure, difference.shape), grid)
+    write_overlay(difference, grid, sure, out / f"{stem}_detections.png")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 
 from pipeline.detect.evaluate import CONFIDENCES, Overlap, Score, coco_metrics, evaluate
 from pipeline.formats.atomic import write_json, write_text
+from pipeline.formats.coco import read_coco, read_detections
 from scene.errors import InputError, nearest
 
 
@@ -40,16 +40,14 @@ def assess(
 
     kind: overlap of masks or of boxes; confidences: lowest scores that count, each a column of the tables.
 
-    Predictions that list their images are joined by file name, others (pycocotools' plain list) by image id. Raises InputError
-    for files that are not COCO, predictions without scores, and images that the truth does not have.
+    Raises InputError for all that `read_coco` and `read_detections` do, and for keys that do not tell the images apart.
     """
     path = truth / "annotations.json" if truth.is_dir() else truth
-    reference, found = _read(path), _read(predictions)
-    if not isinstance(reference, dict) or not reference.get("images"):
-        raise InputError("names no image", where=str(path), remedy="give the COCO annotations of the same maps")
-    items = _joined(reference, found, str(predictions))
-    scores = evaluate(reference, items, _groups(reference, keys, str(path)), confidences, kind=kind)
-    return Assessment(scores, coco_metrics(reference, items, kind))
+    reference = read_coco(path, masks=kind == "segm")
+    found = read_detections(predictions, reference, masks=kind == "segm")
+    groups = _groups(reference.images, keys, str(path))
+    scores = evaluate(reference.to_dict(), found, groups, confidences, kind=kind)
+    return Assessment(scores, coco_metrics(reference.to_dict(), found, kind))
 
 
 def as_text(assessment: Assessment) -> str:
@@ -86,43 +84,21 @@ def _probability(value: float) -> str:
 
 
 def _cell(value: float) -> str:
-    return f"{'-':>9}" if np.isnan(value) else f"{value:>8.1%} "
+    return f"{'-':>9}" if np.isnan(value) else f"{100 * value:>7.1f} %"
 
 
-def _read(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except ValueError as error:
-        raise InputError(f"is not JSON ({error})", where=str(path), remedy="make it again") from None
-
-
-def _joined(truth: Mapping[str, Any], found: Any, where: str) -> list[dict[str, Any]]:
-    """The predictions with the truth's image ids."""
-    items = found.get("annotations") if isinstance(found, dict) else found
-    if not isinstance(items, list) or not all(isinstance(item, dict) and "image_id" in item for item in items):
-        raise InputError("is no list of COCO detections", where=where, remedy="give a detections.json of scarpsim detect")
-    if any("score" not in item for item in items):
-        raise InputError("has annotations without a score", where=where, remedy="give detections, not the truth")
-    known = {image["file_name"]: image["id"] for image in truth["images"]}
-    ids = {number: number for number in known.values()}
-    if isinstance(found, dict):
-        ids = {image["id"]: known[image["file_name"]] for image in found.get("images", []) if image["file_name"] in known}
-    strange = {item["image_id"] for item in items} - set(ids)
-    if strange:
-        problem = f"has detections in {len(strange)} images that the truth does not have, such as id {min(strange)}"
-        raise InputError(problem, where=where, remedy="compare with the annotations of the same maps")
-    return [{**item, "image_id": ids[item["image_id"]]} for item in items]
-
-
-def _groups(truth: Mapping[str, Any], keys: Sequence[str], where: str) -> dict[str, list[int]]:
-    images = truth["images"]
+def _groups(images: Sequence[Mapping[str, Any]], keys: Sequence[str], where: str) -> dict[str, list[int]]:
     groups: dict[str, list[int]] = {"all": [image["id"] for image in images]}
     for key in keys:
-        if not all(key in image for image in images):
-            known = sorted(set.intersection(*(set(image) for image in images)))
-            raise InputError(f"the images have no '{key}'", where=where, allowed=", ".join(known), remedy=nearest(key, known))
+        known = [name for name in sorted(set.intersection(*map(set, images))) if all(_is_word(image[name]) for image in images)]
+        if key not in known:
+            problem = f"the images' '{key}' is no word or number" if any(key in image for image in images) else ""
+            problem = problem or f"the images have no '{key}'"
+            raise InputError(problem, where=where, allowed=", ".join(known), remedy=nearest(key, known) or "give another --by")
         for value in sorted({image[key] for image in images}, key=str):
             groups[f"{key} {value}"] = [image["id"] for image in images if image[key] == value]
     return groups
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str | int | float | bool | None)

@@ -18,7 +18,7 @@ from pipeline.detect.model import LOSSES, MaskRCNN, total_loss
 from pipeline.detect.operating_point import set_operating_point
 from pipeline.detect.schedule import has_settled, learning_rate
 from pipeline.formats.atomic import write_json, writing
-from pipeline.progress import Progress
+from pipeline.report.progress import Progress
 from scene.errors import InputError
 
 CHECKPOINT, BEST = "checkpoint", "best"
@@ -153,18 +153,18 @@ class _EventLog:
     """The losses for TensorBoard, where TensorFlow is the backend."""
 
     def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._writers: dict[str, Any] = {}
-        if keras.backend.backend() == "tensorflow":
-            import tensorflow as tf
-
-            self._writers = {name: tf.summary.create_file_writer(str(folder / name)) for name in ("training", "validation")}
 
     def add(self, epoch: int, history: History) -> None:
-        """The last epoch's losses."""
-        if not self._writers:
+        """The last epoch's losses; the files are begun with the first, so that a training that fails before it leaves none."""
+        if keras.backend.backend() != "tensorflow":
             return
         import tensorflow as tf
 
+        if not self._writers:
+            names = ("training", "validation")
+            self._writers = {name: tf.summary.create_file_writer(str(self._folder / name)) for name in names}
         for name, writer in self._writers.items():
             with writer.as_default():
                 for loss, value in getattr(history, name)[-1].items():

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -24,23 +26,78 @@ _NO_SUCH_PLACE = {errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EEXIST,
 _ELSEWHERE = "choose another folder with --out"
 
 
+_noted: ContextVar[list[Path] | None] = ContextVar("noted", default=None)
+
+
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
     """Give a temporary path to write to; it becomes `path` when the block ends well and vanishes when it does not.
 
     Missing folders are made. The temporary lies in the folder of `path` and keeps its suffix, so that libraries that choose a
-    format by the suffix do so; it has one name per target, so that what a killed process left is overwritten by the next.
+    format by the suffix do so; it has one name per target, so that what a killed process left is overwritten by the next. The
+    bytes are on the disk before the name is, so that a power failure leaves no empty file with it.
     Raises InputError for a full disk, a folder without permission to write and a path that cannot be a file.
     """
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        temporary.replace(path)
-    except OSError as error:
-        raise _as_input_error(error, path) from None
+        with explained(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            give_name(temporary, path)
+        note(path)
     finally:
         _remove(temporary)
+
+
+@contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Turn an operating system's error about `path` that a person can mend into an InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise _as_input_error(error, path) from None
+
+
+@contextmanager
+def noting() -> Iterator[list[Path]]:
+    """A list of the files that get their names by `writing` in the block, in this thread; blocks may be nested."""
+    outer, found = _noted.get(), list[Path]()
+    token = _noted.set(found)
+    try:
+        yield found
+    finally:
+        _noted.reset(token)
+        if outer is not None:
+            outer.extend(found)
+
+
+def note(path: Path) -> None:
+    """Add a file to the list of the `noting` around."""
+    found = _noted.get()
+    if found is not None:
+        found.append(path)
+
+
+def give_name(temporary: Path, path: Path) -> None:
+    """Rename a file or folder to `path`, both on the disk: the bytes before, the name after."""
+    to_disk(temporary)
+    temporary.replace(path)
+    to_disk(path.parent)
+
+
+def to_disk(path: Path) -> None:
+    """Wait until a file's bytes, or a folder's names, are on the disk, as far as the file system can tell."""
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except PermissionError:  # may be written and not read
+        return
+    try:
+        os.fsync(file)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(file)
 
 
 def empty_folder(out: Path) -> Path:
@@ -48,6 +105,27 @@ def empty_folder(out: Path) -> Path:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
     return out
+
+
+@contextmanager
+def filling(out: Path) -> Iterator[Path]:
+    """Give a temporary folder to fill; what is in it appears in `out` when the block ends well, and vanishes when it does not.
+
+    Raises InputError where `out` is in use, and as `writing` does.
+    """
+    empty_folder(out)
+    temporary = out / ".part" if out.exists() else out.absolute().with_name(f".{out.absolute().name}.part")
+    try:
+        _remove_folder(temporary)
+        temporary.mkdir(parents=True)
+        yield temporary
+        out.mkdir(exist_ok=True)
+        for made in sorted(temporary.iterdir()):
+            made.rename(out / made.name)
+    except OSError as error:
+        raise _as_input_error(error, out) from None
+    finally:
+        _remove_folder(temporary)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -98,6 +176,10 @@ def _numpy_errno(error: OSError) -> int:
 def _existing(path: Path) -> Path:
     """The nearest folder above `path` that exists."""
     return next(folder for folder in path.absolute().parents if folder.exists())
+
+
+def _remove_folder(temporary: Path) -> None:
+    shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _remove(temporary: Path) -> None:

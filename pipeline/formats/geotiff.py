@@ -5,6 +5,7 @@ Uncompressed: on a noisy difference map deflate saves a fifth and takes forty ti
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ _PIXEL_SCALE, _TIEPOINT, _GEO_KEYS, _GEO_ASCII, _NODATA = 33550, 33922, 34735, 3
 _ASCII, _SHORT, _DOUBLE = 2, 3, 12
 _MASK_PAGE = 4
 """TIFF's NewSubfileType of a transparency mask."""
+MOST_PIXELS = 250_000_000
+"""Of an image that is read, 1 GB as float32: a small compressed file can claim any size."""
 _CITATION = "wall frame: x along the wall, y up the wall, z towards the sensors, metres"
 _MODEL_TYPE, _RASTER_TYPE, _CITATION_KEY, _LINEAR_UNITS = 1024, 1025, 1026, 3076
 _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
@@ -47,19 +50,23 @@ def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = ""
 def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
     """Read a raster of one band and where its pixels lie: (h, w) float32, NaN where there is no data, and its grid.
 
-    Raises InputError for a damaged file, one without a place, and pixels that are not square or not along the axes.
+    Raises InputError for a damaged file, one of more than MOST_PIXELS, one without a place, and pixels that are not square or not
+    along the axes.
     """
     raster, tags = _read(path)
     scale, tie = tags.get(_PIXEL_SCALE), tags.get(_TIEPOINT)
     if scale is None or tie is None or len(tie) != 6 or not np.isclose(scale[0], scale[1], rtol=1e-9, atol=0):
         raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
     gsd = float(scale[0])
+    if not (0 < gsd < np.inf and np.isfinite(tie).all()):
+        place = f"a pixel of {gsd:g} m with the tie point {', '.join(f'{value:g}' for value in tie)}"
+        raise InputError(f"has {place}", where=str(path), allowed="a positive side of finite pixels at a finite place")
     height, width = raster.shape
     return raster, Grid(float(tie[3] - tie[0] * gsd), float(tie[4] + tie[1] * gsd), gsd, width, height)
 
 
 def read_tiff(path: Path) -> NDArray[np.float32]:
-    """Read an image of one band as float32, NaN where there is no data; raises InputError for a damaged file."""
+    """Read an image of one band as float32, NaN where there is no data; raises InputError for a damaged or too large file."""
     return _read(path)[0]
 
 
@@ -102,8 +109,11 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
     try:
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
+            _check_size(page, path)
             tags = {tag.code: tag.value for tag in page.tags}
             raster = page.asarray()
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
     except (tifffile.TiffFileError, ValueError, IndexError, KeyError, struct.error, MemoryError, TypeError) as error:
@@ -116,3 +126,16 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
     if nodata.lower() not in ("nan", ""):
         raster = np.where(raster == np.float32(nodata), np.float32(np.nan), raster)
     return raster, tags
+
+
+def _check_size(page: tifffile.TiffPage, path: Path) -> None:
+    """Raise InputError for an image that is too large, before any memory is taken for it."""
+    pixels, depth = math.prod(page.shape), page.dtype.itemsize if page.dtype else 4
+    if pixels > MOST_PIXELS:
+        size = " x ".join(map(str, page.shape))
+        raise InputError(
+            f"has {size} px, {pixels * depth / 1e9:.3g} GB in memory",
+            where=str(path),
+            allowed=f"at most {MOST_PIXELS:,} px",
+            remedy="cut it into parts, or export it with larger pixels",
+        )

@@ -97,6 +97,7 @@ def read_laz(path: Path) -> PointCloud:
     if len(las.points) < las.header.point_count:
         problem = f"holds {len(las.points):,} of the {las.header.point_count:,} points it announces"
         raise InputError(problem, where=str(path), remedy="export it again")
+    _check_quantisation(las.header, path)
     extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names} | _standard_channels(las)
     counts = las.points.array["intensity"]
     intensity = counts.astype(np.float32) * np.float32(_stored_full_scale(las.header) / _COUNTS) if counts.any() else None
@@ -107,6 +108,14 @@ def read_laz(path: Path) -> PointCloud:
         gps_time=np.array(las.points.array["gps_time"]) if timed else None,
         extra=extra,
     )
+
+
+def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
+    """Raise InputError for scales and offsets that make no coordinates out of the file's integers."""
+    scales, offsets = np.asarray(header.scales), np.asarray(header.offsets)
+    if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
+        problem = f"has scale factors {scales.tolist()} and offsets {offsets.tolist()}"
+        raise InputError(problem, where=str(path), allowed="finite ones, scales above 0", remedy="export it again")
 
 
 def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:

@@ -2,7 +2,8 @@
 
 Camera XML (File > Export > Export Cameras): a sensor may hold two calibrations, the one of class "adjusted" counts; missing tags
 are 0. A camera without a transform is not aligned. A transform is row-major, camera to chunk; the similarity (s, R, t) of the
-camera's component, or where that has none of the chunk, leads on: x_world = s R x_chunk + t.
+camera's component, or where that has none of the chunk, leads on: x_world = s R x_chunk + t. In a chunk with a projected
+coordinate system (the tag `reference`) that leads to geocentric coordinates, which are taken to the projected ones.
 Calibration XML (Tools > Camera Calibration > Save): one interior orientation.
 """
 
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.formats.atomic import write_bytes
+from pipeline.formats.geocentric import Projection, is_geocentric
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from sensors.camera import Camera
@@ -44,6 +46,8 @@ def read_metashape(path: Path) -> MetashapeCameras:
         component.get("id", ""): default if component.find("transform") is None else _similarity(component, path)
         for component in chunk.iterfind("components//component")
     }
+    reference = (chunk.findtext("reference") or "").strip()
+    projection = None if _is_metric(reference) else Projection(reference, str(path))
     cameras: dict[str, Camera] = {}
     unaligned = []
     for element in chunk.iterfind("cameras//camera"):
@@ -58,6 +62,8 @@ def read_metashape(path: Path) -> MetashapeCameras:
             raise InputError(f"camera '{label}' names no sensor of the file", where=str(path))
         in_chunk = _numbers(transform, 16, f"{path}: camera {label}").reshape(4, 4)
         pose = to_world.get(element.get("component_id", ""), default) @ in_chunk
+        if projection is not None and is_geocentric(pose[:3, 3]):
+            pose = projection.pose(pose)
         cameras[label] = _sensor_camera(sensor, pose, f"{path}: sensor {sensor.get('label', sensor.get('id'))}")
     return MetashapeCameras(cameras, tuple(unaligned))
 
@@ -125,6 +131,11 @@ def _chunk(path: Path) -> ElementTree.Element:
     if chunk is None:
         raise InputError("is no Metashape camera XML", where=str(path), remedy="export it with File > Export > Export Cameras")
     return chunk
+
+
+def _is_metric(reference: str) -> bool:
+    """Whether a chunk's coordinate system, in WKT, is one that transforms lead to: none, a local or a geocentric one."""
+    return not reference or reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS", "GEOCCS"))
 
 
 def _similarity(element: ElementTree.Element, path: Path) -> FloatArray:

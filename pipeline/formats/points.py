@@ -15,12 +15,31 @@ from scene.errors import InputError
 SUFFIXES = (".laz", ".las", ".ply", ".e57", ".xyz", ".txt")
 
 
+_LARGEST_M = 1e8
+"""No coordinate system of a survey reaches farther, not even one with its origin in the middle of the Earth."""
+
+
 def read_points(path: Path) -> PointCloud:
     """Read a point cloud; the points of an E57 file are put into the file's frame by the poses in it.
 
-    An E57 file of several scans gives one cloud, with the number of the scan as extra channel `scan`. Raises InputError for a
-    format that is not known and whatever is wrong in the file.
+    An E57 file of several scans gives one cloud, with the number of the scan as extra channel `scan`. Points may be NaN or
+    infinite, as some programs write what did not return. Raises InputError for a format that is not known, whatever is wrong in
+    the file, and coordinates that are none.
     """
+    cloud = _read(path)
+    if not len(cloud.points):
+        raise InputError("holds no points", where=str(path), remedy="export it again")
+    known = np.where(np.isfinite(cloud.points), np.abs(cloud.points), 0.0)
+    far = np.flatnonzero((known > _LARGEST_M).any(axis=1))
+    if len(far):
+        raise InputError(
+            f"{len(far):,} of {len(known):,} points have coordinates up to {known.max():.3g} m", where=str(path),
+            allowed=f"at most {_LARGEST_M:g} m", remedy="check the unit (m), and the scale and offset of the file",
+        )  # fmt: skip
+    return cloud
+
+
+def _read(path: Path) -> PointCloud:
     match path.suffix.lower():
         case ".laz" | ".las":
             return read_laz(path)

@@ -17,6 +17,7 @@ from scene.errors import InputError
 _CHUNK = 200_000
 """Points in memory as text at a time while writing."""
 _HEADER_LINES = 100
+_LONGEST_LINE = 65_536
 _COMMENT = ("#", "//")
 
 
@@ -45,6 +46,7 @@ def read_xyz(path: Path) -> PointCloud:
     Intensity is as the file has it. Raises InputError for a missing file and lines that are not numbers.
     """
     try:
+        _check_lines(path)
         before, names, separator = _layout(path)
         table = np.loadtxt(path, delimiter=separator, skiprows=before, ndmin=2, comments=None, encoding="utf-8")
     except OSError as error:
@@ -58,6 +60,14 @@ def read_xyz(path: Path) -> PointCloud:
     columns = {name: np.ascontiguousarray(table[:, index]) for index, name in enumerate(names)}
     points = np.stack([columns.pop(name) for name in "xyz"], axis=1)
     return PointCloud(points, columns.pop("intensity", None), columns.pop("gps_time", None), columns)
+
+
+def _check_lines(path: Path) -> None:
+    """Raise ValueError for a line so long that it cannot be one point: a reader would take it into memory as a whole."""
+    with path.open("rb") as file:
+        while len(part := file.read(_LONGEST_LINE)) == _LONGEST_LINE:
+            if b"\n" not in part and b"\r" not in part:
+                raise ValueError(f"a line of more than {_LONGEST_LINE:,} bytes")
 
 
 def _layout(path: Path) -> tuple[int, list[str], str | None]:

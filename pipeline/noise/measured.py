@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.areas import Area, in_areas
-from pipeline.closest_points import ReferenceSurface
-from pipeline.difference import DifferenceConfig, raster_grid
+from pipeline.change.areas import Area, in_areas
+from pipeline.change.difference import DifferenceConfig, raster_grid
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.gap.measurement import FILE, read_measurement
-from pipeline.register import IcpConfig, Registration, register_to
+from pipeline.formats.measurement import FILE, read_measurement
+from pipeline.registration.closest_points import ReferenceSurface
+from pipeline.registration.register import IcpConfig, Registration, register_to
 from scene.backend import mi
 from scene.errors import InputError
 from scene.grid import Grid

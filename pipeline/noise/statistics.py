@@ -1,6 +1,6 @@
 """How differences are distributed: their size, their tails, against a normal distribution, and against what may explain them.
 
-The size (median, StD, RMSE, NMAD) is `pipeline.difference.statistics`; here is what it leaves out.
+The size (median, StD, RMSE, NMAD) is `pipeline.change.difference.statistics`; here is what it leaves out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.difference import DifferenceStatistics, statistics
+from pipeline.change.difference import DifferenceStatistics, statistics
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 

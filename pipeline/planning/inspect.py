@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import SensorName, SimulationConfig
-from pipeline.formats.atomic import empty_folder, write_json
+from pipeline.config.simulation import SensorName, SimulationConfig
+from pipeline.formats.atomic import filling, write_json
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.planning.maps import Plan, plans
-from pipeline.provenance import versions
-from pipeline.report.plan import write_plan_report
-from pipeline.site import prepare_site
+from pipeline.planning.report import write_plan_report
+from pipeline.report.provenance import versions
+from pipeline.run.site import prepare_site
 from scene.keyed_random import KeyedRandom
 
-PLAN_FILE = "plan.json"
+PLAN_FILE, REPORT_FILE = "plan.json", "report.html"
 
 
 def inspect(config: SimulationConfig, sensors: Sequence[SensorName]) -> list[Plan]:
@@ -27,9 +27,14 @@ def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> P
     """Write maps, plan.json and report.html; returns the report's path.
 
     Maps are called <sensor>_<map>.tif, of one of several stations <sensor>_station_<n>_<map>.tif; SI, wall frame.
-    Raises InputError where the folder is in use.
+    The folder appears when all of it is there. Raises InputError where it is in use.
     """
-    empty_folder(out)
+    with filling(out) as folder:
+        _write(folder, config, found)
+    return out / REPORT_FILE
+
+
+def _write(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> None:
     for each in found:
         for plotted in each.maps:
             path = out / f"{each.prefix}_{plotted.name}.tif"
@@ -42,6 +47,4 @@ def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> P
         "versions": versions(),
     }
     write_json(out / PLAN_FILE, record)
-    report = out / "report.html"
-    write_plan_report(report, found, config.model_dump(mode="json"))
-    return report
+    write_plan_report(out / REPORT_FILE, found, config.model_dump(mode="json"))

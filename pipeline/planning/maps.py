@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import SimulationConfig
-from pipeline.planning import stereo_geometry as stereo
-from pipeline.planning import tls_geometry as tls
-from pipeline.planning.detectability import PlanningConfig, Sampling, detection_probability, smallest_block
-from pipeline.planning.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
-from pipeline.site import Site
+from pipeline.config.simulation import SimulationConfig
+from pipeline.precision import stereo_geometry as stereo
+from pipeline.precision import tls_geometry as tls
+from pipeline.precision.detectability import PlanningConfig, Sampling, detection_probability, smallest_block
+from pipeline.precision.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
+from pipeline.run.site import Site
 from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.rectify import rectify
@@ -158,7 +157,7 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
         *_if_any(_map("orientation_sigma_z_m", "Standard deviation in z by the orientation", orientation[:, 2], both, "mm", 1e3)),
         *_detection_maps(found.sampling, both, config),
     ]
-    noise = stereo.DisparityNoise.of(pair.model.chain(KeyedRandom(0)))
+    noise = stereo.DisparityNoise.of(pair.model)
     in_both = found.in_left & found.in_right
     figures = {
         "seen_by_both": float(both.mean()),
@@ -176,7 +175,7 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
         return geometry.sampling, geometry.in_left & geometry.in_right
 
     curves = _curves(sampling_of, views, config, ("depth map's cell, px of the frame", float(REDUCTION[pair.quality])))
-    ignored = _ignored(effect.name for effect in pair.model.effects if effect.name not in stereo.COUNTED)
+    ignored = _ignored(effect.name for effect in pair.model.effects if not effect.planned)
     return Plan("stereo", "Stereo pair", None, wall, raster, maps, figures, curves, ignored, config)
 
 
@@ -226,7 +225,7 @@ def _tls_plan(
     step = float(np.sqrt(scanner.pattern.azimuth_step * scanner.pattern.zenith_step))
     views = _middle_views(raster, seen, scanner.position, scanner.rotation[:, 2])
     curves = _curves(sampling_of, views, config, ("angular step, mrad", step * 1e3))
-    ignored = _ignored(effect.name for effect in scanner.model.effects if effect.name not in tls.COUNTED)
+    ignored = _ignored(effect.name for effect in scanner.model.effects if not effect.planned)
     words = "Laser scanner", scanner.config.name, station and f"station {station}", _FACES[scanner.config.faces]
     instrument = ", ".join(str(word) for word in words if word)
     return Plan("tls", instrument, station, wall, raster, maps, figures, curves, ignored, config)
@@ -235,7 +234,7 @@ def _tls_plan(
 def _together(single: list[Plan]) -> Plan:
     """Several stations as one plan: at each place the figures of the station with the best precision along the normal there.
 
-    That is the one whose surface the merged surface takes (`pipeline.stations`).
+    That is the one whose surface the merged surface takes (`pipeline.surface.stations`).
     """
     first = single[0]
     seen = np.sum([_values(plan, "views") for plan in single], axis=0)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.planning.detectability import PlanningConfig, detection_probability
-from pipeline.planning.stereo_geometry import stereo_geometry
-from pipeline.planning.surface import BoolArray, Places
-from pipeline.planning.tls_geometry import tls_geometry
+from pipeline.precision.detectability import PlanningConfig, detection_probability
+from pipeline.precision.stereo_geometry import stereo_geometry
+from pipeline.precision.surface import BoolArray, Places
+from pipeline.precision.tls_geometry import tls_geometry
 from scene.blocks import RockfallConfig, place_blocks
 from scene.carve import carve
 from scene.distributions import Gaussian

@@ -15,23 +15,32 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
-from pipeline.difference import DifferenceStatistics, statistics
+from pipeline.change.difference import DifferenceStatistics, statistics
+from pipeline.report.plain_text import plain_text, powers_of_ten
 from scene.grid import Grid
 from scene.mesh import WALL, IntArray
 
 SCALE_SIGMAS = 6.0
 """A difference map's colours end at this many sigma on either side of zero."""
+DIFFERENCE_LABEL = "reference minus epoch, mm; missing rock positive"
+"""The one sign of all difference maps, whose colours are those of COLOURS: red where rock is missing."""
 _WIDEST_PX = 2000
 DPI = 150
 _MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.6, 9.0
 _PAIRED = 0.55
 """Size of a picture that stands beside another one; its text is larger in proportion, its pixels are as many."""
+_LOW_IN, _BENEATH_IN = 3.6, 0.65
+"""Below this height of maps the label of a colour bar has no room beside them; what it takes beneath them."""
+_FAR_M, _ROUND_M = 1e4, 1e3
+"""From here on coordinates are given relative to a multiple of this, as those of a national grid."""
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.7, 1.25, 0.6, 0.4
 _OUTSIDE, _INSIDE = "#0072B2", "#D55E00"
 FAMILY = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -77,7 +86,7 @@ def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "")
     shade = (-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / np.sqrt(
         1 + right**2 + down**2
     )  # the normal is (-dz/dx, -dz/dy, 1)
-    figure, axes = _map_figure(grid, title, right_in=0.2, size=_PAIRED)
+    figure, axes = _map_figure(grid, title, bar=False, size=_PAIRED)
     axes.set_facecolor(_NO_DATA_HILLSHADE)
     axes.imshow(shade, cmap=_GREYS, vmin=-0.1, vmax=1.0, extent=raster_extent(grid, shade.shape), interpolation="nearest")
     _no_data_legend(axes, heights, _NO_DATA_HILLSHADE)
@@ -96,7 +105,7 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
     inside = _max_pooled(block != WALL, pooling(grid))
     if inside.any() and min(inside.shape) > 1:
         axes.contour(inside, levels=[0.5], colors="black", linewidths=0.6, origin="upper", extent=extent)
-    _colour_bar(figure, axes, image, sigma_m * 1e3)
+    _sigma_bar(figure, axes, image, sigma_m * 1e3)
     _no_data_legend(axes, values, NO_DATA, "outline: block" if inside.any() else "")
     return png_bytes(figure)
 
@@ -113,13 +122,11 @@ def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str 
     axes.set_facecolor(NO_DATA)
     image = axes.imshow(pooled, cmap=SEQUENTIAL, norm=scale, extent=raster_extent(grid, pooled.shape), interpolation="nearest")
     beyond = known.size and (known.min() < scale.vmin or known.max() > scale.vmax)
-    bar = figure.colorbar(image, cax=_beside(figure, axes), extend="both" if beyond else "neither")
+    bar = _colour_bar(figure, axes, image, label, "both" if beyond else "neither")
     if isinstance(scale, LogNorm):
-        plain_numbers(bar.ax.yaxis)
+        plain_numbers(bar.long_axis)
     elif np.array_equal(known, np.round(known)):
         bar.locator = MaxNLocator(integer=True)
-    bar.ax.tick_params(labelsize=8)
-    bar.set_label(label, fontsize=9)
     _no_data_legend(axes, pooled, NO_DATA)
     return png_bytes(figure)
 
@@ -173,6 +180,7 @@ def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating]
     _histogram(whole, samples, _whole_range(samples))
     whole.set_title("Everything: logarithmic scale", fontsize=10)
     whole.set_yscale("symlog", linthresh=1)
+    powers_of_ten(whole.yaxis)
     whole.set_ylim(bottom=0)
     handles = [Patch(color=colour, label=f"{name}\n{_in_words(statistics(values))}") for name, values, colour in samples]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
@@ -204,7 +212,7 @@ def _histogram(axes: Axes, samples: Sequence[tuple[str, NDArray[np.floating], st
         axes.stairs(counts, edges, color=colour, linewidth=1.2)
     axes.axvline(0, color="0.3", linewidth=0.8)
     axes.set_xlim(limits)
-    dress(axes, "reference minus epoch, mm (missing rock is positive)", f"pixels per {edges[1] - edges[0]:.3g} mm")
+    dress(axes, DIFFERENCE_LABEL, f"pixels per {edges[1] - edges[0]:.3g} mm")
 
 
 def _noise_range(values: NDArray[np.floating]) -> tuple[float, float]:
@@ -232,17 +240,46 @@ def _in_words(found: DifferenceStatistics) -> str:
     )
 
 
-def _map_figure(grid: Grid, title: str, right_in: float = _RIGHT_IN, size: float = 1.0) -> tuple[Figure, Axes]:
-    """A figure whose axes have the aspect of the grid, in wall-frame metres; size: of the map, its pixels stay as many."""
+def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) -> tuple[Figure, Axes]:
+    """A figure whose axes have the aspect of the grid, in wall-frame metres.
+
+    bar: with room for a colour bar; size: of the map, its pixels stay as many.
+    """
     aspect = grid.height / grid.width
     width = min(_MAP_WIDTH_IN, _MAP_HEIGHT_IN / aspect) * size
     height = width * aspect
-    full_width, full_height = _LEFT_IN + width + right_in, _BOTTOM_IN + height + _TOP_IN
+    beneath = bar and height < _LOW_IN
+    bottom = _BOTTOM_IN + (_BENEATH_IN if beneath else 0.0)
+    full_width, full_height = _LEFT_IN + width + (_RIGHT_IN if bar and not beneath else 0.2), bottom + height + _TOP_IN
     figure = Figure(figsize=(full_width, full_height), dpi=DPI / size)
-    axes = figure.add_axes((_LEFT_IN / full_width, _BOTTOM_IN / full_height, width / full_width, height / full_height))
+    axes = figure.add_axes((_LEFT_IN / full_width, bottom / full_height, width / full_width, height / full_height))
     axes.set_title(title, fontsize=11, loc="left")
-    dress(axes, "x along the wall, m", "y up the wall, m")
+    dress_map(axes, grid.x_min, grid.y_max - grid.height * grid.gsd)
     return figure, axes
+
+
+def dress_map(axes: Axes, left: float, bottom: float) -> None:
+    """Labels of a map over a wall; coordinates far from zero, m, are given relative to round ones that stand beneath the map."""
+    offsets = [_shortened(axis, low) for axis, low in ((axes.xaxis, left), (axes.yaxis, bottom))]
+    far = f" (from x {offsets[0]:,.0f}, y {offsets[1]:,.0f})" if any(offsets) else ""
+    dress(axes, f"x along the wall, m{far}", "y up the wall, m")
+
+
+def _shortened(axis: Axis, low: float) -> float:
+    """What the numbers of an axis that begins at `low` are relative to."""
+    if abs(low) < _FAR_M:
+        return 0.0
+    offset = float(_ROUND_M * np.floor(low / _ROUND_M))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value - offset:g}"))
+    return offset
+
+
+def bar_place(height_in: float) -> tuple[dict[str, Any], float]:
+    """Where the colour bar of maps stands, and the height that it takes, in: beside them, or beneath low ones, where its label
+    would have no room."""
+    if height_in < _LOW_IN:
+        return {"location": "bottom", "shrink": 0.6, "aspect": 45}, _BENEATH_IN
+    return {"location": "right", "shrink": 0.8}, 0.0
 
 
 def dress(axes: Axes, x_label: str, y_label: str) -> None:
@@ -252,18 +289,24 @@ def dress(axes: Axes, x_label: str, y_label: str) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _beside(figure: Figure, axes: Axes) -> Axes:
-    """The place of a colour bar at the right of a map."""
-    box = axes.get_position()
-    return figure.add_axes((box.x1 + 0.15 / figure.get_figwidth(), box.y0, 0.16 / figure.get_figwidth(), box.height))
+def _colour_bar(figure: Figure, axes: Axes, image: AxesImage, label: str, extend: str) -> Colorbar:
+    """A colour bar at the right of a map, or beneath a low one."""
+    box, width, height = axes.get_position(), figure.get_figwidth(), figure.get_figheight()
+    if box.height * height < _LOW_IN:
+        place, orientation = (box.x0 + 0.1 * box.width, _BENEATH_IN / height, 0.8 * box.width, 0.14 / height), "horizontal"
+    else:
+        place, orientation = (box.x1 + 0.15 / width, box.y0, 0.16 / width, box.height), "vertical"
+    bar = figure.colorbar(image, cax=figure.add_axes(place), extend=extend, orientation=orientation)
+    bar.ax.tick_params(labelsize=8)
+    bar.set_label(label, fontsize=9)
+    return bar
 
 
-def _colour_bar(figure: Figure, axes: Axes, image: Any, sigma_mm: float) -> None:
+def _sigma_bar(figure: Figure, axes: Axes, image: AxesImage, sigma_mm: float) -> None:
     ticks = sigma_mm * np.arange(-SCALE_SIGMAS, SCALE_SIGMAS + 1, 2)
-    bar = figure.colorbar(image, cax=_beside(figure, axes), extend="both", ticks=ticks)
     digits = max(0, int(np.ceil(-np.log10(sigma_mm))) + 1)
-    bar.ax.set_yticklabels([_signed(tick, digits) for tick in ticks], fontsize=8)
-    bar.set_label(f"reference minus epoch, mm; a tick is 2 $\\sigma$, $\\sigma$ = {sigma_mm:.3g} mm", fontsize=9)
+    label = f"{DIFFERENCE_LABEL}; a tick is 2 \N{GREEK SMALL LETTER SIGMA}, \N{GREEK SMALL LETTER SIGMA} = {sigma_mm:.3g} mm"
+    _colour_bar(figure, axes, image, label, "both").set_ticks(ticks, labels=[_signed(tick, digits) for tick in ticks])
 
 
 def _signed(value: float, digits: int) -> str:
@@ -313,8 +356,8 @@ def _max_pooled(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """The figure as a PNG file; equal figures give equal bytes."""
-    """The figure as a PNG file that holds no date or version."""
+    """The figure as a PNG file that holds no date or version: equal figures give equal bytes."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
+    with plain_text(figure):
+        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()

@@ -23,7 +23,7 @@ _QUANTILE = 0.98
 
 
 class GapResults:
-    """Residuals, measured minus predicted.
+    """Residuals: by how much the measured surface lies deeper than the predicted one, positive where rock is missing.
 
     The folder does not say where the sensor stood, so the wall is looked at from the side on which its normal points upwards.
     """
@@ -51,7 +51,7 @@ class GapResults:
         self._cells = lru_cache(8)(self._binned)
 
     def layers(self, step: str) -> list[Layer]:
-        return [Layer("residual", "measured minus predicted", "mm", _MM, diverging=True, limit=self._limit)]
+        return [Layer("residual", "deeper than predicted (missing rock positive)", "mm", _MM, diverging=True, limit=self._limit)]
 
     def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
         return self._cells(step, window, budget)

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.difference import SurfaceRaster, surface_raster
+from pipeline.change.difference import SurfaceRaster, surface_raster
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.laz import read_laz
 from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.products import epoch_folder
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
+from pipeline.run.products import epoch_folder
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, Points, Window, centres, cut, inside
 from scene.errors import InputError
 from scene.grid import Grid
@@ -56,7 +56,7 @@ class RunResults:
 
     def layers(self, step: str) -> list[Layer]:
         limit = SCALE_SIGMAS * self._epochs[step]["statistics"]["sigma_m"] * _MM
-        maps = [Layer("difference", "reference minus epoch", "mm", _MM, diverging=True, limit=limit)]
+        maps = [Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit)]
         if self._map_path("m3c2", step).exists():
             maps.append(Layer("m3c2", "M3C2 distance", "mm", _MM, diverging=True, limit=limit))
         return [*maps, _ROCK, _HEIGHT]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import threading
 import webbrowser
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,19 @@ from scene.errors import InputError
 
 HOST = "127.0.0.1"
 _OWN_NAMES = {"127.0.0.1", "localhost"}
+_POLICY = {
+    "default-src": "'none'",
+    "script-src": "'self' {inline}",
+    "style-src": "'self' 'unsafe-inline'",
+    "img-src": "'self' data: blob:",
+    "font-src": "'self' data:",
+    "connect-src": "'self'",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+    "frame-ancestors": "'none'",
+}
+"""What the page may load and run: its own scripts and, by their hashes ({inline}), the lines in the page by which Dash starts
+them. Plotly sets styles from scripts and saves pictures through data and blob addresses."""
 
 
 def open_results(folder: Path, detections: Path | None = None) -> Results:
@@ -43,13 +58,14 @@ def make_app(results: Results) -> dash.Dash:
     app = dash.Dash(
         __name__,
         serve_locally=True,
-        title=f"scarpsim: {results.title}",
+        title=html.escape(f"scarpsim: {results.title}"),  # Dash puts it into the page as it is
         update_title="",
         assets_folder=str(Path(__file__).parent / "assets"),
     )
     app.layout = layout(results)
     register_callbacks(app, results, threading.Lock())
     app.server.before_request(_refuse_other_names)
+    app.server.after_request(_with_headers(app.csp_hashes()))
     return app
 
 
@@ -81,6 +97,19 @@ def _refuse_other_names() -> Any:
     """A page elsewhere that reaches this one under a name of its own gets nothing."""
     name = flask.request.host.rpartition(":")[0] or flask.request.host
     return None if name in _OWN_NAMES else flask.abort(403)
+
+
+def _with_headers(inline: Sequence[str]) -> Callable[[flask.Response], flask.Response]:
+    """What each answer tells the browser to refuse. inline: hashes of the scripts in the page itself."""
+    policy = "; ".join(f"{key} {value}" for key, value in _POLICY.items()).format(inline=" ".join(inline))
+
+    def add(response: flask.Response) -> flask.Response:
+        response.headers["Content-Security-Policy"] = policy
+        response.headers["X-Content-Type-Options"] = "nosniff"
+        response.headers["Referrer-Policy"] = "no-referrer"
+        return response
+
+    return add
 
 
 class _Silent(WSGIRequestHandler):

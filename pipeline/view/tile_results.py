@@ -26,7 +26,7 @@ class TileResults:
 
     def __init__(self, folder: Path) -> None:
         """Raises InputError where annotations.json cannot be used."""
-        self.folder, self._coco = folder, CocoFolder(folder)
+        self.folder, self._coco = folder, CocoFolder(folder, masks=False)
         self.title = f"{folder.parent.name}/{folder.name}: {len(self._coco)} tiles"
         self._images = {str(image["id"]): image for image in self._coco.images}
         self.steps = {key: str(image["file_name"]) for key, image in self._images.items()}
@@ -34,10 +34,19 @@ class TileResults:
 
     def layers(self, step: str) -> list[Layer]:
         sigma = self._images[step].get("noise_sigma_m", _SIGMA_M)
-        return [Layer("difference", "reference minus epoch", "mm", _MM, diverging=True, limit=SCALE_SIGMAS * sigma * _MM)]
+        return [
+            Layer(
+                "difference",
+                "reference minus epoch (missing rock positive)",
+                "mm",
+                _MM,
+                diverging=True,
+                limit=SCALE_SIGMAS * sigma * _MM,
+            )
+        ]
 
     def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
-        values, grid = self._map(self.folder / self.steps[step])
+        values, grid = self._map(self._coco.path(self._images[step]))
         rows, columns, factor = cut(grid, window, budget)
         shown = mean_pooled(values[rows, columns], factor)
         return Patch(*centres(grid, rows, columns, factor), -shown, shown * _MM, np.zeros(shown.shape, int), factor)
@@ -46,7 +55,7 @@ class TileResults:
         return None
 
     def items(self, step: str) -> list[Item]:
-        grid = self._map(self.folder / self.steps[step])[1]
+        grid = self._map(self._coco.path(self._images[step]))[1]
         found = [each for each in self._coco.annotations if each["image_id"] == self._images[step]["id"]]
         return [_block(each, grid.x_min, grid.y_max, grid.gsd) for each in found]
 

@@ -1,108 +1,73 @@
-"""The registry of effects: every class that a config may name, in the catalogue's order."""
+"""The registry of effects: every class that a config may name.
+
+An effect is known by being there: a module of this folder, or one that another package names under the entry point
+`scarpsim.effects` ("name = package.module:Class"), holds it, and what is to be known of it stands on its class.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.metadata import entry_points
+from inspect import isabstract
+from pkgutil import iter_modules
 from typing import Annotated, Any, Union
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator
 
 from scene.errors import nearest
-from sensors.effects.affinity_skew import AffinitySkew
-from sensors.effects.angle_noise import AngleNoise
-from sensors.effects.base import Effect
-from sensors.effects.beam_divergence import BeamDivergence
-from sensors.effects.camera_kappa import CameraKappa
-from sensors.effects.camera_omega import CameraOmega
-from sensors.effects.camera_phi import CameraPhi
-from sensors.effects.camera_shift import CameraShift
-from sensors.effects.collimation import Collimation
-from sensors.effects.detection_limit import DetectionLimit
-from sensors.effects.disparity_empirical import DisparityEmpirical
-from sensors.effects.edge_fattening import EdgeFattening
-from sensors.effects.focal_length import FocalLength
-from sensors.effects.heavy_tailed_noise import HeavyTailedNoise
-from sensors.effects.horizontal_eccentricity import HorizontalEccentricity
-from sensors.effects.occlusion_fill import OcclusionFill
-from sensors.effects.parallax_noise import ParallaxNoise
-from sensors.effects.pixel_locking import PixelLocking
-from sensors.effects.precipitation import Precipitation
-from sensors.effects.principal_point_x import PrincipalPointX
-from sensors.effects.principal_point_y import PrincipalPointY
-from sensors.effects.radial_distortion import RadialDistortion
-from sensors.effects.range_cyclic import RangeCyclic
-from sensors.effects.range_empirical import RangeEmpirical
-from sensors.effects.range_incidence_bias import RangeIncidenceBias
-from sensors.effects.range_intensity_bias import RangeIntensityBias
-from sensors.effects.range_noise import RangeNoise
-from sensors.effects.range_noise_incidence import RangeNoiseIncidence
-from sensors.effects.range_noise_intensity import RangeNoiseIntensity
-from sensors.effects.range_noise_proportional import RangeNoiseProportional
-from sensors.effects.range_offset import RangeOffset
-from sensors.effects.range_quantization import RangeQuantization
-from sensors.effects.range_scale import RangeScale
-from sensors.effects.regularization_noise import RegularizationNoise
-from sensors.effects.row_jitter import RowJitter
-from sensors.effects.smoothing import Smoothing
-from sensors.effects.tangential_distortion import TangentialDistortion
-from sensors.effects.texture_noise import TextureNoise
-from sensors.effects.tilt_drift import TiltDrift
-from sensors.effects.trunnion_tilt import TrunnionTilt
-from sensors.effects.vertical_eccentricity import VerticalEccentricity
-from sensors.effects.vertical_index import VerticalIndex
-from sensors.effects.wobble import Wobble
+from sensors.effects.base import Effect, Sensor
 
-TLS_EFFECTS: tuple[type[Effect], ...] = (
-    RangeOffset,
-    RangeScale,
-    RangeCyclic,
-    RangeIntensityBias,
-    RangeIncidenceBias,
-    RangeQuantization,
-    RangeNoise,
-    RangeNoiseProportional,
-    RangeNoiseIncidence,
-    RangeNoiseIntensity,
-    AngleNoise,
-    VerticalIndex,
-    Collimation,
-    TrunnionTilt,
-    HorizontalEccentricity,
-    VerticalEccentricity,
-    Wobble,
-    TiltDrift,
-    BeamDivergence,
-    DetectionLimit,
-    Precipitation,
-)
+Effects = tuple[type[Effect], ...]
 
-STEREO_EFFECTS: tuple[type[Effect], ...] = (
-    FocalLength,
-    PrincipalPointX,
-    PrincipalPointY,
-    RadialDistortion,
-    TangentialDistortion,
-    AffinitySkew,
-    CameraOmega,
-    CameraPhi,
-    CameraKappa,
-    CameraShift,
-    ParallaxNoise,
-    RegularizationNoise,
-    PixelLocking,
-    EdgeFattening,
-    Smoothing,
-    OcclusionFill,
-    TextureNoise,
-    RowJitter,
-)
+PLUG_INS = "scarpsim.effects"
+"""The group of entry points."""
 
-FURTHER_STEREO_EFFECTS: tuple[type[Effect], ...] = (HeavyTailedNoise,)
+
+def _own() -> Iterator[type[Effect]]:
+    for module in iter_modules(__path__, f"{__name__}."):
+        held = vars(import_module(module.name)).values()
+        yield from (each for each in held if _is_effect(each) and each.__module__ == module.name)
+
+
+def _is_effect(value: Any) -> bool:
+    return isinstance(value, type) and issubclass(value, Effect) and not isabstract(value) and "name" in value.__annotations__
+
+
+def _registered() -> Effects:
+    """Of this folder and of other packages, along the sensors' chains, then by name."""
+    found = {effect.tag(): effect for effect in _own()}
+    for entry in sorted(entry_points(group=PLUG_INS), key=lambda entry: entry.name):
+        effect = entry.load()
+        if not _is_effect(effect):
+            raise TypeError(f"entry point '{entry.value}' of {PLUG_INS}: needs a subclass of sensors.effects.base.Effect")
+        if effect.tag() in found:
+            raise ValueError(f"entry point '{entry.value}' of {PLUG_INS}: there is an effect '{effect.tag()}' already")
+        found[effect.tag()] = effect
+    return tuple(sorted(found.values(), key=lambda effect: (effect.stage, effect.order, effect.tag())))
+
+
+EFFECTS: Effects = _registered()
+_BY_NAME = {effect.tag(): effect for effect in EFFECTS}
+TLS_EFFECTS: Effects = tuple(each for each in EFFECTS if each.sensor == "tls" and each.catalogue)
+STEREO_EFFECTS: Effects = tuple(each for each in EFFECTS if each.sensor == "stereo" and each.catalogue)
+FURTHER_EFFECTS: Effects = tuple(each for each in EFFECTS if not each.catalogue and not each.empirical)
 """Beyond the shared catalogue: for simulation, no candidates of `scarpsim gap`."""
 
 
-def _named(effects: tuple[type[Effect], ...]) -> Any:
+def effect_of(name: str) -> type[Effect]:
+    """The class of an effect by its name, with or without the sensor's prefix. Raises KeyError."""
+    return _BY_NAME[name.rpartition(".")[2]]
+
+
+def catalogue(sensor: Sensor) -> Effects:
+    """The effects of one sensor that `scarpsim gap` may name."""
+    return TLS_EFFECTS if sensor == "tls" else STEREO_EFFECTS
+
+
+def _named(effects: Effects) -> Any:
     """The type of one entry of an `effects:` list: a mapping whose `name` picks the class out of `effects`."""
-    names = [effect.model_fields["name"].default for effect in effects]
+    names = [effect.tag() for effect in effects]
     prefix = f"{effects[0].sensor}."
 
     def check(value: Any) -> Any:
@@ -126,57 +91,6 @@ def _doing_something(effect: Effect) -> Effect:
     return effect
 
 
-TlsEffect = _named((*TLS_EFFECTS, RangeEmpirical))
-StereoEffect = _named((*STEREO_EFFECTS, *FURTHER_STEREO_EFFECTS, DisparityEmpirical))
+TlsEffect = _named(tuple(each for each in EFFECTS if each.sensor == "tls"))
+StereoEffect = _named(tuple(each for each in EFFECTS if each.sensor == "stereo"))
 """What a config may name: the catalogue and, for what it does not explain, the empirical terms that `scarpsim gap` adds."""
-
-__all__ = [
-    "FURTHER_STEREO_EFFECTS",
-    "STEREO_EFFECTS",
-    "TLS_EFFECTS",
-    "AffinitySkew",
-    "AngleNoise",
-    "BeamDivergence",
-    "CameraKappa",
-    "CameraOmega",
-    "CameraPhi",
-    "CameraShift",
-    "Collimation",
-    "DetectionLimit",
-    "DisparityEmpirical",
-    "EdgeFattening",
-    "Effect",
-    "FocalLength",
-    "HeavyTailedNoise",
-    "HorizontalEccentricity",
-    "OcclusionFill",
-    "ParallaxNoise",
-    "PixelLocking",
-    "Precipitation",
-    "PrincipalPointX",
-    "PrincipalPointY",
-    "RadialDistortion",
-    "RangeCyclic",
-    "RangeEmpirical",
-    "RangeIncidenceBias",
-    "RangeIntensityBias",
-    "RangeNoise",
-    "RangeNoiseIncidence",
-    "RangeNoiseIntensity",
-    "RangeNoiseProportional",
-    "RangeOffset",
-    "RangeQuantization",
-    "RangeScale",
-    "RegularizationNoise",
-    "RowJitter",
-    "Smoothing",
-    "StereoEffect",
-    "TangentialDistortion",
-    "TextureNoise",
-    "TiltDrift",
-    "TlsEffect",
-    "TrunnionTilt",
-    "VerticalEccentricity",
-    "VerticalIndex",
-    "Wobble",
-]

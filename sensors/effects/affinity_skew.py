@@ -5,17 +5,16 @@ from __future__ import annotations
 from typing import Literal
 
 from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair, Side
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.camera import CameraPair
+from sensors.effects.base import parameter
+from sensors.effects.camera_effect import CameraEffect
 
 
-class AffinitySkew(Effect):
+class AffinitySkew(CameraEffect):
     """b_real = b_nominal + b: the pixels are not square, or the axes not at right angles."""
 
     name: Literal["affinity_skew"] = "affinity_skew"
-    sensor = "stereo"
-    stage = Stage.CAMERA
-    camera: Side = "both"
+    sets = (("b1_px",), ("b2_px",), ("b1_px", "b2_px"))
     b1_px: float = parameter(
         "real minus calibrated affinity", unit="px", source="Metashape user manual, appendix D", typical=1.0, ge=-1e4, le=1e4
     )

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+
 from scene.backend import mi
 from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
 from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
+from sensors.pulses import PulseGeometry, Pulses
 
 
 class AngleNoise(Effect):
@@ -20,6 +23,8 @@ class AngleNoise(Effect):
     name: Literal["angle_noise"] = "angle_noise"
     sensor = "tls"
     stage = Stage.AIM
+    shows_in = ShowsIn.SPREAD
+    planned = True
     azimuth_sigma_rad: float = parameter(
         "standard deviation in azimuth", unit="rad", source="datasheets", typical=5e-5, ge=0, le=0.1
     )
@@ -31,3 +36,7 @@ class AngleNoise(Effect):
         noise = state.normals(random)
         azimuth, zenith = opaque(self.azimuth_sigma_rad, self.zenith_sigma_rad)
         return state.with_angle_error(azimuth * mi.Float64(noise.x), zenith * mi.Float64(noise.y))
+
+    def variance(self, at: PulseGeometry) -> FloatArray:
+        by_azimuth, by_zenith = self.azimuth_sigma_rad * at.by_azimuth, self.zenith_sigma_rad * at.by_zenith
+        return np.asarray(by_azimuth**2 + by_zenith**2)

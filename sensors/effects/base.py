@@ -5,15 +5,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
-from enum import IntEnum
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
 from typing import Any, ClassVar, Literal, TypeVar, cast
 
+import numpy as np
 from pydantic import Field
 
 from scene.config import Config
 from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
 
 StateT = TypeVar("StateT")
+Sensor = Literal["tls", "stereo"]
 
 
 class Stage(IntEnum):
@@ -30,18 +34,105 @@ class Stage(IntEnum):
     FILL = 14  # stereo: cells without a match
 
 
+class ShowsIn(StrEnum):
+    """In what of a measurement an effect shows."""
+
+    MEAN = "mean"  # ranges or disparities are off
+    SPREAD = "spread"  # they scatter more
+    VALUES = "values"  # they crowd at some values
+    RETURNS = "returns"  # some are missing
+    EDGES = "edges"  # the surface's edges are displaced
+
+
+@dataclass(frozen=True)
+class Search:
+    """A sine whose period is searched.
+
+    period: the parameter that holds it; along: the covariate it repeats along; shortest, longest: periods, in the covariate's
+    unit, None where its reach is the bound; cycles: the fewest within that reach.
+    """
+
+    period: str
+    along: str
+    shortest: float
+    longest: float | None = None
+    cycles: float = 1.0
+
+
 class Effect(Config, ABC):
     """Base of all effects: a frozen set of parameters and a pure `apply`.
 
     A subclass declares `name` (the catalogue's, as a Literal field, so that it stands in configs), `sensor` and `stage`, its
     parameters through `parameter`, and `evaluate(state, random)`. At the parameters' null values `apply` is the identity, bit
     for bit. Signs: recorded = true + effect. Within a stage effects act by rising `order`; equal ones in the config's order.
+
+    What else is to be known of it stands here too, so that no other place decides by its name:
+    shows_in; looks_at: its own pulse or pixel (`element`), neighbouring ones, or the whole scan or image; needs: fields that a
+    measurement must have; catalogue: whether `scarpsim gap` may name it; empirical: a term that has no name; planned: whether a
+    plan takes it into account; searched: of a sine; sets: of its parameters that are tried (default: all that switch it on,
+    together); trials: a parameter that is not fitted, with the values that are tried; shared: whether neighbours scatter alike;
+    held_out_gain: log score on held-out data up to which it is not believed.
     """
 
     name: str
-    sensor: ClassVar[Literal["tls", "stereo"]]
+    sensor: ClassVar[Sensor]
     stage: ClassVar[Stage]
     order: ClassVar[int] = 0
+    shows_in: ClassVar[ShowsIn]
+    looks_at: ClassVar[Literal["element", "neighbours", "whole"]] = "element"
+    needs: ClassVar[tuple[str, ...]] = ()
+    catalogue: ClassVar[bool] = True
+    empirical: ClassVar[bool] = False
+    planned: ClassVar[bool] = False
+    searched: ClassVar[Search | None] = None
+    sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    trials: ClassVar[tuple[str, tuple[float, ...]] | None] = None
+    shared: ClassVar[bool] = False
+    held_out_gain: ClassVar[float] = 0.0
+
+    @classmethod
+    def tag(cls) -> str:
+        """The name that configs hold."""
+        return cast(str, cls.model_fields["name"].default)
+
+    @classmethod
+    def scored(cls) -> bool:
+        """Whether a Gaussian log score of residuals shows what the effect is worth."""
+        return cls.shows_in in (ShowsIn.MEAN, ShowsIn.SPREAD)
+
+    @classmethod
+    def known(cls, at: Any) -> bool:
+        """Whether a geometry holds all that the effect's equation needs."""
+        return all(getattr(at, name, None) is not None for name in cls.needs)
+
+    @classmethod
+    def typical_sizes(cls) -> dict[str, float]:
+        """Typical values of the parameters that are 0 where the effect is not there."""
+        found = {key: info.json_schema_extra for key, info in cls.model_fields.items()}
+        return {
+            key: float(known["typical"])  # type: ignore[arg-type]
+            for key, known in found.items()
+            if isinstance(known, dict) and known.get("null") == 0.0 and isinstance(known.get("typical"), float)
+        }
+
+    def argument(self, at: Any) -> FloatArray:
+        """(n,) what a searched sine runs along, in the unit of its period."""
+        raise NotImplementedError(f"{self.name} is no searched sine")
+
+    def mean(self, at: Any) -> FloatArray:
+        """(n,) by how much the effect changes a recorded range (m) or disparity (px) on average.
+
+        at: what the sensor's equations look at, as host arrays (`PulseGeometry`, or the pixels' geometry of a stereo pair).
+        """
+        return np.zeros(len(at))
+
+    def variance(self, at: Any) -> FloatArray:
+        """(n,) variance that the effect adds to a recorded range (m2) or disparity (px2)."""
+        return np.zeros(len(at))
+
+    def kept(self, at: Any) -> FloatArray:
+        """(n,) probability that a return is not lost to the effect."""
+        return np.ones(len(at))
 
     @property
     def is_null(self) -> bool:

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
 from sensors.footprint import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
 
 
@@ -25,6 +25,9 @@ class BeamDivergence(Effect):
     name: Literal["beam_divergence"] = "beam_divergence"
     sensor = "tls"
     stage = Stage.FOOTPRINT
+    shows_in = ShowsIn.EDGES
+    looks_at = "neighbours"
+    planned = True
     divergence_rad: float = parameter(
         "full divergence, 1/e^2", unit="rad", source="datasheets (mind their conventions)", typical=3e-4, ge=0, le=0.1
     )

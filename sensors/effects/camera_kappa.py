@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import Literal
 
 from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair, Side
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.camera import CameraPair
+from sensors.effects.base import parameter
+from sensors.effects.camera_effect import CameraEffect
 
 
-class CameraKappa(Effect):
+class CameraKappa(CameraEffect):
     """R_real = R_nominal R_z(angle), camera to world: right-handed about the camera's z axis (x right, y down, z forward)."""
 
     name: Literal["camera_kappa"] = "camera_kappa"
-    sensor = "stereo"
-    stage = Stage.CAMERA
-    camera: Side = "both"
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=1e-4, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:

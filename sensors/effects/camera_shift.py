@@ -7,17 +7,15 @@ from typing import Literal
 import numpy as np
 
 from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair, Side
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.camera import CameraPair
+from sensors.effects.base import parameter
+from sensors.effects.camera_effect import CameraEffect
 
 
-class CameraShift(Effect):
+class CameraShift(CameraEffect):
     """X_real = X_nominal + (x, y, z), world frame."""
 
     name: Literal["camera_shift"] = "camera_shift"
-    sensor = "stereo"
-    stage = Stage.CAMERA
-    camera: Side = "both"
     x_m: float = parameter(
         "real minus nominal perspective centre, world x", unit="m", source="photogrammetry", typical=0.01, ge=-10, le=10
     )

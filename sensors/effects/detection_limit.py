@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
+
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from scene.mesh import FloatArray
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
+from sensors.pulses import PulseGeometry, Pulses
 
 
 class DetectionLimit(Effect):
@@ -17,6 +20,8 @@ class DetectionLimit(Effect):
     name: Literal["detection_limit"] = "detection_limit"
     sensor = "tls"
     stage = Stage.RETURN
+    shows_in = ShowsIn.RETURNS
+    planned = True
     minimum_power: float = parameter(
         "smallest received power that is detected",
         unit="1, relative to albedo 1 at 100 m",
@@ -28,3 +33,6 @@ class DetectionLimit(Effect):
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         return replace(state, returned=state.returned & (state.power >= dr.opaque(mi.Float32, self.minimum_power)))
+
+    def kept(self, at: PulseGeometry) -> FloatArray:
+        return np.asarray(at.power >= self.minimum_power, dtype=np.float64)

@@ -10,7 +10,7 @@ from pydantic import Field
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from sensors.curve import Axis, Table, surface
-from sensors.effects.base import Effect, Stage
+from sensors.effects.base import Effect, ShowsIn, Stage
 from sensors.matches import Matches
 
 Covariate = Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"]
@@ -26,6 +26,9 @@ class DisparityEmpirical(Effect):
     name: Literal["disparity_empirical"] = "disparity_empirical"
     sensor = "stereo"
     stage = Stage.MATCH
+    shows_in = ShowsIn.MEAN
+    catalogue = False
+    empirical = True
     order = 25
     covariate: Covariate = Field("image_x", description="x")
     along: Axis = Field(Axis(), description="where the values stand on x")

@@ -7,15 +7,15 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.matches import Matches, bridged
+from sensors.effects.base import parameter
+from sensors.effects.raster_effect import RasterEffect
+from sensors.matches import bridged
 
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
 
 
-class EdgeFattening(Effect):
+class EdgeFattening(RasterEffect):
     """d(p) = max of d(q) over |q - p| <= r, q on the near side of a depth step: outlines grow by r, niches' rims shrink.
 
     A depth step is where neighbouring cells differ by more than one pixel of the image that is matched: semi-global matching's
@@ -24,14 +24,11 @@ class EdgeFattening(Effect):
     """
 
     name: Literal["edge_fattening"] = "edge_fattening"
-    sensor = "stereo"
-    stage = Stage.MATCH
     order = 10
     radius_px: float = parameter("reach beyond the outline", unit="px", source="Hirschmueller 2008", typical=8.0, ge=0, le=1000)
 
-    def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        radius = int(self.radius_px / state.reduction + 1e-9)
-        return state.with_raster(fattened(state.raster(), radius, float(state.reduction)))
+    def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
+        return fattened(disparity, int(self.radius_px / cell_px + 1e-9), jump_px)
 
 
 def fattened(disparity: FloatArray, radius: int, step_px: float) -> FloatArray:

@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import Literal
 
 from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair, Side
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.camera import CameraPair
+from sensors.effects.base import parameter
+from sensors.effects.camera_effect import CameraEffect
 
 
-class FocalLength(Effect):
+class FocalLength(CameraEffect):
     """f_real = f_nominal + delta: the lens warms or is refocused (46 mm at 100 m for 20 K, Glendale lens)."""
 
     name: Literal["focal_length"] = "focal_length"
-    sensor = "stereo"
-    stage = Stage.CAMERA
-    camera: Side = "both"
     delta_px: float = parameter(
         "real minus calibrated principal distance",
         unit="px",

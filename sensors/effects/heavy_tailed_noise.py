@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
+
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
+from scene.mesh import FloatArray
+from sensors.effects.base import parameter
+from sensors.effects.matching_noise import NodeNoise
 from sensors.matches import Matches
-from sensors.node_grid import smooth_field
+from sensors.node_grid import even_correlation, smooth_field
 
 
-class HeavyTailedNoise(Effect):
+class HeavyTailedNoise(NodeNoise):
     """dd = sigma a exp(t b - t^2), a and b independent smooth fields over the image of mean 0 and variance 1.
 
     A normal error whose size varies log-normally from place to place: standard deviation sigma, kurtosis 3 exp(4 t^2). Both
@@ -21,9 +25,8 @@ class HeavyTailedNoise(Effect):
     """
 
     name: Literal["heavy_tailed_noise"] = "heavy_tailed_noise"
-    sensor = "stereo"
-    stage = Stage.MATCH
     order = 35
+    catalogue = False
     sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.5, ge=0, le=1000)
     step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=12.0, gt=0)
     tail: float = parameter(
@@ -41,3 +44,12 @@ class HeavyTailedNoise(Effect):
         sigma, tail = (dr.opaque(mi.Float32, value) for value in (self.sigma_px, self.tail))
         noise = sigma * error * dr.exp(tail * size - dr.square(tail))
         return replace(state, disparity=state.disparity + mi.Float64(noise))
+
+    def semivariogram(self, lag: FloatArray) -> FloatArray:
+        """sigma^2 (1 - <r exp(t^2 (r - 1))>), r the correlation of the fields at two places, averaged over the places.
+
+        From E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b, b' of variance 1.
+        """
+        correlation = even_correlation(lag / self.step_px)
+        kept = correlation * np.exp(self.tail**2 * (correlation - 1))
+        return np.asarray(self.sigma_px**2 * (1 - kept.mean(axis=1)))

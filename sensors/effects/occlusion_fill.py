@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.matches import Matches, bridged
+from scene.mesh import FloatArray
+from sensors.effects.base import Stage, parameter
+from sensors.effects.raster_effect import RasterEffect
+from sensors.matches import bridged
 
 
-class OcclusionFill(Effect):
+class OcclusionFill(RasterEffect):
     """d = min(d_before, d_after): an unmatched strip of a row, at most `reach` wide, is taken for background.
 
     d_before and d_after are the disparities at the strip's two ends; the smaller is farther away (Hirschmueller 2008, 2.5.3).
@@ -17,9 +18,8 @@ class OcclusionFill(Effect):
     """
 
     name: Literal["occlusion_fill"] = "occlusion_fill"
-    sensor = "stereo"
     stage = Stage.FILL
     reach_px: float = parameter("widest strip that is filled", unit="px", source="Hirschmueller 2008", typical=80.0, ge=0, le=1e5)
 
-    def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        return state.with_raster(bridged(state.raster(), self.reach_px / state.reduction))
+    def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
+        return bridged(disparity, self.reach_px / cell_px)

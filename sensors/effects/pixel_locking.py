@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from scene.backend import dr
 from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
 from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
+from sensors.functions import DEVICE, HOST, Functions
 from sensors.matches import Matches
 
 
@@ -25,6 +27,7 @@ class PixelLocking(Effect):
     name: Literal["pixel_locking"] = "pixel_locking"
     sensor = "stereo"
     stage = Stage.MATCH
+    shows_in = ShowsIn.VALUES
     order = 60
     amplitude_px: float = parameter(
         "largest change of the disparity", unit="px", source="Shimizu & Okutomi 2005", typical=0.8, ge=-100, le=100
@@ -37,6 +40,12 @@ class PixelLocking(Effect):
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         amplitude, period, phase = opaque(self.amplitude_px, self.period_px or state.reduction, self.phase_rad)
-        matched = state.disparity / period
-        wave = dr.sin(2 * np.pi * (matched - dr.floor(matched)) + phase)
-        return replace(state, disparity=state.disparity + amplitude * wave)
+        return replace(state, disparity=state.disparity + amplitude * _wave(state.disparity / period, phase, DEVICE))
+
+    def mean(self, at: Any) -> FloatArray:
+        return np.asarray(self.amplitude_px * _wave(at.found / (self.period_px or 1.0), self.phase_rad, HOST))
+
+
+def _wave(pixels: Any, phase: Any, m: Functions) -> Any:
+    """(n,) sin(2 pi d / n + phase) of disparities in pixels d / n; without whole pixels, for precision."""
+    return m.sin(2 * math.pi * (pixels - m.floor(pixels)) + phase)

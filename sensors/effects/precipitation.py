@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
+
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from scene.mesh import WALL
+from scene.mesh import WALL, FloatArray
 from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
+from sensors.pulses import PulseGeometry, Pulses
 
 
 class Precipitation(Effect):
@@ -24,6 +26,7 @@ class Precipitation(Effect):
     name: Literal["precipitation"] = "precipitation"
     sensor = "tls"
     stage = Stage.RETURN
+    shows_in = ShowsIn.RETURNS
     rate_per_m: float = parameter("extinction coefficient beta", unit="1/m", source="rain, dust, snow", typical=1e-4, ge=0, le=10)
     early_share: float = parameter(
         "share of the lost returns that a drop gives back", unit="1", source="empirical", null=None, default=0.1, ge=0, le=1
@@ -44,3 +47,6 @@ class Precipitation(Effect):
             block=dr.select(early, WALL, state.block),
             returned=state.returned & (~lost | early),
         )
+
+    def kept(self, at: PulseGeometry) -> FloatArray:
+        return np.exp(-2 * self.rate_per_m * np.asarray(at.range_m, dtype=np.float64))

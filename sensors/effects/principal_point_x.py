@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import Literal
 
 from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair, Side
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.camera import CameraPair
+from sensors.effects.base import parameter
+from sensors.effects.camera_effect import CameraEffect
 
 
-class PrincipalPointX(Effect):
+class PrincipalPointX(CameraEffect):
     """cx_real = cx_nominal + delta."""
 
     name: Literal["principal_point_x"] = "principal_point_x"
-    sensor = "stereo"
-    stage = Stage.CAMERA
-    camera: Side = "both"
     delta_px: float = parameter(
         "real minus calibrated principal point",
         unit="px",

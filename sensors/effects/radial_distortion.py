@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair, Side
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.camera import CameraPair
+from sensors.effects.base import parameter
+from sensors.effects.camera_effect import CameraEffect
 
 
-class RadialDistortion(Effect):
+class RadialDistortion(CameraEffect):
     """k_real = k_nominal + k: a doming of the surface, on a rectified pair in the ratio 3 : 1 of u to v.
 
     dZ = -Z k1 [3 (u - b/2)^2 + v^2 + b^2/4] (James & Robson 2014), with u, v tangents of the
@@ -17,9 +18,7 @@ class RadialDistortion(Effect):
     """
 
     name: Literal["radial_distortion"] = "radial_distortion"
-    sensor = "stereo"
-    stage = Stage.CAMERA
-    camera: Side = "both"
+    sets = (("k1",), ("k1", "k2"), ("k1", "k2", "k3"))
     k1: float = parameter(
         "real minus calibrated k1", unit="1", source="Metashape user manual, appendix D", typical=5e-4, ge=-100, le=100
     )

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr
-from scene.keyed_random import KeyedRandom
-from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+import numpy as np
+
+from scene.mesh import FloatArray
+from sensors.effects.base import Search, parameter
+from sensors.effects.laser import RangeEffect
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry
 
 
-class RangeCyclic(Effect):
+class RangeCyclic(RangeEffect):
     """dR = A sin(2 pi R / period + phase): crosstalk in the phase measurement (Lichti 2007, A3 and A4)."""
 
     name: Literal["range_cyclic"] = "range_cyclic"
-    sensor = "tls"
-    stage = Stage.RANGE
+    searched = Search("period_m", along="range", shortest=0.3, longest=15.0)
     amplitude_m: float = parameter(
         "amplitude of the range error", unit="m", source="Lichti 2007, A3, A4", typical=0.001, ge=-10, le=10
     )
@@ -26,6 +27,8 @@ class RangeCyclic(Effect):
     )
     phase_rad: float = parameter("phase at range 0", unit="rad", source="Lichti 2007", null=None, default=0.0, ge=-100, le=100)
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        amplitude, wave, phase = opaque(self.amplitude_m, 2 * math.pi / self.period_m, self.phase_rad)
-        return state.with_range_error(amplitude * dr.sin(wave * state.true_range + phase))
+    def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        return p.amplitude_m * m.sin(2 * math.pi * at.range_m / p.period_m + p.phase_rad)
+
+    def argument(self, at: PulseGeometry) -> FloatArray:
+        return np.asarray(at.range_m, dtype=np.float64)

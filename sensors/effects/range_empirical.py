@@ -10,7 +10,7 @@ from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from sensors.curve import Axis, Table, surface
 from sensors.device import bounded
-from sensors.effects.base import Effect, Stage
+from sensors.effects.base import Effect, ShowsIn, Stage
 from sensors.pulses import Pulses
 
 Covariate = Literal["range", "azimuth", "zenith", "incidence", "intensity", "time"]
@@ -26,6 +26,9 @@ class RangeEmpirical(Effect):
     name: Literal["range_empirical"] = "range_empirical"
     sensor = "tls"
     stage = Stage.RANGE
+    shows_in = ShowsIn.MEAN
+    catalogue = False
+    empirical = True
     covariate: Covariate = Field("range", description="x")
     along: Axis = Field(Axis(), description="where the values stand on x")
     second: Covariate | None = Field(None, description="y, for a surface")

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import parameter
+from sensors.effects.laser import RangeEffect
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry, slant
 
 
-class RangeIncidenceBias(Effect):
+class RangeIncidenceBias(RangeEffect):
     """dR = k (1 / cos i - 1): the stretched echo of a slanting surface is timed late, or early (TLS against tracker)."""
 
     name: Literal["range_incidence_bias"] = "range_incidence_bias"
-    sensor = "tls"
-    stage = Stage.RANGE
     coefficient_m: float = parameter(
         "range error at 60 degrees of incidence", unit="m", source="TLS against laser tracker", typical=0.001, ge=-10, le=10
     )
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        slant = 1 / mi.Float64(state.cos_incidence) - 1
-        return state.with_range_error(dr.opaque(mi.Float64, self.coefficient_m) * slant)
+    def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        return p.coefficient_m * slant(at.cos_incidence, m)

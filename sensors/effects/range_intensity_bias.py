@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from scene.mesh import FloatArray
+from sensors.effects.base import parameter
+from sensors.effects.laser import RangeEffect
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry, Pulses
 
 
-class RangeIntensityBias(Effect):
+class RangeIntensityBias(RangeEffect):
     """dR = k ln(I / I_0), I the received power and I_0 the median of all pulses that return, or a given one.
 
     A weaker echo crosses a fixed threshold later, so that k is negative there. The median belongs to one scan: give I_0 where
@@ -21,8 +22,8 @@ class RangeIntensityBias(Effect):
     """
 
     name: Literal["range_intensity_bias"] = "range_intensity_bias"
-    sensor = "tls"
-    stage = Stage.RANGE
+    looks_at = "whole"
+    needs = ("power",)
     coefficient_m: float = parameter(
         "range error per e-fold of the received power", unit="m", source="pulse scanners, empirical", typical=0.005, ge=-10, le=10
     )
@@ -35,12 +36,18 @@ class RangeIntensityBias(Effect):
         le=1e12,
     )
 
+    def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        return p.coefficient_m * m.log(at.power / p.reference_power)
+
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        state = state if self.reference_power else state.evaluated()
-        coefficient, reference = opaque(self.coefficient_m, self.reference_power or _median(state))
-        return state.with_range_error(coefficient * dr.log(mi.Float64(state.power) / reference))
+        if self.reference_power:
+            return super().evaluate(state, random)
+        state = state.evaluated()
+        return self._about(np.array(state.power)[np.array(state.returned)]).evaluate(state, random)
 
+    def mean(self, at: PulseGeometry) -> FloatArray:
+        return super().mean(at) if self.reference_power else self._about(at.power).mean(at)
 
-def _median(pulses: Pulses) -> float:
-    powers = np.array(pulses.power)[np.array(pulses.returned)]
-    return float(np.median(powers)) if powers.size else 1.0
+    def _about(self, power: FloatArray) -> RangeIntensityBias:
+        """The same effect with the median of some powers as I_0."""
+        return self.model_copy(update={"reference_power": float(np.median(power)) if power.size else 1.0})

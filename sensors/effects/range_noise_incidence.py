@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import parameter
+from sensors.effects.laser import RangeSpread
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry, slant
 
 
-class RangeNoiseIncidence(Effect):
+class RangeNoiseIncidence(RangeSpread):
     """dR ~ N(0, s (1 / cos i - 1)) per pulse (Soudarissanane et al. 2011)."""
 
     name: Literal["range_noise_incidence"] = "range_noise_incidence"
-    sensor = "tls"
-    stage = Stage.RANGE
     sigma_m: float = parameter(
         "standard deviation at 60 degrees of incidence", unit="m", source="Soudarissanane et al. 2011", typical=0.002, ge=0, le=10
     )
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        sigma = dr.opaque(mi.Float64, self.sigma_m) * (1 / mi.Float64(state.cos_incidence) - 1)
-        return state.with_range_error(sigma * mi.Float64(state.normals(random).x))
+    def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        return p.sigma_m * slant(at.cos_incidence, m)

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import parameter
+from sensors.effects.laser import RangeSpread
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry
 
 
-class RangeNoiseIntensity(Effect):
+class RangeNoiseIntensity(RangeSpread):
     """dR ~ N(0, a I^exponent) per pulse, I the received power (Wujanz et al. 2017; Schmitz et al. 2019).
 
     The exponent is about -0.5 where photons are counted (shot noise), -1 where the receiver's noise dominates (thermal).
     """
 
     name: Literal["range_noise_intensity"] = "range_noise_intensity"
-    sensor = "tls"
-    stage = Stage.RANGE
+    needs = ("power",)
+    trials = ("exponent", (-0.5, -0.75, -1.0))
     a_m: float = parameter(
         "standard deviation at power 1 (albedo 1, squarely hit, 100 m)",
         unit="m",
@@ -32,7 +31,5 @@ class RangeNoiseIntensity(Effect):
         "exponent of the power", unit="1", source="Wujanz et al. 2017", null=None, default=-0.5, ge=-4, le=4
     )
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        amplitude, exponent = opaque(self.a_m, self.exponent)
-        sigma = amplitude * dr.power(mi.Float64(state.power), exponent)
-        return state.with_range_error(sigma * mi.Float64(state.normals(random).x))
+    def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        return p.a_m * at.power**p.exponent

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import parameter
+from sensors.effects.laser import RangeSpread
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry
 
 
-class RangeNoiseProportional(Effect):
+class RangeNoiseProportional(RangeSpread):
     """dR ~ N(0, ppm R 1e-6) per pulse, the second figure of a datasheet's "1 mm + 10 ppm"."""
 
     name: Literal["range_noise_proportional"] = "range_noise_proportional"
-    sensor = "tls"
-    stage = Stage.RANGE
     ppm: float = parameter("standard deviation per range", unit="ppm", source="datasheets", typical=20.0, ge=0, le=1e5)
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        sigma = dr.opaque(mi.Float64, self.ppm * 1e-6) * state.true_range
-        return state.with_range_error(sigma * mi.Float64(state.normals(random).x))
+    def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        return p.ppm * 1e-6 * at.range_m

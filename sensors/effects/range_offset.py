@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import parameter
+from sensors.effects.laser import RangeEffect
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry
 
 
-class RangeOffset(Effect):
+class RangeOffset(RangeEffect):
     """dR = offset: the rangefinder's zero point (Lichti 2007, A0; NIST x10)."""
 
     name: Literal["range_offset"] = "range_offset"
-    sensor = "tls"
-    stage = Stage.RANGE
     offset_m: float = parameter("recorded minus true range", unit="m", source="Lichti 2007, A0", typical=0.003, ge=-100, le=100)
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        return state.with_range_error(dr.opaque(mi.Float64, self.offset_m))
+    def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        return p.offset_m

@@ -5,21 +5,32 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
+
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from scene.mesh import FloatArray
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
+from sensors.pulses import PulseGeometry, Pulses
 
 
 class RangeQuantization(Effect):
-    """R to the nearest multiple of the step, after all other range effects: the counter reads what was timed, noise included."""
+    """R to the nearest multiple of the step, after all other range effects: the counter reads what was timed, noise included.
+
+    Where the range noise exceeds a third of the step, that adds the variance step^2 / 12 of a uniform error.
+    """
 
     name: Literal["range_quantization"] = "range_quantization"
     sensor = "tls"
     stage = Stage.RANGE
+    shows_in = ShowsIn.VALUES
+    planned = True
     order = 1
     step_m: float = parameter("step of the recorded range", unit="m", source="datasheets", typical=0.001, ge=0, le=100)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         step = dr.opaque(mi.Float64, self.step_m)
         return replace(state, range_m=step * dr.round(state.range_m / step))
+
+    def variance(self, at: PulseGeometry) -> FloatArray:
+        return np.full(len(at), self.step_m**2 / 12)

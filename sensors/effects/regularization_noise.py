@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
+
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
-from sensors.effects.base import Effect, Stage, parameter
+from scene.mesh import FloatArray
+from sensors.effects.base import parameter
+from sensors.effects.matching_noise import NodeNoise
 from sensors.matches import Matches
-from sensors.node_grid import smooth_field
+from sensors.node_grid import node_semivariogram, smooth_field
 
 
-class RegularizationNoise(Effect):
+class RegularizationNoise(NodeNoise):
     """Gaussian values on the nodes of a grid over the image, interpolated bilinearly (thesis 3.4).
 
     dd(u, v) = sum_ij w_ij(u, v) g_ij, g_ij ~ N(0, sigma), nodes at multiples of the step. Midway between nodes the variance is
@@ -20,12 +24,12 @@ class RegularizationNoise(Effect):
     """
 
     name: Literal["regularization_noise"] = "regularization_noise"
-    sensor = "stereo"
-    stage = Stage.MATCH
     order = 30
     sigma_px: float = parameter("standard deviation at the nodes", unit="px", source="empirical", typical=0.2, ge=0, le=1000)
-    step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=32.0, gt=0)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         field = smooth_field(state, self.step_px, random)
         return replace(state, disparity=state.disparity + mi.Float64(dr.opaque(mi.Float32, self.sigma_px) * field))
+
+    def semivariogram(self, lag: FloatArray) -> FloatArray:
+        return np.asarray(self.sigma_px**2 * node_semivariogram(lag / self.step_px))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from scene.backend import dr
 from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
 from sensors.camera import Side
-from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.effects.base import Effect, Search, ShowsIn, Stage, parameter
+from sensors.functions import DEVICE, HOST, Functions, OnDevice
 from sensors.matches import ImageRows
 
 
@@ -26,13 +27,26 @@ class RowJitter(Effect):
     name: Literal["row_jitter"] = "row_jitter"
     sensor = "stereo"
     stage = Stage.EXPOSE
+    shows_in = ShowsIn.MEAN
+    searched = Search("rows_per_cycle", along="image_y", shortest=20.0, cycles=0.7)
     camera: Side = "left"
     amplitude_px: float = parameter("largest displacement", unit="px", source="empirical", typical=0.5, ge=0, le=100)
     rows_per_cycle: float = parameter("rows per cycle", unit="px", source="empirical", null=None, default=1000.0, gt=0)
     phase_rad: float = parameter("phase at the frame's top", unit="rad", source="empirical", null=None, default=0.0)
 
+    def shift(self, row: Any, m: Functions, p: Any) -> Any:
+        """(n,) recorded minus ideal column, px, of pixels at `row` (px)."""
+        return p.amplitude_px * m.sin(2 * math.pi * row / p.rows_per_cycle + p.phase_rad)
+
     def evaluate(self, state: ImageRows, random: KeyedRandom) -> ImageRows:
         if self.camera not in (state.camera, "both"):
             return state
-        amplitude, frequency, phase = opaque(self.amplitude_px, 2 * np.pi / self.rows_per_cycle, self.phase_rad)
-        return replace(state, du=state.du + amplitude * dr.sin(frequency * state.v + phase))
+        return replace(state, du=state.du + self.shift(state.v, DEVICE, OnDevice(self)))
+
+    def mean(self, at: Any) -> FloatArray:
+        left = self.shift(at.v, HOST, self) if self.camera != "right" else 0.0
+        right = self.shift(at.v_right, HOST, self) if self.camera != "left" else 0.0
+        return np.asarray(left - right)
+
+    def argument(self, at: Any) -> FloatArray:
+        return np.asarray(at.v_right if self.camera == "right" else at.v)

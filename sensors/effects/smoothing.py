@@ -6,13 +6,12 @@ from typing import Literal
 
 import numpy as np
 
-from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.matches import Matches
+from sensors.effects.base import parameter
+from sensors.effects.raster_effect import RasterEffect
 
 
-class Smoothing(Effect):
+class Smoothing(RasterEffect):
     """d = (G * m d) / (G * m), G Gaussian with sigma px, m 1 where there is a match: the matcher's windows and smoothness terms.
 
     Unmatched cells neither count nor fill (normalised convolution, Knutsson & Westin 1993). Near them and at the frame's border
@@ -20,13 +19,16 @@ class Smoothing(Effect):
     """
 
     name: Literal["smoothing"] = "smoothing"
-    sensor = "stereo"
-    stage = Stage.MATCH
     order = 20
+    held_out_gain = 5.0  # a little low-pass also makes up for rays that are not quite where they are thought to be
     sigma_px: float = parameter("standard deviation of the low-pass", unit="px", source="empirical", typical=8.0, ge=0, le=500)
 
-    def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        return state.with_raster(smoothed(state.raster(), self.sigma_px / state.reduction))
+    @classmethod
+    def scored(cls) -> bool:
+        return True  # it moves disparities on every curved part of the surface, not at edges alone
+
+    def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
+        return smoothed(disparity, self.sigma_px / cell_px)
 
 
 def smoothed(disparity: FloatArray, sigma: float) -> FloatArray:

@@ -5,17 +5,16 @@ from __future__ import annotations
 from typing import Literal
 
 from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair, Side
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.camera import CameraPair
+from sensors.effects.base import parameter
+from sensors.effects.camera_effect import CameraEffect
 
 
-class TangentialDistortion(Effect):
+class TangentialDistortion(CameraEffect):
     """p_real = p_nominal + p, in Metashape's order (OpenCV's p1 and p2 change places)."""
 
     name: Literal["tangential_distortion"] = "tangential_distortion"
-    sensor = "stereo"
-    stage = Stage.CAMERA
-    camera: Side = "both"
+    sets = (("p1",), ("p2",), ("p1", "p2"))
     p1: float = parameter(
         "real minus calibrated p1, Metashape's order",
         unit="1",

@@ -12,7 +12,7 @@ from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.upload import on_device
-from sensors.effects.base import Effect, Stage, parameter
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
 from sensors.matches import Matches
 
 WINDOW = 5
@@ -36,6 +36,9 @@ class TextureNoise(Effect):
     name: Literal["texture_noise"] = "texture_noise"
     sensor = "stereo"
     stage = Stage.MATCH
+    shows_in = ShowsIn.SPREAD
+    looks_at = "neighbours"
+    needs = ("image",)
     order = 50
     coefficient: float = parameter("k", unit="1", source="Cramer-Rao bound", typical=2.0, ge=0, le=1e6)
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr
-from scene.keyed_random import KeyedRandom
-from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import parameter
+from sensors.effects.laser import AimEffect
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry
 
 
-class TiltDrift(Effect):
+class TiltDrift(AimEffect):
     """Recorded directions are the true ones turned about the scanner's x and y axes by angles that grow from 0 to the rates.
 
     With w = s (rate_x, rate_y, 0), s the share of the scan's duration that has passed, and right-handed rotations:
@@ -20,8 +19,7 @@ class TiltDrift(Effect):
     """
 
     name: Literal["tilt_drift"] = "tilt_drift"
-    sensor = "tls"
-    stage = Stage.AIM
+    needs = ("share",)
     rate_x_rad: float = parameter(
         "turn about the scanner's x axis over the scan",
         unit="rad per scan",
@@ -39,11 +37,8 @@ class TiltDrift(Effect):
         le=0.1,
     )
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        turn_x, turn_y = (rate * state.share for rate in opaque(self.rate_x_rad, self.rate_y_rad))
-        sin_azimuth, cos_azimuth = dr.sincos(state.azimuth)
-        sin_zenith, cos_zenith = dr.sincos(state.zenith)
-        return state.with_angle_error(
-            azimuth=-cos_zenith / sin_zenith * (turn_x * cos_azimuth + turn_y * sin_azimuth),
-            zenith=turn_y * cos_azimuth - turn_x * sin_azimuth,
-        )
+    def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        turn_x, turn_y = p.rate_x_rad * at.share, p.rate_y_rad * at.share
+        sin_azimuth, cos_azimuth = m.sin(at.azimuth), m.cos(at.azimuth)
+        azimuth = -m.cos(at.zenith) / m.sin(at.zenith) * (turn_x * cos_azimuth + turn_y * sin_azimuth)
+        return azimuth, turn_y * cos_azimuth - turn_x * sin_azimuth

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr
-from scene.keyed_random import KeyedRandom
-from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+from sensors.effects.base import parameter
+from sensors.effects.laser import AimEffect
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry
 
 
-class VerticalEccentricity(Effect):
+class VerticalEccentricity(AimEffect):
     """dz = a sin(z + phase), once per turn (Lichti 2007, C2)."""
 
     name: Literal["vertical_eccentricity"] = "vertical_eccentricity"
-    sensor = "tls"
-    stage = Stage.AIM
     amplitude_rad: float = parameter(
         "amplitude of the zenith error", unit="rad", source="Lichti 2007, C2", typical=1e-4, ge=-0.1, le=0.1
     )
@@ -24,6 +21,5 @@ class VerticalEccentricity(Effect):
         "phase at zenith 0", unit="rad", source="Lichti 2007, C2", null=None, default=0.0, ge=-100, le=100
     )
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        amplitude, phase = opaque(self.amplitude_rad, self.phase_rad)
-        return state.with_angle_error(zenith=amplitude * dr.sin(state.zenith + phase))
+    def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        return 0.0, p.amplitude_rad * m.sin(at.zenith + p.phase_rad)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.device import opaque
-from sensors.effects.base import Effect, Stage, parameter
-from sensors.pulses import Pulses
+import numpy as np
+
+from scene.mesh import FloatArray
+from sensors.effects.base import Search, parameter
+from sensors.effects.laser import AimEffect
+from sensors.functions import Functions
+from sensors.pulses import PulseGeometry
 
 
-class Wobble(Effect):
+class Wobble(AimEffect):
     """dz = a sin(2 pi line / n + phase), line the scan line's number from the scan's first, one step in azimuth each."""
 
     name: Literal["wobble"] = "wobble"
-    sensor = "tls"
-    stage = Stage.AIM
+    needs = ("line",)
+    searched = Search("lines_per_cycle", along="line", shortest=4.0, cycles=2.0)
     amplitude_rad: float = parameter(
         "amplitude of the zenith error", unit="rad", source="empirical", typical=5e-5, ge=-0.1, le=0.1
     )
@@ -28,6 +30,8 @@ class Wobble(Effect):
         "phase at the first line", unit="rad", source="empirical", null=None, default=0.0, ge=-100, le=100
     )
 
-    def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        amplitude, wave, phase = opaque(self.amplitude_rad, 2 * math.pi / self.lines_per_cycle, self.phase_rad)
-        return state.with_angle_error(zenith=amplitude * dr.sin(wave * mi.Float64(state.line) + phase))
+    def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        return 0.0, p.amplitude_rad * m.sin(2 * math.pi * at.line / p.lines_per_cycle + p.phase_rad)
+
+    def argument(self, at: PulseGeometry) -> FloatArray:
+        return np.asarray(at.line, dtype=np.float64)

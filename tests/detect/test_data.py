@@ -161,7 +161,7 @@ def test_inputs_that_are_none_are_refused(tmp_path):
     (tmp_path / "annotations.json").write_text("[1, 2]")
     with pytest.raises(InputError, match="no COCO annotation file"):
         find_inputs([tmp_path])
-    (tmp_path / "annotations.json").write_text(json.dumps({"images": [], "annotations": []}))
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": [], "annotations": [], "categories": []}))
     with pytest.raises(InputError, match="names no image"):
         find_inputs([tmp_path])
     (tmp_path / "a.tif").write_bytes(b"II*\0garbage")
@@ -172,7 +172,7 @@ def test_inputs_that_are_none_are_refused(tmp_path):
 def test_a_tiff_of_another_size_than_annotated_is_refused(tmp_path):
     make_set(tmp_path, 1, 9)
     content = json.loads((tmp_path / "annotations.json").read_text())
-    content["images"][0]["width"] = 99
+    content["images"][0]["width"], content["annotations"] = 99, []
     (tmp_path / "annotations.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="128 x 99 px as annotated"):
         CocoFolder(tmp_path).labelled(0)

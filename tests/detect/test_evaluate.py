@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from pipeline.annotate import run_length_encoding
+from pipeline.change.annotate import run_length_encoding
 from pipeline.detect.evaluate import coco_metrics, evaluate, matches
 from pipeline.detect.score_files import as_text, assess, write
 from scene.errors import InputError
@@ -81,7 +81,7 @@ def test_files_by_name_and_tables(truth, found, tmp_path):
     assessment = assess(tmp_path, tmp_path / "found.json", ["noise"])
     assert [score.group for score in assessment.scores[::6]] == ["all", "noise high", "noise low"]
     assert assessment.scores[0].true_positives == 2
-    assert "57.1%" in as_text(assessment)
+    assert "57.1 %" in as_text(assessment)
     write(assessment, tmp_path / "scores")
     assert len((tmp_path / "scores" / "scores.csv").read_text().splitlines()) == 1 + 18
 
@@ -91,7 +91,7 @@ def test_files_by_name_and_tables(truth, found, tmp_path):
     [
         ('{"a": 1}', "no list of COCO detections"),
         ('[{"image_id": 1, "area": 3}]', "without a score"),
-        ('[{"image_id": 9, "score": 0.3}]', "does not have"),
+        ('[{"image_id": 9, "category_id": 1, "score": 0.3}]', "does not have"),
         ("nothing", "not JSON"),
     ],
 )

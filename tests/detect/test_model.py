@@ -11,7 +11,7 @@ import pytest
 import tensorflow as tf
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.annotate import run_length_encoding
+from pipeline.change.annotate import run_length_encoding
 from pipeline.detect import weights
 from pipeline.detect.backbone import feature_pyramid
 from pipeline.detect.config import DetectorConfig, HeadConfig, TrainConfig, TrainingConfig, load_train_config
@@ -167,7 +167,7 @@ class _KilledAfter:
     """A progress that interrupts in the middle of an epoch, as Ctrl-C does."""
 
     def __new__(cls, epochs: int):
-        from pipeline.progress import Progress
+        from pipeline.report.progress import Progress
 
         class Killer(Progress):
             def advance(self, fraction: float) -> None:
@@ -206,7 +206,7 @@ def test_levels_have_the_pixels_per_cell_that_the_config_says(name, finest):
 
 
 def test_the_shipped_configs_load():
-    from pipeline.bundled import configs_folder
+    from pipeline.config.bundled import configs_folder
 
     for path in sorted((configs_folder() / "detectors").glob("*.yaml")):
         assert load_train_config(path).detector.backbone == path.stem

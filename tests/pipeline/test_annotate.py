@@ -9,7 +9,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from scipy import ndimage
 
-from pipeline.annotate import AnnotationConfig, LabelledImage, block_annotations, coco, run_length_encoding
+from pipeline.change.annotate import AnnotationConfig, LabelledImage, block_annotations, coco, run_length_encoding
 from scene.grid import Grid
 
 GRID = Grid(1.0, 9.0, 0.1, 90, 60)

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from scipy import stats
 
-from pipeline.bundled import bundled_config
-from pipeline.config import SimulationConfig, load_config
-from pipeline.difference import raster_grid
-from pipeline.look import look, reconstruct
-from pipeline.noise.calibrate import calibrate_material
-from pipeline.noise.greedy import greedy
-from pipeline.noise.inputs import Material
-from pipeline.noise.maps import noise_map
-from pipeline.noise.parameters import Parameters, parameters
-from pipeline.noise.reobserve import Reobserver
-from pipeline.noise.search import Search
-from pipeline.noise.settings import CalibrationConfig
-from pipeline.noise.signature import Signature
-from pipeline.noise.windows import choose_windows, unchanged
-from pipeline.progress import Progress
-from pipeline.site import Site, prepare_site
+from pipeline.calibrate.calibrate import calibrate_material
+from pipeline.calibrate.greedy import greedy
+from pipeline.calibrate.inputs import Material
+from pipeline.calibrate.maps import noise_map
+from pipeline.calibrate.parameters import Parameters, parameters
+from pipeline.calibrate.reobserve import Reobserver
+from pipeline.calibrate.search import Search
+from pipeline.calibrate.signature import Signature
+from pipeline.calibrate.windows import Windows, choose_windows, unchanged
+from pipeline.change.difference import raster_grid
+from pipeline.cli.main import main
+from pipeline.config.bundled import bundled_config
+from pipeline.config.calibration import CalibrationConfig
+from pipeline.config.simulation import SimulationConfig, load_config
+from pipeline.formats.geotiff import write_geotiff
+from pipeline.report.progress import Progress
+from pipeline.run.acquisition import look, reconstruct
+from pipeline.run.site import Site, prepare_site
 from scene.config import parse
 from scene.errors import InputError
 from scene.grid import Grid
@@ -86,6 +92,33 @@ def test_windows_lie_on_stable_ground_apart_from_one_another_and_reach_both_ends
     assert windows.corner[:, 1].max() > 250
 
 
+def noisy_map(path: Path, values: FloatArray | None = None, grid: Grid = GRID) -> str:
+    write_geotiff(path, KeyedRandom(1).generator().normal(0, 0.005, grid.shape) if values is None else values, grid)
+    return str(path)
+
+
+def test_maps_that_are_no_measurement_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing but zeros, one map as two epochs, and pixels without a size."""
+    once, zero, flat = (tmp_path / f"{name}.tif" for name in ("once", "zero", "flat"))
+    noisy_map(once)
+    noisy_map(zero, np.zeros(GRID.shape))
+    tagged = tifffile.TiffWriter(flat)
+    tags = [(33550, 12, 3, (0.0, 0.0, 0.0), False), (33922, 12, 6, (0.0, 0.0, 0.0, 0.0, 4.0, 0.0), False)]
+    tagged.write(np.ones(GRID.shape, np.float32), extratags=tags)
+    tagged.close()
+    out = tmp_path / "out"
+    for words, message in (
+        ([zero], "zero: shows the same difference, 0 m, everywhere"),
+        ([once, once], "is the same map as once"),
+        ([flat], "a pixel of 0 m"),
+    ):
+        assert main(["calibrate", *map(str, words), "--sensor", "tls", "--out", str(out), "--quiet"]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert len(said.splitlines()) == 1
+        assert not out.exists()
+
+
 def test_no_stable_window_is_an_input_error() -> None:
     with pytest.raises(InputError, match="no window"):
         choose_windows(np.zeros(GRID.shape, dtype=bool), GRID, CalibrationConfig())
@@ -144,6 +177,20 @@ def test_maps_in_windows_have_the_statistics_of_the_whole_simulation(sensor: str
     np.testing.assert_allclose((signature.of(fast) - signature.of(slow))[local], 0, atol=0.04)
 
 
+@pytest.mark.parametrize("count", [1, 5])
+def test_few_windows_have_no_modes_of_deformation(count: int) -> None:
+    """Fewer than twice the plane's terms: what is left is the RMS of the windows' medians, here 1, 2 ... mm in turn."""
+    corner = np.array([[0, 32 * number] for number in range(count)], dtype=np.int32)
+    windows = Windows(Grid(0.0, 1.0, 0.02, 200, 50), corner, 24, np.ones((count, 24, 24), dtype=bool))
+    bumps = KeyedRandom(1).generator().normal(0, 0.05, (count, 24, 24))
+    signature = Signature(windows, bumps, np.array([0.0, 0.0, 1.0]))
+    level = 1e-3 * np.arange(1, count + 1)
+    values = np.broadcast_to(level[None, :, None, None], (2, count, 24, 24)) + 0.0
+    found = dict(zip(signature.names, np.exp(signature.of(values)), strict=True))
+    assert [name for name in found if name.startswith("deformation")] == ["deformation.rest"]
+    assert found["deformation.rest"] == pytest.approx(np.sqrt(np.mean(level**2)), rel=0.01)
+
+
 class Known:
     """A simulation in closed form: statistics of n values each are logs of sqrt(sum_j a_ij theta_j^2) plus their own scatter."""
 
@@ -199,6 +246,39 @@ def test_a_search_that_went_astray_starts_anew(monkeypatch: pytest.MonkeyPatch) 
     assert np.abs((found.x - truth) / sigma).max() < 5
     assert np.abs((found.history[3][1] - truth) / sigma).max() > 10
     assert len(found.history) > 5
+
+
+class Recorded(Progress):
+    """Notes the share that is done whenever a stage begins, advances or ends."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shares: list[float] = []
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Recorded]:
+        with super().stage(name):
+            self.shares.append(self.share)
+            yield self
+        self.shares.append(self.share)
+
+    def advance(self, fraction: float) -> None:
+        super().advance(fraction)
+        self.shares.append(self.share)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.5])
+def test_progress_of_the_search_goes_from_nothing_to_all(size: float) -> None:
+    """Also where the misfit (of size 0.5 in one statistic) makes it search a second time."""
+    known, progress = Known(), Recorded()
+    search = known.search(3)
+    search.progress = progress
+    search.run(known(np.array([1.0, 1.0]), 2, KeyedRandom(1)) + np.array([0, 0, 0, 0, size]), 60, 0.95)
+    shares = np.array(progress.shares)
+    assert shares[0] < 0.01
+    assert shares[-1] == pytest.approx(1.0)
+    assert (np.diff(shares) >= 0).all()
+    assert len(np.unique(shares.round(2))) > 50
 
 
 def test_parameters_that_act_alike_are_correlated() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.config import CamerasFile
+from pipeline.config.simulation import CamerasFile
 from pipeline.formats.camera_files import read_lens, read_oriented
 from pipeline.formats.cameras import read_cameras_yaml, write_cameras_yaml
 from pipeline.formats.colmap import read_colmap, read_map, write_colmap, write_map

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -18,17 +19,17 @@ import pytest
 
 from pipeline.cli import main as cli
 from pipeline.cli.answer import as_json
+from pipeline.cli.json_schema import json_schema
 from pipeline.cli.simulate import new_folder
-from pipeline.config import load_config
+from pipeline.config.presets import read_preset
+from pipeline.config.simulation import load_config
 from pipeline.dataset.config import load_dataset_config
-from pipeline.presets import read_preset
-from pipeline.schema import json_schema
 from scene.config import load_yaml
 from scene.errors import InputError
 
 
 class Pipeline:
-    """Stands in for pipeline.config and pipeline.run: keeps what it was called with, raises what it is told to."""
+    """Stands in for pipeline.config.simulation and pipeline.run.simulation: keeps its arguments, raises what it is told to."""
 
     def __init__(self) -> None:
         self.loaded: tuple[Any, ...] = ()
@@ -54,10 +55,10 @@ class Pipeline:
 def pipeline(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Pipeline:
     fake = Pipeline()
     for name, function in (("config", fake.load_config), ("run", fake.simulate)):
-        module = ModuleType(f"pipeline.{name}")
+        module = ModuleType(f"pipeline.{name}.simulation")
         setattr(module, function.__name__, function)
-        monkeypatch.setitem(sys.modules, f"pipeline.{name}", module)
-        monkeypatch.setattr("pipeline." + name, module, raising=False)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        monkeypatch.setattr(import_module(f"pipeline.{name}"), "simulation", module, raising=False)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my.yaml").touch()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

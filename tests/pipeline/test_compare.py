@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,13 @@ import pytest
 import yaml
 
 from pipeline.cli.main import main
+from pipeline.compare.assess import assess
+from pipeline.compare.comparison import compare_sensors
+from pipeline.compare.covariates import edge_distance
+from pipeline.compare.sensors_compared import contestants
+from pipeline.compare.trial import Trial, compare, rockfalls
 from pipeline.formats.geotiff import write_geotiff
-from pipeline.noise.assess import assess
-from pipeline.noise.compare import Trial, compare, rockfalls
-from pipeline.noise.comparison import compare_sensors
-from pipeline.noise.contestants import contestants
-from pipeline.noise.covariates import edge_distance
+from pipeline.report.progress import Progress
 from scene.blocks import RockfallConfig
 from scene.errors import InputError
 from scene.grid import Grid
@@ -54,14 +57,17 @@ def trial(site: Path) -> Trial:
 
 
 def test_who_is_compared(site: Path) -> None:
-    found = contestants([str(site), "riegl_vz400i", "glendale_high", str(site)])
+    again = site.parent / "again" / site.name
+    again.parent.mkdir()
+    again.write_text(site.read_text())
+    found = contestants([str(site), "riegl_vz400i", "glendale_high", str(again)])
     assert [(each.name, each.sensor) for each in found] == [
         ("site_stereo", "stereo"),
         ("site_tls", "tls"),
         ("riegl_vz400i", "tls"),
         ("glendale_high", "stereo"),
-        ("site_stereo_stereo", "stereo"),
-        ("site_tls_tls", "tls"),
+        ("site_stereo_2", "stereo"),
+        ("site_tls_2", "tls"),
     ]
     first = found[0].config
     assert all(each.config.wall == first.wall and each.config.seed == 3 for each in found)
@@ -80,6 +86,75 @@ def test_a_site_beside_another_gets_the_first_ones_wall(site: Path) -> None:
 def test_an_unknown_name_is_told_with_the_nearest() -> None:
     with pytest.raises(InputError, match="riegl_vz400i"):
         contestants(["riegl_vz40i"])
+
+
+def test_presets_scan_with_the_configs_step_unless_asked(site: Path) -> None:
+    """The config's is 2 mrad in both; the preset names none, so that its own is the default of 0.5 mrad."""
+    shared, own = (contestants([str(site), "riegl_vz400i"], own_step=own_step) for own_step in (False, True))
+    assert [each.angular_step_rad for each in shared] == [None, (0.002, 0.002), (0.002, 0.002)]
+    assert own[2].angular_step_rad == (0.0005, 0.0005)
+    assert shared[2].config.scanner.pulse_rate_hz == own[2].config.scanner.pulse_rate_hz
+
+
+@pytest.mark.parametrize("again", ["site.yaml", "./site.yaml", "{folder}/site.yaml"])
+def test_the_same_file_twice_is_refused(site: Path, monkeypatch: pytest.MonkeyPatch, again: str) -> None:
+    monkeypatch.chdir(site.parent)
+    with pytest.raises(InputError, match="given twice"):
+        contestants(["site.yaml", "riegl_vz400i", again.format(folder=site.parent)])
+    with pytest.raises(InputError, match="given twice"):
+        contestants(["riegl_vz400i", "riegl_vz400i"])
+
+
+@pytest.mark.parametrize("epochs", ["0", "1000", "1000000000", "9" * 5000, "1e9", "-1"])
+def test_too_many_epochs_are_refused_before_anything_is_done(
+    site: Path, tmp_path: Path, epochs: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compare", str(site), "--epochs", epochs, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "a whole number from 1 to 999" in said
+    assert len(said) < 300
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_epoch_of_small_blocks_and_a_name_with_dollars(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Blocks of 5 cm, of which the scanner sees less than half: a figure without data. And no formula in $x^$."""
+    named, out = tmp_path / "a $x^$ \\frac.yaml", tmp_path / "out"
+    named.write_text(yaml.safe_dump(SMALL | {"sensor": [SMALL["sensor"][1]]}))
+    words = ["compare", str(named), "--epochs", "1", "--out", str(out), "--quiet"]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "a $x^$ \\frac: angular step 2 by 2 mrad" in printed
+    assert "blocks" in printed
+    record = json.loads((out / "comparison.json").read_text())
+    assert record["sensors"][0]["angular_step_rad"] == [0.002, 0.002]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [named.name, "out"]
+
+
+class Recorded(Progress):
+    """Notes the share that is done whenever a stage begins or ends."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shares: list[float] = []
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Recorded]:
+        with super().stage(name):
+            self.shares.append(self.share)
+            yield self
+        self.shares.append(self.share)
+
+
+def test_the_progress_ends_with_the_figures(site: Path) -> None:
+    progress = Recorded()
+    compare_sensors(contestants([str(site)])[1:], (), 2, (0.1, 0.4), progress)
+    assert progress.shares[0] < 0.01
+    assert progress.shares == sorted(progress.shares)
+    assert progress.shares[-1] == pytest.approx(1.0)
+    assert len(set(progress.shares)) > 6
+    assert progress.shares[-2] < 0.9
 
 
 def test_sizes_grow_and_leave_room() -> None:

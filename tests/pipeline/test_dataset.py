@@ -5,11 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,60 +15,21 @@ import numpy as np
 import pytest
 import rasterio
 from pycocotools.coco import COCO
+from tiny_dataset import EPOCHS, ROOT, TINY, digests, tiny, tiny_set
 
-from pipeline.bundled import bundled_config
+from pipeline.change.tiles import TileConfig
+from pipeline.config.bundled import bundled_config
 from pipeline.dataset.combine import merge_datasets, split_dataset
-from pipeline.dataset.config import DatasetConfig, load_dataset_config
+from pipeline.dataset.config import load_dataset_config
 from pipeline.dataset.epoch import Stages, make_epoch
-from pipeline.dataset.folder import LOCK, locked
 from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.plan import planned_epochs, region, simulation_of
-from pipeline.dataset.run import Workers, make_dataset, verify_dataset
+from pipeline.dataset.records import write_dataset_file
+from pipeline.dataset.run import make_dataset, verify_dataset
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.progress import Progress
-from pipeline.tiles import TileConfig
-from scene.config import parse
+from pipeline.report.progress import Progress
 from scene.errors import InputError
 from scene.grid import Grid
-
-ROOT = Path(__file__).parents[2]
-TINY: dict[str, Any] = {
-    "name": "tiny",
-    "seed": 3,
-    "sensors": ["stereo", "tls"],
-    "walls": {
-        "ledge": {
-            "wall": {"style": "glendale", "width_m": 9.0, "height_m": 5.0, "resolution_m": 0.1, "seed": 1},
-            "cameras": {"distance_m": 20.0, "base_m": 5.0},
-            "depth_map": "low",
-            "station": {"distance_m": 20.0},
-            "scanner": {"azimuth_step_rad": 0.004, "zenith_step_rad": 0.004},
-            "difference": {"gsd_m": 0.05},
-            "icp": {"max_iteration": 5},
-        }
-    },
-    "noise": {
-        "low": {
-            "stereo": {"model": {"sensor": "stereo", "noise": {"parallax_sigma_px": 0.2}}},
-            "tls": {"model": {"sensor": "tls"}, "scale": {"ledge": 2.0}},
-        }
-    },
-    "sizes": {"large": {"blocks_per_m2": 0.35, "rockfall": {"size_m": {"kind": "uniform", "low": 0.4, "high": 0.6}}}},
-    "tiles": {"size_px": 48, "minimum_valid_share": 0.3},
-    "parts": [{"walls": ["ledge"], "noise": ["low"], "sizes": ["large"], "train": 2, "val": 1, "test": 1}],
-    "truth": True,
-}
-EPOCHS = 8
-
-
-def tiny(**changes: Any) -> DatasetConfig:
-    return parse(DatasetConfig, {**TINY, **changes}, "test")
-
-
-def digests(folder: Path) -> dict[str, str]:
-    """Checksums of all that a set consists of; hidden files are the job's own."""
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith("."))
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def entries(folder: Path, split: str, kind: str) -> list[dict[str, Any]]:
@@ -80,9 +38,7 @@ def entries(folder: Path, split: str, kind: str) -> list[dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("dataset") / "set"
-    make_dataset(tiny(), out, command="scarpsim dataset tiny.yaml --out DIR")
-    return out
+    return tiny_set(tmp_path_factory.mktemp("dataset") / "set")
 
 
 def test_every_split_loads_in_pycocotools_with_ids_of_its_own(made: Path) -> None:
@@ -315,13 +271,6 @@ for sample, again in zip(tiles, dataset.as_numpy_iterator(), strict=True):
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT, env={**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"})
 
 
-def test_two_jobs_on_one_folder_refuse_each_other(tmp_path: Path) -> None:
-    with locked(tmp_path / "set"), pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for it"):
-        make_dataset(tiny(), tmp_path / "set")
-    with locked(tmp_path / "set"):
-        assert (tmp_path / "set" / LOCK).exists()
-
-
 def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="exists and is not empty"):
@@ -332,10 +281,9 @@ def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not a data set"):
         verify_dataset(tmp_path)
     source = next(iter(known["sources"].values()))
-    changed = {**known, "sources": {known["fingerprint"]: {**source, "versions": {**source["versions"], "numpy": "0.1"}}}}
+    changed = {known["fingerprint"]: {**source, "versions": {**source["versions"], "numpy": "0.1"}}}
     copy = tmp_path / "copy"
-    copy.mkdir()
-    (copy / "dataset.json").write_text(json.dumps(changed))
+    write_dataset_file(copy, known["name"], changed, known["epochs"])
     with pytest.raises(InputError, match=r"begun with numpy 0.1 \(here"):
         make_dataset(tiny(), copy)
 
@@ -414,162 +362,3 @@ def test_blocks_that_do_not_fit_name_the_epoch(tmp_path: Path) -> None:
     sizes = {"large": {"blocks_per_m2": 0.1, "rockfall": {"size_m": 20.0}}}
     with pytest.raises(InputError, match=r"ledge_tls_low_large_train0001: size_m: .* are larger than the wall"):
         make_dataset(tiny(sizes=sizes, sensors=["tls"]), tmp_path / "set")
-
-
-# Interruptions: the job is a process of its own, as the command starts it.
-
-PROGRAM = """
-import json, sys
-from pipeline.dataset.config import DatasetConfig
-from pipeline.dataset.run import Workers, make_dataset
-if __name__ == "__main__":
-    config = DatasetConfig.model_validate(json.loads(sys.argv[1]))
-    command = "scarpsim dataset tiny.yaml --out DIR"
-    print(len(make_dataset(config, __import__("pathlib").Path(sys.argv[2]), Workers(int(sys.argv[3])), command=command).made))
-"""
-
-
-def job(folder: Path, out: Path, workers: int = 0) -> subprocess.Popen[str]:
-    program = folder / "job.py"
-    program.write_text(PROGRAM)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        [sys.executable, str(program), json.dumps(TINY), str(out), str(workers)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
-def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 300.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, "the job ended before the condition was met"
-        assert time.monotonic() < end
-        time.sleep(0.002)
-
-
-def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(made: Path, tmp_path: Path) -> None:
-    """kill -9 in the middle of writing an epoch's tiles, before its shard; then of a job whose workers outlive it for a while."""
-    out = tmp_path / "set"
-    for moment, workers in (
-        (lambda: any((out / ".staging").glob("*/*/*.tif")), 0),
-        (lambda: len(list((out / "shards").glob("*.json"))) >= 2, 2),
-    ):
-        process = job(tmp_path, out, workers)
-        wait_for(moment, process)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        assert not (out / "train/annotations.json").exists()
-    process = job(tmp_path, out)
-    assert 0 < int(process.communicate(timeout=300)[0]) < EPOCHS
-    assert digests(out) == digests(made)
-    assert not list(out.rglob(".*.part*"))
-    assert not (out / ".staging").exists()
-
-
-def test_a_killed_worker_costs_nothing(made: Path, tmp_path: Path) -> None:
-    """Dask starts another one and gives it the run of two epochs; which worker makes an epoch, and when, leaves no trace."""
-    pytest.importorskip("distributed")
-    import psutil
-
-    out = tmp_path / "set"
-    process = job(tmp_path, out, workers=2)
-    wait_for(lambda: any((out / "shards").glob("*.json")), process)
-    workers = [
-        child for child in psutil.Process(process.pid).children(recursive=True) if "spawn_main" in " ".join(child.cmdline())
-    ]
-    workers[0].kill()
-    assert int(process.communicate(timeout=300)[0]) == EPOCHS
-    assert process.returncode == 0
-    assert digests(out) == digests(made)
-
-
-@pytest.mark.parametrize(
-    ("name", "workers"), [("small", 1), ("small", 2), ("rockfall_9", 2), ("rockfall_9", 16), ("rockfall_9", 256)]
-)
-def test_epochs_that_share_a_stage_go_to_one_worker(name: str, workers: int) -> None:
-    """Every epoch once; no run has two stages; whole stages where they are short; enough runs for all workers."""
-    from pipeline.dataset.cluster import runs
-    from pipeline.dataset.worker import Order
-
-    plan = planned_epochs(load_dataset_config(bundled_config("datasets", name)))
-    found = runs([Order("folder", "job", "source", epoch.index, epoch.stage) for epoch in plan], workers)
-    assert [order.index for run in found for order in run] == list(range(len(plan)))
-    assert all(len({order.stage for order in run}) == 1 for run in found)
-    assert max(len(run) for run in found) <= 8
-    stages = len({epoch.stage for epoch in plan})
-    if name == "small":
-        assert len(found) == stages
-    else:
-        assert len(found) >= max(2 * workers - stages, stages)
-
-
-def test_a_scheduler_of_the_users(made: Path, tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
-    out = tmp_path / "set"
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
-    ) as cluster:
-        make_dataset(tiny(), out, Workers(scheduler=cluster.scheduler_address), command="scarpsim dataset tiny.yaml --out DIR")
-    assert digests(out) == digests(made)
-
-
-def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cluster = pytest.importorskip("pipeline.dataset.cluster")
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
-    with pytest.raises(InputError, match=r"no scheduler answers at 'tcp://127\.0\.0\.1:9'"):
-        make_dataset(tiny(), tmp_path / "set", Workers(scheduler="tcp://127.0.0.1:9"))
-
-
-def test_a_worker_that_does_not_end_in_time_spoils_nothing(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As Dask's nanny on a busy machine: the set is finished, and so is the command."""
-    distributed = pytest.importorskip("distributed")
-
-    class Slow(distributed.LocalCluster):  # type: ignore[misc, name-defined]
-        def close(self, timeout: float | None = None) -> None:
-            super().close(timeout)
-            raise TimeoutError
-
-    monkeypatch.setattr(distributed, "LocalCluster", Slow)
-    make_dataset(tiny(), tmp_path / "set", Workers(1), command="scarpsim dataset tiny.yaml --out DIR")
-    assert digests(tmp_path / "set") == digests(made)
-
-
-def test_a_full_disk_stops_the_job_and_the_next_goes_on(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline.dataset import worker
-
-    out, writes = tmp_path / "set", iter(range(1000))
-    write = worker.write_geotiff
-
-    def full(path: Path, *arguments: Any, **options: Any) -> None:
-        if next(writes) == 9:
-            raise InputError("the disk is full, 0 MB are free", where=str(path), remedy="make room")
-        write(path, *arguments, **options)
-
-    monkeypatch.setattr(worker, "write_geotiff", full)
-    with pytest.raises(InputError, match="the disk is full"):
-        make_dataset(tiny(), out, command="scarpsim dataset tiny.yaml --out DIR")
-    monkeypatch.undo()
-    make_dataset(tiny(), out, command="scarpsim dataset tiny.yaml --out DIR")
-    assert digests(out) == digests(made)
-
-
-def test_an_interrupted_set_is_usable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline.dataset import run
-
-    out = tmp_path / "set"
-    fill = run.fill
-
-    def interrupted(order: Any) -> dict[str, Any]:
-        if order.index == 1:
-            raise KeyboardInterrupt
-        return fill(order)
-
-    monkeypatch.setattr(run, "fill", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        make_dataset(tiny(sensors=["tls"]), out)
-    assert len(COCO(out / "train/annotations.json").imgs) > 0
-    assert "Incomplete" in (out / "README.md").read_text()
-    with pytest.raises(InputError, match="is not finished"):
-        merge_datasets([out, out], tmp_path / "merged")

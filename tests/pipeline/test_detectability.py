@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 from surfaces import heightfield
 
-from pipeline.planning.detectability import PlanningConfig, Sampling, detection_probability, smallest_block
-from pipeline.planning.surface import Places
-from pipeline.planning.tls_geometry import tls_geometry
 from pipeline.planning.trials import Trials, detection_trials
+from pipeline.precision.detectability import PlanningConfig, Sampling, detection_probability, smallest_block
+from pipeline.precision.surface import Places
+from pipeline.precision.tls_geometry import tls_geometry
 from scene.config import parse
 from scene.errors import InputError
 from scene.frame import WallFrame
@@ -183,6 +183,8 @@ def test_from_aside_and_below_the_rim_of_an_upright_niche_hides_what_both_tangen
         ({"minimum_points": 1}, "'minimum_points'"),
         ({"block_size_m": []}, "'block_size_m'"),
         ({"block_size_m": [-0.2]}, "'block_size_m"),
+        ({"block_size_m": [1e300]}, "less than or equal to 30"),
+        ({"block_size_m": [0.2, 1e-9]}, "greater than or equal to 0.001"),
         ({"gsd": 0.1}, "unknown key 'gsd'; did you mean 'gsd_m'?"),
     ],
 )

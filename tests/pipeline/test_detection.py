@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
 
-from pipeline.noise.detection import (
+from pipeline.compare.detection import (
     MeanTest,
     blocks_seen,
-    detection_curve,
     false_alarms,
     footprints,
     level_of_detection,
@@ -98,38 +96,6 @@ def test_footprints_leave_out_what_did_not_recede() -> None:
     ((label, window, footprint),) = footprints(block, change)
     assert (label, window) == (2, (slice(1, 3), slice(1, 4)))
     assert footprint.tolist() == [[False, True, True], [True, True, True]]
-
-
-def test_the_curve_is_found_again() -> None:
-    """20 trials of 300 blocks: the true smallest block is in at least 16 of the 95 % intervals.
-
-    19 are expected; a binomial of 0.95 gives fewer than 16 in 0.3 %, one of 0.9, as bootstrap intervals may have, in 4 %.
-    """
-    middle, width, lapse = np.log(0.1), 0.3, 0.02
-    truth = np.exp(middle + width * 1.87208)  # ndtri(0.95 / 0.98)
-    inside = 0
-    for number in range(20):
-        random = KeyedRandom(11).child(number)
-        generator = random.generator()
-        size = np.exp(generator.uniform(np.log(0.03), np.log(0.6), 300))
-        seen = generator.random(300) < (1 - lapse) * ndtr((np.log(size) - middle) / width)
-        curve = detection_curve(size, seen, random)
-        assert curve is not None
-        low, high = curve.interval_m
-        inside += (low or np.inf) <= truth <= (high or np.inf)
-    assert inside >= 16
-    assert curve.middle_m == pytest.approx(0.1, rel=0.3)
-
-
-def test_a_curve_that_stays_below_has_no_smallest_block() -> None:
-    generator = KeyedRandom(5).generator()
-    curve = detection_curve(np.geomspace(0.05, 1, 200), generator.random(200) < 0.7, KeyedRandom(5))
-    assert curve is not None
-    assert curve.smallest_95_m is None
-    assert detection_curve(np.ones(3), np.ones(3, dtype=bool), KeyedRandom(5)) is None
-    everything = detection_curve(np.geomspace(0.05, 1, 50), np.ones(50, dtype=bool), KeyedRandom(5))
-    assert everything is not None
-    assert everything.extrapolated or everything.smallest_95_m == pytest.approx(0.05, rel=0.3)
 
 
 def test_wilsons_interval() -> None:

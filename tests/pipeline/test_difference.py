@@ -6,8 +6,8 @@ import types
 import numpy as np
 import pytest
 
-from pipeline import difference as module
-from pipeline.difference import (
+from pipeline.change import difference as module
+from pipeline.change.difference import (
     DifferenceConfig,
     block_statistics,
     difference,
@@ -15,8 +15,8 @@ from pipeline.difference import (
     statistics,
     surface_raster,
 )
-from pipeline.mesh import SurfaceConfig, mesh_observation
-from pipeline.robust import nmad
+from pipeline.change.robust import nmad
+from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import TriangleMesh

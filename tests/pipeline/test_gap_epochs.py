@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from gap_cases import Scan, write_scan
 
-from pipeline.gap.measurement import read_measurement
-from pipeline.gap.registration import residuals_of
-from pipeline.gap.workflow import Diagnosis, diagnose
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.residuals.registration import residuals_of
 
 
 def found_in(folder: Path, seed: int, **how: Any) -> Diagnosis:

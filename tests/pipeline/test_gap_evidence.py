@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from gap_cases import Array, Scan, smooth_noise, write_scan
 
-from pipeline.gap.candidates import Candidate
-from pipeline.gap.cells import Cells, held_out_blocks
-from pipeline.gap.entries import Named
-from pipeline.gap.held_out import score_effects
-from pipeline.gap.measurement import read_measurement
-from pipeline.gap.registration import registered, settled
-from pipeline.gap.selection import MeanSearch, Tried
-from pipeline.gap.spread import find_spread
-from pipeline.gap.workflow import diagnose, few
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.selection import MeanSearch, Tried
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.held_out import score_effects
+from pipeline.gap.naming.workflow import diagnose, few
+from pipeline.gap.other.spread import find_spread
+from pipeline.gap.residuals.cells import Cells, held_out_blocks
+from pipeline.gap.residuals.registration import registered, settled
 from scene.keyed_random import KeyedRandom
 
 

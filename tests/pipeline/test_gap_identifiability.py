@@ -11,9 +11,9 @@ import pytest
 from gap_cases import HEIGHT, STEP, WIDTH, Array, Field, smooth_noise, unit, write_scan
 
 from pipeline.cli.main import main
-from pipeline.config import load_config
-from pipeline.gap.identifiability import Identifiability, identifiability
-from pipeline.gap.planned import planned_survey
+from pipeline.config.simulation import load_config
+from pipeline.gap.survey.identifiability import Identifiability, identifiability
+from pipeline.gap.survey.planned import planned_survey
 
 POSITION = np.array([WIDTH * 0.42, -34.0, 2.5])
 SIGMA = 0.003

@@ -13,16 +13,16 @@ from gap_cases import write_scan
 from benchmarks.gap_challenge import stereo_cases
 from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_challenge.strength import Target
-from pipeline.gap.candidates import Candidate
-from pipeline.gap.cells import Cells, held_out_blocks
-from pipeline.gap.entries import Named
-from pipeline.gap.families import families_of
-from pipeline.gap.held_out import score_effects
-from pipeline.gap.mean_model import MeanModel, fitted
-from pipeline.gap.measurement import read_measurement
-from pipeline.gap.registration import settled
-from pipeline.gap.selection import MeanSearch
-from pipeline.gap.workflow import diagnose
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.mean_model import MeanModel, fitted
+from pipeline.gap.mean.selection import MeanSearch
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.families import families_of
+from pipeline.gap.naming.held_out import score_effects
+from pipeline.gap.naming.workflow import diagnose
+from pipeline.gap.residuals.cells import Cells, held_out_blocks
+from pipeline.gap.residuals.registration import settled
 from scene.keyed_random import KeyedRandom
 
 

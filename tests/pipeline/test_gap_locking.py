@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.gap.locking import find_locking
+from pipeline.gap.other.locking import find_locking
 
 
 @pytest.mark.parametrize(

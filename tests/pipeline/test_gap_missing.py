@@ -11,11 +11,11 @@ from gap_cases import write_scan
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
-from pipeline.gap.measurement import read_measurement
-from pipeline.gap.missing import MissingFound, find_missing, isolated
-from pipeline.gap.residuals import Missing
-from pipeline.gap.tls_residuals import missing_returns, tls_residuals
-from pipeline.gap.verify import measure_losses
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.naming.verify import measure_losses
+from pipeline.gap.other.missing import MissingFound, find_missing, isolated
+from pipeline.gap.residuals.residuals import Missing
+from pipeline.gap.residuals.tls_residuals import missing_returns, tls_residuals
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 COUNT = 30_000

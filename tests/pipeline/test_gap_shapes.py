@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from benchmarks.gap_challenge.cases import Case, make
-from pipeline.gap.cells import Cells
-from pipeline.gap.footprint import find_footprint
-from pipeline.gap.measurement import Measurement, read_measurement
-from pipeline.gap.registration import registered, settled
-from pipeline.gap.residuals import Residuals
-from pipeline.gap.spread import find_spread
-from pipeline.gap.stereo_noise import find_nodes, told_apart
-from pipeline.gap.stereo_shapes import find_shapes
+from pipeline.formats.measurement import Measurement, read_measurement
+from pipeline.gap.other.footprint import find_footprint
+from pipeline.gap.other.spread import find_spread
+from pipeline.gap.other.stereo_noise import find_nodes, told_apart
+from pipeline.gap.other.stereo_shapes import find_shapes
+from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.residuals.registration import registered, settled
+from pipeline.gap.residuals.residuals import Residuals
 from scene.keyed_random import KeyedRandom
-from sensors.effects import BeamDivergence
+from sensors.effects.beam_divergence import BeamDivergence
 from sensors.model import StereoModel
 
 Made = tuple[Measurement, Residuals, dict[str, Any]]

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.gap.measurement import read_measurement, read_model
-from pipeline.gap.report import write
-from pipeline.gap.workflow import diagnose
+from pipeline.formats.measurement import read_measurement, read_model
+from pipeline.gap.naming.workflow import diagnose
+from pipeline.gap.report.report import write
 
 SHARED = Path(__file__).parents[3] / "shared" / "measurements"
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from pipeline.gap.cells import Cells, held_out_blocks
-from pipeline.gap.entries import Named
-from pipeline.gap.measurement import read_measurement
-from pipeline.gap.registration import settled
-from pipeline.gap.showing import Showing
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.verification import Showing
+from pipeline.gap.residuals.cells import Cells, held_out_blocks
+from pipeline.gap.residuals.registration import settled
 from scene.keyed_random import KeyedRandom
 
 

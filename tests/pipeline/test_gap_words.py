@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.gap.in_words import decimal, number, rounded, with_unit
+from pipeline.gap.report.in_words import decimal, number, rounded, with_unit
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,10 @@ import pytest
 from surfaces import heightfield
 
 from pipeline.cli.main import main
-from pipeline.noise.icp_study import Recommendation, StudyRow, Surfaces, composed, recommended, study, true_pose
-from pipeline.register import IcpConfig
-from pipeline.report.icp_study import write_icp_study
-from pipeline.rigid import RigidTransform
+from pipeline.icp_study.report import write_icp_study
+from pipeline.icp_study.study import Recommendation, StudyRow, Surfaces, composed, recommended, study, true_pose
+from pipeline.registration.register import IcpConfig
+from pipeline.registration.rigid import RigidTransform
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 
@@ -90,6 +90,32 @@ def test_what_is_recommended() -> None:
     best = recommended(thresholds, "outlier_distance_threshold")
     assert best == Recommendation("outlier_distance_threshold", 0.04, (0.03, 0.05), 1e-3)
     assert recommended([row("outlier_distance_threshold", 0.1, None)], "outlier_distance_threshold") is None
+
+
+@pytest.mark.parametrize(
+    ("record", "words", "message"),
+    [
+        ("5", [], "is not the record of a run"),
+        ('{"sensor": "tls", "epochs": 3}', [], "is not the record of a run"),
+        ('{"sensor": "tls", "epochs": [1, 2]}', [], "is not the record of a run"),
+        ('{"sensor": "tls", "epochs": [{"epoch": 0}, {"epoch": 1, "registration": {"rotation": "x"}}]}', [], "not the record"),
+        ("{", [], "is not the record of a run"),
+        ('{"sensor": "tls", "epochs": [{"epoch": 0}]}', [], "no epoch after the reference"),
+        ('{"sensor": "tls", "epochs": [{"epoch": 0}, {"epoch": 1}]}', ["--epochs", "99"], "allowed: 1 to 1"),
+        ("{}", ["--offset-m", "1e300"], "allowed: 0 to 100 m"),
+        ("{}", ["--offset-m", "nan"], "allowed: 0 to 100 m"),
+        ("{}", ["--epochs", "1e9"], "a whole number from 1"),
+    ],
+)
+def test_odd_records_and_options_are_one_line(
+    tmp_path: Path, record: str, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.json").write_text(record)
+    assert main(["icp-study", str(tmp_path), "--out", str(tmp_path / "out"), *words]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert len(said.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_without_a_run_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,14 +13,14 @@ from scipy import stats
 from surfaces import plane, step
 
 from pipeline.cli import main as cli
-from pipeline.config import SimulationConfig, load_config
+from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.planning.inspect import write_plans
 from pipeline.planning.maps import plans
-from pipeline.planning.stereo_geometry import stereo_geometry
-from pipeline.planning.surface import Places, seen_from, wall_raster
-from pipeline.planning.tls_geometry import TlsGeometry, tls_geometry
-from pipeline.site import prepare_site
+from pipeline.precision.stereo_geometry import stereo_geometry
+from pipeline.precision.surface import Places, seen_from, wall_raster
+from pipeline.precision.tls_geometry import TlsGeometry, tls_geometry
+from pipeline.run.site import prepare_site
 from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh

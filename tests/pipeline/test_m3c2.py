@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from pycocotools import mask
 
-from pipeline.config import SimulationConfig
-from pipeline.difference import SurfaceRaster
+from pipeline.change.difference import SurfaceRaster
+from pipeline.change.m3c2 import M3c2Config, core_grid, m3c2
+from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.laz import read_laz
-from pipeline.m3c2 import M3c2Config, core_grid, m3c2
-from pipeline.run import simulate
+from pipeline.run.simulation import simulate
 from scene.config import parse
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom

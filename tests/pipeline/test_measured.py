@@ -9,12 +9,12 @@ import pytest
 import yaml
 from surfaces import heightfield
 
-from pipeline.difference import DifferenceConfig
+from pipeline.change.difference import DifferenceConfig
+from pipeline.config.calibration import CalibrationConfig
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.noise.measured import area_mask, point_differences, read_measured
-from pipeline.noise.settings import CalibrationConfig
 from scene.config import parse
 from scene.errors import InputError
 from scene.grid import Grid

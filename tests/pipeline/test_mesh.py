@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pipeline.mesh import SurfaceConfig, mesh_cloud, mesh_observation
+from pipeline.surface.mesh import SurfaceConfig, mesh_cloud, mesh_observation
 from scene.errors import InputError
 from scene.mesh import TriangleMesh
 from sensors.observation import Observation

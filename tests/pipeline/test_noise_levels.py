@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.bundled import bundled_config
-from pipeline.config import SimulationConfig, load_config
-from pipeline.difference import statistics
-from pipeline.noise.maps import noise_map, with_model
-from pipeline.site import Site, prepare_site
+from pipeline.calibrate.maps import noise_map, with_model
+from pipeline.change.difference import statistics
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import SimulationConfig, load_config
+from pipeline.run.site import Site, prepare_site
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster

@@ -1,7 +1,7 @@
 """Configs of older minor versions still load: each folder of tests/configs_of_versions holds those of one version.
 
 A key that is renamed keeps its old name as an alias; when a minor version comes out, its own complete configs are added
-(`scarpsim init`). Nothing in these files is ever changed.
+(`scarpsim init`, the `#` of its keys taken away). Nothing in these files is ever changed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from config_loaders import LOADERS
 
-from pipeline.config import load_config
+from pipeline.config.simulation import load_config
 
 FILES = sorted((Path(__file__).parents[1] / "configs_of_versions").glob("*/*.yaml"))
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.overrides import apply_overrides
+from pipeline.config.overrides import apply_overrides
 from scene.errors import InputError
 from scene.yaml_text import parse_yaml
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from pipeline.bundled import config_path, configs_folder
-from pipeline.config import SimulationConfig, load_config
-from pipeline.presets import read_preset
+from pipeline.config.bundled import config_path, configs_folder
+from pipeline.config.presets import read_preset
+from pipeline.config.simulation import SimulationConfig, load_config
 from scene.config import parse
 from scene.errors import InputError
-from sensors.effects import BeamDivergence
+from sensors.effects.beam_divergence import BeamDivergence
 from sensors.model import TlsNoise
 from sensors.presets import Divergence, ScannerPreset
 from sensors.tls import ScannerConfig
@@ -124,11 +124,67 @@ def test_keys_beside_the_preset_go_before_it(bare: Path) -> None:
     assert scanner.zenith_step_rad == ScannerConfig().zenith_step_rad
 
 
-def test_a_key_beside_a_bare_name_is_refused_with_the_way_to_write_it(bare: Path) -> None:
-    with pytest.raises(InputError, match=r"scanner\.preset=leica_p40"):
-        load_config(bare, ["scanner=leica_p40", "scanner.azimuth_step_rad=0.001"], "tls", None)
-    config = load_config(bare, ["scanner.preset=leica_p40", "scanner.azimuth_step_rad=0.001"], "tls", None)
-    assert config.scanner.azimuth_step_rad == 0.001
+def test_keys_stand_beside_a_bare_name_too(bare: Path) -> None:
+    for text, overrides in (("epochs: 1", ["scanner=leica_p40"]), ("scanner: leica_p40", [])):
+        bare.write_text(text + "\n")
+        config = load_config(bare, [*overrides, "scanner.azimuth_step_rad=0.001"], "tls", None)
+        assert config.scanner == read_preset("leica_p40").scanner().model_copy(update={"azimuth_step_rad": 0.001})
+
+
+WRITTEN_OUT = """
+scanner: {name: null, zenith_limits_rad: [0.5, 2.3], azimuth_step_rad: 0.0003, pulse_rate_hz: 100000.0, faces: 2}
+sensor:
+  - {sensor: stereo, noise: {parallax_sigma_px: 0.7}}
+  - {sensor: tls, noise: {range_sigma_m: 0.007, angle_sigma_rad: 1.0e-3}, effects: [{name: range_offset, offset_m: 0.02}]}
+"""
+"""A file with keys of the instrument in it, such as the resolved config of a run."""
+
+
+@pytest.mark.parametrize("name", ["riegl_vz400i", "leica_p50"])
+@pytest.mark.parametrize(
+    "override", ["scanner={}", "scanner.preset={}", "scanner={{preset: {}, azimuth_step_rad: 0.0003, faces: 2}}"]
+)
+def test_a_preset_named_later_wins_over_the_files_keys(bare: Path, override: str, name: str) -> None:
+    """And over its model of the noise; what the preset does not know stays: the pattern, the faces, the other sensor."""
+    bare.write_text(WRITTEN_OUT)
+    config, preset = load_config(bare, [override.format(name)], "tls", None), read_preset(name)
+    assert preset.scanner_values().items() <= config.scanner.model_dump().items()
+    assert (config.scanner.azimuth_step_rad, config.scanner.faces) == (0.0003, 2)
+    assert config.tls_model() == preset.model()
+    assert config.stereo_model().noise.parallax_sigma_px == 0.7
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_keys_on_the_same_command_line_refine_the_preset(bare: Path, order: int) -> None:
+    bare.write_text(WRITTEN_OUT)
+    overrides = ["scanner.preset=riegl_vz400i", "scanner.pulse_rate_hz=300000", "sensor.1.noise.range_sigma_m=0.004"]
+    config, preset = load_config(bare, overrides[::order], "tls", None), read_preset("riegl_vz400i")
+    assert (config.scanner.name, config.scanner.pulse_rate_hz) == (preset.name, 300_000)
+    assert config.tls_model().noise == preset.model().noise.model_copy(update={"range_sigma_m": 0.004})
+    assert config.tls_model().effects == preset.model().effects
+
+
+def test_a_later_preset_replaces_an_earlier_one(bare: Path) -> None:
+    bare.write_text("scanner: {preset: riegl_vz400i, pulse_rate_hz: 300000}\n")
+    for overrides in (["scanner=zf_5016"], ["scanner=leica_p40", "scanner.preset=zf_5016"]):
+        config, preset = load_config(bare, overrides, "tls", None), read_preset("zf_5016")
+        assert (config.scanner, config.tls_model()) == (preset.scanner(), preset.model())
+
+
+def test_a_model_named_on_the_command_line_stays_beside_the_preset(tmp_path: Path, bare: Path) -> None:
+    """Also as the config itself: a bare model, which stands on the demo."""
+    model = tmp_path / "model.yaml"
+    model.write_text("sensor: tls\nnoise: {range_sigma_m: 0.007}\n")
+    bare.write_text(WRITTEN_OUT)
+    for path, overrides in ((bare, [f"sensor={model}"]), (model, [])):
+        config = load_config(path, ["scanner.preset=zf_5016", *overrides], "tls", None)
+        assert (config.scanner.name, config.tls_model().noise.range_sigma_m) == ("Z+F IMAGER 5016", 0.007)
+
+
+def test_a_preset_replaces_a_model_that_the_file_names(tmp_path: Path, bare: Path) -> None:
+    (tmp_path / "model.yaml").write_text("sensor: tls\nnoise: {range_sigma_m: 0.007}\n")
+    bare.write_text("sensor: model.yaml\n")
+    assert load_config(bare, ["scanner=zf_5016"], "tls", None).tls_model() == read_preset("zf_5016").model()
 
 
 def test_a_model_of_ones_own_stays(bare: Path) -> None:
@@ -167,6 +223,8 @@ def test_a_scanner_of_ones_own_is_a_file_away(tmp_path: Path, bare: Path) -> Non
         ("scanner=nowhere.yaml", "nowhere.yaml: cannot be read"),
         ("scanner={preset: leica_p40, azimuth_stp_rad: 0.1}", "did you mean 'azimuth_step_rad'"),
         ("scanner=7", "'scanner'"),
+        ('scanner="a\\0/b"', "null character"),
+        ('sensor="a\\0/b"', "null character"),
     ],
 )
 def test_mistakes_in_naming_a_scanner_are_one_line(override: str, message: str) -> None:

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from pipeline.progress import LineProgress, Progress, duration, shown_progress
-from pipeline.progress_bar import BarProgress
+from pipeline.report.progress import LineProgress, Progress, duration, shown_progress
+from pipeline.report.progress_bar import BarProgress
 
 
 class Clock:
@@ -55,6 +55,39 @@ def test_a_silent_stage_goes_by_the_pace_and_never_ends_early() -> None:
         assert progress.share < 1.0
 
 
+def test_a_plan_made_under_way_divides_what_is_left() -> None:
+    """A half is done when as much again turns out to be needed beside the other half: a third of the rest for each second."""
+    clock = Clock()
+    progress = Progress(clock)
+    progress.plan({"a": 1.0, "b": 1.0})
+    with progress.stage("a"):
+        clock.now += 1.0
+    progress.plan({"c": 2.0})
+    assert (progress.share, progress.left_s) == (0.5, 3.0)
+    with progress.stage("b"):
+        clock.now += 1.0
+    assert progress.share == pytest.approx(0.5 + 0.5 / 3)
+    with progress.stage("c"):
+        clock.now += 2.0
+    assert (progress.share, progress.left_s) == (1.0, 0.0)
+
+
+def test_the_share_never_falls() -> None:
+    """A stage that comes again, and one that says it is less far than was guessed."""
+    clock = Clock()
+    progress = Progress(clock)
+    progress.plan({"a": 1.0, "b": 1.0})
+    shares = []
+    for fraction in (0.0, 0.3, 1.0):
+        with progress.stage("a"):
+            clock.now += 0.9
+            shares.append(progress.share)
+            progress.advance(fraction)
+            shares.append(progress.share)
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(0.5)
+
+
 def test_timings_add_up_per_stage_and_survive_an_error() -> None:
     clock = Clock()
     progress = Progress(clock)
@@ -84,7 +117,7 @@ def test_lines_appear_after_the_quiet_time_only() -> None:
             while not stream.getvalue().count("\n") >= 2:
                 time.sleep(0.005)
     first = stream.getvalue().splitlines()[0]
-    assert first.startswith("50% done, about 0 s left: cast")
+    assert first.startswith("50 % done, about 0 s left: cast")
 
 
 def test_the_terminal_decides_what_is_shown() -> None:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config import SimulationConfig
-from pipeline.depth_maps import DepthMap, normals, pinhole
+from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.colmap import read_map
-from pipeline.mesh import SurfaceConfig
-from pipeline.reconstruct import FusionConfig, colmap_surface, write_workspace
-from pipeline.run import simulate
+from pipeline.run.simulation import simulate
+from pipeline.surface.depth_maps import DepthMap, normals, pinhole
+from pipeline.surface.mesh import SurfaceConfig
+from pipeline.surface.reconstruct import FusionConfig, colmap_surface, write_workspace
 from scene.config import parse
 from scene.errors import InputError
 from scene.mesh import FloatArray

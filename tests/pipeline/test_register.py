@@ -13,9 +13,9 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
-from pipeline.closest_points import ReferenceSurface, scan_order
-from pipeline.register import IcpConfig, Registration, _point_step, fit, register, register_to
-from pipeline.rigid import RigidTransform, rotation_matrix
+from pipeline.registration.closest_points import ReferenceSurface, scan_order
+from pipeline.registration.register import IcpConfig, Registration, _point_step, fit, register, register_to
+from pipeline.registration.rigid import RigidTransform, rotation_matrix
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -339,7 +339,7 @@ def test_threads_do_not_change_a_bit(reference: ReferenceSurface) -> None:
 
 def test_blas_threads_do_not_change_a_bit() -> None:
     code = (
-        "import json, numpy as np; from pipeline.register import *; g = np.random.default_rng(3); "
+        "import json, numpy as np; from pipeline.registration.register import *; g = np.random.default_rng(3); "
         "p = np.stack([*g.uniform(0, 9, (2, 40000)), np.zeros(40000)], 1); p[:, 2] = np.sin(p[:, 0]) * np.cos(p[:, 1]); "
         "c = IcpConfig(method='point_to_point', max_iteration=6, outlier_distance_threshold=0.5); "
         "print(json.dumps(register(p[::2] + 0.02, p, None, c, KeyedRandom(1)).to_dict()))"

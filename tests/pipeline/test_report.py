@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
-from pipeline.report.page import BlockRow, EpochReport, RegistrationSummary, RunReport, write_report
+from pipeline.report.page import template
+from pipeline.run.page import BlockRow, EpochReport, RegistrationSummary, RunReport, write_report
 from scene.grid import Grid
 
+TEMPLATES = Path(__file__).parents[2] / "pipeline"
 GRID = Grid(x_min=0.0, y_max=20.0, gsd=0.1, width=300, height=200)
 SIGMA_M = 0.008
 HISTORY = [SimpleNamespace(rms_m=0.03 / step, inliers=900 + step, points=1000) for step in range(1, 6)]
@@ -203,3 +205,17 @@ def test_many_blocks_come_folded(tmp_path: Path) -> None:
         page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
         assert ("open" in page.all("details")[0]) == unfolded
         assert len(page.all("tr")) > count
+
+
+def test_what_comes_from_a_file_stays_text(tmp_path: Path) -> None:
+    """A wall's name, a scanner's, a path in the config; and no template takes a value past the escaping."""
+    evil = "</title></pre><script>alert(1)</script>"
+    report = RunReport(evil, "tls", 1, b"", [], {"wall": {"mesh": evil}}, {"Sensor": evil, evil: "x"})
+    write_report(tmp_path / "report.html", report)
+    page = (tmp_path / "report.html").read_text()
+    assert "<script>" not in page
+    assert page.count("&lt;script&gt;alert(1)") == 5
+    for path in TEMPLATES.rglob("*.jinja"):
+        assert template(path.name).environment.autoescape is True
+        past = re.findall(r"\{\{([^}]*)\| *safe", path.read_text())
+        assert all(re.fullmatch(r"\s*'[^']*'\s*", value) for value in past), path.name

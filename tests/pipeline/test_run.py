@@ -16,13 +16,14 @@ import rasterio
 import trimesh
 from pycocotools.coco import COCO
 
-from pipeline import run as pipeline_run
-from pipeline.config import SensorName, SimulationConfig, load_config
+from pipeline.cli.main import main
+from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.e57 import read_e57
 from pipeline.formats.laz import read_laz
 from pipeline.formats.ply import read_ply, write_ply
 from pipeline.formats.points import read_points
-from pipeline.run import simulate
+from pipeline.run import simulation as pipeline_run
+from pipeline.run.simulation import simulate
 from scene.config import parse
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
@@ -318,3 +319,14 @@ def test_paths_in_a_config_are_relative_to_its_folder(tmp_path: Path) -> None:
     loaded = load_config(file, [], "stereo", None)
     assert loaded.wall.mesh == tmp_path / "site/wall.ply"
     assert loaded.cameras.file == tmp_path / "site/cameras.yaml"
+
+
+def test_a_path_that_is_a_loop_of_links_is_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "wall.ply").symlink_to("other.ply")
+    (tmp_path / "other.ply").symlink_to("wall.ply")
+    (tmp_path / "config.yaml").write_text("wall: {mesh: wall.ply}\n")
+    command = ["simulate", "--sensor", "tls", "--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "run")]
+    assert main(command) == 2
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert message.startswith(f"error: {tmp_path}")
+    assert "there is no such file" in message

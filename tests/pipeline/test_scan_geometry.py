@@ -16,7 +16,7 @@ from surfaces import heightfield
 
 from pipeline.formats.laz import read_laz, write_laz
 from pipeline.formats.points import read_points
-from pipeline.scan_geometry import ScanGeometry, polar, recover_pattern
+from pipeline.formats.scan_geometry import ScanGeometry, polar, recover_pattern
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray

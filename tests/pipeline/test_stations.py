@@ -12,13 +12,13 @@ import pytest
 from surfaces import heightfield
 from test_run import config
 
-from pipeline.difference import DifferenceConfig, raster_grid, surface_raster
+from pipeline.change.difference import DifferenceConfig, raster_grid, surface_raster
 from pipeline.formats.laz import read_laz
-from pipeline.mesh import SurfaceConfig, mesh_observation
-from pipeline.register import IcpConfig
-from pipeline.rigid import RigidTransform
-from pipeline.run import simulate
-from pipeline.stations import Joined, StationsConfig, join, merged
+from pipeline.registration.register import IcpConfig
+from pipeline.registration.rigid import RigidTransform
+from pipeline.run.simulation import simulate
+from pipeline.surface.mesh import SurfaceConfig, mesh_observation
+from pipeline.surface.stations import Joined, StationsConfig, join, merged
 from scene.errors import InputError
 from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom

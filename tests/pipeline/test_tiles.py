@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pipeline.tiles import TileConfig, tiles
+from pipeline.change.tiles import TileConfig, tiles
 from scene.errors import InputError
 from scene.grid import Grid
 

@@ -14,7 +14,7 @@ from scene.backend import mi
 from scene.config import parse
 from scene.errors import InputError
 from sensors.curve import Axis, surface, surface_on_host
-from sensors.effects import RangeEmpirical
+from sensors.effects.range_empirical import RangeEmpirical
 
 
 @dataclass(frozen=True)

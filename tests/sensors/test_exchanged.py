@@ -77,7 +77,7 @@ def test_points_lie_on_the_depth_cameras_rays_and_on_the_plane(lens: dict[str, f
     assert np.nanmedian(seen[1].depth) == pytest.approx(np.nanmedian(seen[0].depth), rel=0.1)
 
 
-def test_both_maps_show_the_same_camera_errors() -> None:
+def test_both_maps_show_the_same_camera_effects() -> None:
     """Camera errors bend the plane; the right map has to show the surface of the left one, drawn from the same numbers."""
     pair = CameraPair(camera(-8.0, k1=-0.05), camera(8.0, k1=-0.05))
     orientation = {"phi_rad": 3e-5, "cx_px": 0.5, "k1": 1e-3, "p1": 1e-4, "x_m": 0.01}

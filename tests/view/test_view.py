@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import html
 import json
 import re
 import shutil
@@ -9,6 +11,7 @@ import subprocess
 import threading
 import urllib.error
 import urllib.request
+from base64 import b64encode
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,18 +19,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.annotate import BLOCK_CATEGORY
-from pipeline.config import SimulationConfig
-from pipeline.difference import surface_raster
+from pipeline.change.annotate import BLOCK_CATEGORY
+from pipeline.change.difference import surface_raster
+from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.atomic import write_json, write_text
 from pipeline.formats.geotiff import read_geotiff, write_geotiff
 from pipeline.formats.laz import read_laz, write_laz
 from pipeline.formats.ply import read_ply
-from pipeline.run import simulate
+from pipeline.run.simulation import simulate
 from pipeline.view.figures import map_figure, wall_figure
 from pipeline.view.page import clicked, zoom
 from pipeline.view.results import Item, Layer, Patch, Window, cut
-from pipeline.view.server import make_page_server, open_results
+from pipeline.view.server import make_app, make_page_server, open_results
 from scene.config import parse
 from scene.errors import InputError
 from scene.grid import Grid
@@ -262,6 +265,37 @@ def test_the_page_comes_whole_from_this_machine(address: str) -> None:
     assert '"wall"' in get(f"{address}/_dash-layout")
 
 
+EVIL = "</title><script>alert(1)</script><b>'\"&"
+
+
+def test_a_name_out_of_a_file_stays_text(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    record = json.loads((run / "run.json").read_text())
+    record["wall"]["name"] = EVIL
+    write_json(tmp_path / "run" / "run.json", record)
+    app = make_app(open_results(tmp_path / "run"))
+    page = app.server.test_client().get("/", headers={"Host": "127.0.0.1"}).get_data(as_text=True)
+    (title,) = re.findall(r"<title>(.*?)</title>", page)
+    assert html.unescape(title) == f"scarpsim: run: laser scanner, {EVIL}"
+    assert "<script>alert" not in page
+
+
+def test_the_page_runs_its_own_scripts_only(address: str) -> None:
+    """Every script in the page itself is named by its hash, none is allowed that is not, on any answer."""
+    with urllib.request.urlopen(address, timeout=30) as answer:
+        page, policy = answer.read().decode(), answer.headers["Content-Security-Policy"]
+    allowed = dict(part.strip().split(" ", 1) for part in policy.split(";"))
+    without_comments = re.sub(r"<!--.*?-->", "", page, flags=re.DOTALL)
+    inline = re.findall(r"<script(?![^>]*(?:src=|application/json))[^>]*>(.*?)</script>", without_comments, re.DOTALL)
+    hashes = {f"'sha256-{b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" for script in inline}
+    assert hashes
+    assert set(allowed["script-src"].split()) == {"'self'", *hashes}
+    assert allowed["default-src"] == allowed["frame-ancestors"] == allowed["base-uri"] == allowed["form-action"] == "'none'"
+    assert "http" not in policy
+    with urllib.request.urlopen(f"{address}/_dash-layout", timeout=30) as answer:
+        assert answer.headers["Content-Security-Policy"] == policy
+
+
 def test_the_page_answers_to_this_machine_s_names_only(address: str) -> None:
     with pytest.raises(urllib.error.HTTPError, match="403"):
         get(address, "evil.example")
@@ -306,9 +340,11 @@ def test_a_browser_draws_the_page(address: str, tmp_path: Path) -> None:
     flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags.append(f"--user-data-dir={tmp_path}")
     offline = ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--virtual-time-budget=60000", "--timeout=90000"]
-    command = [str(CHROMIUM), *flags, *offline, "--dump-dom", address]
-    page = subprocess.run(command, capture_output=True, text=True, timeout=150, check=True).stdout
+    command = [str(CHROMIUM), *flags, *offline, "--enable-logging=stderr", "--dump-dom", address]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=True)
+    page = done.stdout
+    assert "Content Security Policy" not in done.stderr, "the policy stops something of the page's own"
     assert "gl-container" in page  # the 3D scene
     assert "heatmaplayer" in page
-    assert "reference minus epoch, mm" in page  # the colour bar
+    assert "reference minus epoch (missing rock positive), mm" in page  # the colour bar
     assert "epoch 1" in page

@@ -15,13 +15,13 @@ From the docstrings. What the commands do, a notebook can do: each command reads
 
 | command | function |
 |---|---|
-| `simulate` | `pipeline.run.simulate` |
+| `simulate` | `pipeline.run.simulation.simulate` |
 | `inspect` | `pipeline.planning.inspect.inspect`, `write_plans` |
-| `compare` | `pipeline.noise.comparison.compare_sensors` |
-| `icp-study` | `pipeline.noise.icp_study` |
-| `calibrate` | `pipeline.noise.calibrate.calibrate` |
+| `compare` | `pipeline.compare.comparison.compare_sensors` |
+| `icp-study` | `pipeline.icp_study.study` |
+| `calibrate` | `pipeline.calibrate.calibrate.calibrate` |
 | `dataset` | `pipeline.dataset.run.make_dataset`, `verify_dataset`; `pipeline.dataset.combine` |
-| `gap` | `pipeline.gap.workflow.diagnose`; `pipeline.gap.identifiability.identifiability` |
+| `gap` | `pipeline.gap.naming.workflow.diagnose`; `pipeline.gap.survey.identifiability.identifiability` |
 | `train`, `detect`, `evaluate` | `pipeline.detect.run` |
 
 A module's folder says what it knows: `scene` knows no sensor, `sensors` know the scene's ray caster, `pipeline` joins them.

@@ -7,8 +7,8 @@ from typing import Any
 
 import yaml
 
-from pipeline.bundled import configs_folder
-from pipeline.presets import read_preset
+from pipeline.config.bundled import configs_folder
+from pipeline.config.presets import read_preset
 from sensors.model import TlsModel, TlsNoise
 from sensors.presets import ScannerPreset
 

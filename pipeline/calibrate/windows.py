@@ -1,0 +1,140 @@
+"""The windows in which measured and simulated difference maps are compared, and the stable ground that they lie on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pipeline.change.difference import statistics
+from pipeline.config.calibration import CalibrationConfig
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.mesh import FloatArray, IntArray
+
+BoolArray = NDArray[np.bool_]
+_LEAST_STABLE = 0.6
+"""Share of a window's pixels that have to be stable and known in every map."""
+_CHANGE_NMADS = 4.0
+_CHANGE_CELL_PX = 5
+_CHANGE_LEAST_CELLS = 3
+_BACKGROUND_CELLS = 15
+
+
+@dataclass(frozen=True)
+class Windows:
+    """k square windows of side n on a raster. corner: (k, 2) row and column of their first pixels; stable: (k, n, n) bool."""
+
+    grid: Grid
+    corner: IntArray
+    side: int
+    stable: BoolArray
+
+    def cut(self, raster: NDArray[np.floating]) -> FloatArray:
+        """(k, n, n) of a raster (h, w), NaN where it is not stable."""
+        cut = np.stack([raster[row : row + self.side, column : column + self.side] for row, column in self.corner])
+        return np.where(self.stable, cut, np.nan)
+
+    def places(self) -> tuple[FloatArray, FloatArray]:
+        """(k, n, n) x and y of the pixels' centres, wall frame, m."""
+        row = self.corner[:, 0, None, None] + np.arange(self.side)[None, :, None] + 0.5
+        column = self.corner[:, 1, None, None] + np.arange(self.side)[None, None, :] + 0.5
+        shape = (len(self.corner), self.side, self.side)
+        x, y = self.grid.x_min + column * self.grid.gsd, self.grid.y_max - row * self.grid.gsd
+        return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+
+    def centres(self) -> FloatArray:
+        """(k, 2) x and y of the windows' middles, wall frame, m."""
+        middle = self.corner + self.side / 2
+        return np.stack([self.grid.x_min + middle[:, 1] * self.grid.gsd, self.grid.y_max - middle[:, 0] * self.grid.gsd], axis=1)
+
+
+def unchanged(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
+    """(h, w) where no map shows a change: what the program takes as stable where nobody drew it.
+
+    Medians over cells of 5 x 5 pixels, less their median over 15 x 15 cells, are compared with four of their NMADs; three or more
+    cells side by side that exceed it are a change, with a cell's margin around them; so are compact places of single pixels that
+    exceed four NMADs of all pixels. Single gross errors are not, nor thin strips along edges: they are noise.
+    """
+    stable = np.ones(maps[0].shape, dtype=bool)
+    for values in maps:
+        cells = _cell_medians(values)
+        known = ~np.isnan(cells)
+        filled = np.where(known, cells, np.nanmedian(cells) if known.any() else 0.0)
+        background = ndimage.median_filter(filled, _BACKGROUND_CELLS)
+        stable &= ~_compact(values, background)
+        departure = np.where(known, cells - background, 0.0)
+        large = np.abs(departure) > _CHANGE_NMADS * statistics(departure[known]).nmad
+        label, _ = ndimage.label(large)
+        size = np.bincount(label.ravel())
+        size[0] = 0
+        changed = ndimage.binary_dilation(size[label] >= _CHANGE_LEAST_CELLS)
+        pixels = np.repeat(np.repeat(changed, _CHANGE_CELL_PX, axis=0), _CHANGE_CELL_PX, axis=1)
+        stable &= ~pixels[: values.shape[0], : values.shape[1]]
+    return stable
+
+
+def _compact(values: NDArray[np.floating], background: FloatArray) -> BoolArray:
+    """(h, w) places of 3 x 3 or more pixels of one sign that all exceed the limit, with a margin of two pixels."""
+    behind = np.repeat(np.repeat(background, _CHANGE_CELL_PX, axis=0), _CHANGE_CELL_PX, axis=1)
+    departure = values - behind[: values.shape[0], : values.shape[1]]
+    limit = _CHANGE_NMADS * statistics(departure).nmad
+    changed = np.zeros(values.shape, dtype=bool)
+    for sign in (1, -1):
+        changed |= ndimage.binary_opening(sign * departure > limit, np.ones((3, 3), dtype=bool))
+    return ndimage.binary_dilation(changed, np.ones((5, 5), dtype=bool))
+
+
+def _cell_medians(values: NDArray[np.floating]) -> FloatArray:
+    """Medians of what is known in cells of some pixels; NaN where less than half is."""
+    rows, columns = (-(-size // _CHANGE_CELL_PX) * _CHANGE_CELL_PX for size in values.shape)
+    padded = np.full((rows, columns), np.nan, dtype=np.float32)
+    padded[: values.shape[0], : values.shape[1]] = values
+    cells = padded.reshape(rows // _CHANGE_CELL_PX, _CHANGE_CELL_PX, -1, _CHANGE_CELL_PX).swapaxes(1, 2)
+    cells = np.sort(cells.reshape(*cells.shape[:2], -1), axis=2)  # NaN last
+    count = (~np.isnan(cells)).sum(axis=2)
+    median = np.take_along_axis(cells, np.maximum(count - 1, 0)[..., None] // 2, axis=2)[..., 0]
+    return np.where(2 * count >= _CHANGE_CELL_PX**2, median, np.nan).astype(np.float64)
+
+
+def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -> Windows:
+    """Windows spread evenly over the ground that is stable and known in all maps.
+
+    Of all places on a lattice of half a window that are stable enough, the first is the most stable and each further one the one
+    farthest from those before it (Gonzalez 1985), so that they reach the wall's ends, where deformations show.
+    """
+    side = settings.window_px
+    if min(grid.shape) < side:
+        raise InputError(
+            f"the maps have {grid.height} x {grid.width} pixels",
+            where="calibration.window_px",
+            allowed=f"up to {min(grid.shape)}",
+        )
+    total = np.pad(stable.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    row, column = (
+        each.ravel() for each in np.mgrid[0 : grid.height - side + 1 : side // 2, 0 : grid.width - side + 1 : side // 2]
+    )
+    share = total[row + side, column + side] - total[row, column + side] - total[row + side, column] + total[row, column]
+    good = share >= _LEAST_STABLE * side**2
+    row, column, share = row[good], column[good], share[good]
+    if len(row) == 0:
+        raise InputError(
+            f"no window of {side} x {side} pixels is stable and known in all maps",
+            where="calibration.stable_areas, calibration.window_px",
+            remedy="draw larger areas, or take smaller windows or fewer maps",
+        )
+    chosen = [int(np.argmax(share))]
+    distance = np.full(len(row), np.inf)
+    while len(chosen) < settings.windows:
+        last = chosen[-1]
+        apart = np.maximum(np.abs(row - row[last]), np.abs(column - column[last]))  # windows that touch do not overlap
+        distance = np.minimum(distance, apart)
+        if distance.max() < side:
+            break
+        chosen.append(int(np.argmax(distance)))
+    corner = np.stack([row[chosen], column[chosen]], axis=1).astype(np.int32)
+    cut = np.stack([stable[r : r + side, c : c + side] for r, c in corner])
+    return Windows(grid, corner, side, cut)

@@ -1,0 +1,150 @@
+"""Rasters of surfaces over the wall's plane, their differences, and the statistics of those."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pipeline.change.robust import nmad
+from scene.backend import dr, mi
+from scene.config import Config
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.raycast import RayCaster
+from scene.upload import on_device
+
+_BYTES_PER_PIXEL = 64
+"""What reference, epoch, difference, labels and the copies of statistics and pictures take at their peak."""
+_MOST_PIXELS = 2**32 - 1
+"""Dr.Jit numbers the elements of an array with 32 bits."""
+
+
+class DifferenceConfig(Config):
+    """How surfaces are compared."""
+
+    gsd_m: float = Field(0.02, gt=0, description="side of a pixel of the difference map")
+
+
+@dataclass(frozen=True)
+class SurfaceRaster:
+    """A surface seen from the sensors' side along the wall's normal.
+
+    grid: where its pixels lie; heights: (h, w) float32, m, z of the highest surface at each pixel's centre, NaN where there is
+    none; block: (h, w) int32, the label of the vertex nearest to that place, WALL where there is none.
+    """
+
+    grid: Grid
+    heights: NDArray[np.float32]
+    block: IntArray
+
+
+def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
+    """The pixels inside the reference surface's bounding box ((2, 3), wall frame, m).
+
+    Raises InputError where the GSD is larger than the surface or so fine that the rasters would not fit the free memory.
+    """
+    width, height = (float(extent) for extent in (bounds[1] - bounds[0])[:2])
+    available = psutil.virtual_memory().available
+    most = min(available / _BYTES_PER_PIXEL, _MOST_PIXELS)
+    finest, coarsest = np.sqrt(width * height / most), min(width, height)
+    allowed = f"{_rounded_up(finest):g} to {coarsest:.3g} m for a surface of {width:.1f} x {height:.1f} m"
+    if config.gsd_m > coarsest:
+        raise InputError(f"a pixel of {config.gsd_m:g} m is larger than the surface", where="difference.gsd_m", allowed=allowed)
+    pixels = width * height / config.gsd_m**2
+    if pixels > most:
+        raise InputError(
+            f"{config.gsd_m:g} m would take {pixels:.3g} pixels and {pixels * _BYTES_PER_PIXEL / 1e9:,.0f} GB of memory, "
+            f"{available / 1e9:.1f} GB are free",
+            where="difference.gsd_m",
+            allowed=allowed,
+        )
+    return Grid.over(bounds, config.gsd_m)
+
+
+def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
+    """Look at `mesh` (wall frame) along -z at every pixel centre of `grid`; labels come from its `vertex_block`."""
+    dr.flush_malloc_cache()  # what the observation took: a surface of millions of triangles is the peak of an epoch's memory
+    return cast_raster(RayCaster(mesh), grid)
+
+
+def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
+    """The same as `surface_raster`, of a mesh already prepared for ray casting."""
+    hits, point = caster.look_down(grid)
+    z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
+    if caster.mesh.vertex_block is None:
+        return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.full(grid.shape, WALL, dtype=np.int32))
+    label = caster.nearest_vertex_label(hits, point, on_device(mi.Int32, caster.mesh.vertex_block))
+    dr.eval(z, label)  # one kernel
+    return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.array(label).reshape(grid.shape))
+
+
+def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.float32]:
+    """(h, w) reference minus epoch in z, m: positive where rock is missing, negative where it was added, NaN without data."""
+    if reference.grid != epoch.grid:
+        raise InputError(f"{epoch.grid} is not the reference's {reference.grid}", where="difference")
+    return reference.heights - epoch.heights
+
+
+@dataclass(frozen=True)
+class DifferenceStatistics:
+    """Statistics of `count` differences, m; NaN where there are none. rmse is about zero, nmad = 1.4826 median(|d - median|)."""
+
+    count: int
+    median: float
+    mean: float
+    standard_deviation: float
+    rmse: float
+    nmad: float
+
+    def to_dict(self) -> dict[str, float | int | None]:
+        """As JSON holds it: the lengths' keys end in _m, NaN is null."""
+        lengths = {f"{name}_m": value for name, value in dataclasses.asdict(self).items() if name != "count"}
+        return {"count": self.count} | {name: None if np.isnan(value) else value for name, value in lengths.items()}
+
+    def summary(self) -> str:
+        """One line in millimetres."""
+        values = (self.median, self.standard_deviation, self.rmse, self.nmad)
+        median, deviation, rmse, nmad = (f"{value * 1e3:.1f} mm" for value in values)
+        return f"median {median}, StD {deviation}, RMSE {rmse}, NMAD {nmad} ({self.count:,} pixels)"
+
+
+def statistics(values: NDArray[np.floating]) -> DifferenceStatistics:
+    """The statistics of the values (any shape, m) that are not NaN."""
+    values = values[~np.isnan(values)]
+    if values.size == 0:
+        return DifferenceStatistics(0, *[float("nan")] * 5)
+    median, mean = np.median(values), np.mean(values, dtype=np.float64)
+    variance = np.var(values, dtype=np.float64)
+    return DifferenceStatistics(
+        count=int(values.size),
+        median=float(median),
+        mean=float(mean),
+        standard_deviation=float(np.sqrt(variance)),
+        rmse=float(np.sqrt(variance + mean**2)),
+        nmad=nmad(values, median),
+    )
+
+
+@dataclass(frozen=True)
+class BlockStatistics:
+    """The statistics of a difference map inside the niches of the blocks and outside of them."""
+
+    inside: DifferenceStatistics
+    outside: DifferenceStatistics
+
+
+def block_statistics(values: NDArray[np.floating], block: IntArray) -> BlockStatistics:
+    """Statistics of a difference map (h, w), m, by the epoch's labels (h, w)."""
+    return BlockStatistics(statistics(values[block != WALL]), statistics(values[block == WALL]))
+
+
+def _rounded_up(value: float) -> float:
+    """`value` rounded up to two significant digits."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(np.ceil(value / unit) * unit)

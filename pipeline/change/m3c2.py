@@ -1,0 +1,139 @@
+"""M3C2 distances between two epochs' points, beside the raster differences: for those who compare clouds instead of rasters.
+
+At each core point, lying on the reference surface with the normal n, the points of both epochs within a cylinder of radius d/2
+along n are averaged, and the distance of the averages along n is the change (Lague, Brodu and Leroux 2013); the level of
+detection at 95 % is
+
+    LoD = 1.96 (sqrt(s_1^2 / n_1 + s_2^2 / n_2) + registration error),       equation 1 there, as py4dgeo computes it,
+
+with the standard deviations s along n and the numbers n of points in the cylinder. The sign is the difference map's: missing rock
+is positive. Core points are pixel centres of the difference map, so that labels and annotations are shared.
+
+Limits: s also holds the wall's roughness within the cylinder, so LoD is too large on rough rock; it takes points as independent,
+so it is too small where noise is alike over more than a cylinder. Scales here are radii, as py4dgeo's; CloudCompare's are
+diameters.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pipeline.change.difference import SurfaceRaster
+from scene.config import Config
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.mesh import WALL, FloatArray, IntArray
+
+_LEAST_POINTS = 2
+"""In a cylinder of each epoch: fewer have no standard deviation."""
+
+
+class M3c2Config(Config):
+    """M3C2 by py4dgeo (`pip install scarpsim[m3c2]`)."""
+
+    core_step_px: int = Field(5, ge=1, description="core points: every so many pixels of the difference map, both ways")
+    normal_radius_m: float = Field(0.25, gt=0, description="radius of the neighbourhood that normals are fitted in")
+    cylinder_radius_m: float = Field(0.08, gt=0, description="radius of the cylinder whose points are averaged (half of d)")
+    maximum_distance_m: float = Field(2.0, gt=0, description="half length of the cylinder; deeper changes are not found")
+    direction: Literal["normal", "wall"] = Field(
+        "normal", description="along the reference's own normals, or all along the wall's normal, as the difference map"
+    )
+    registration_error_m: float = Field(0.0, ge=0, description="of the level of detection: what the registration adds")
+
+
+@dataclass(frozen=True)
+class M3c2Map:
+    """M3C2 distances at core points, as rasters over the wall's plane.
+
+    grid: one pixel a core point; distance, level: (h, w) float32, m, NaN without enough points; block: (h, w) the labels of the
+    difference map there; points: (n, 3) the core points, wall frame, m; place: (n,) their pixels, row by row.
+    """
+
+    grid: Grid
+    distance: NDArray[np.float32]
+    level: NDArray[np.float32]
+    block: IntArray
+    points: FloatArray
+    place: NDArray[np.int64]
+
+    @property
+    def significant(self) -> NDArray[np.bool_]:
+        """(h, w) where the change exceeds its level of detection."""
+        with np.errstate(invalid="ignore"):
+            return np.abs(self.distance) > self.level
+
+    def summary(self) -> dict[str, float | int | None]:
+        """Core points with a distance, how many are significant, and the median level of detection, m, as JSON holds it."""
+        known = ~np.isnan(self.level)
+        return {
+            "core_points": int(np.count_nonzero(~np.isnan(self.distance))),
+            "significant": int(np.count_nonzero(self.significant)),
+            "level_of_detection_median_m": float(np.median(self.level[known])) if known.any() else None,
+        }
+
+
+def core_grid(grid: Grid, step: int) -> tuple[Grid, slice]:
+    """The grid of core points and the rows and columns of `grid` whose pixels they take: the middle one of every `step`."""
+    width, height = (max(size // step, 1) for size in (grid.width, grid.height))
+    return replace(grid, gsd=grid.gsd * step, width=width, height=height), slice(step // 2, None, step)
+
+
+def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block: IntArray, config: M3c2Config) -> M3c2Map:
+    """Distances from the reference's points to the epoch's, (n, 3) and (m, 3), wall frame, m, both registered.
+
+    raster: of the reference, whose pixels are the core points; block: (h, w) the epoch's labels at them. The same for any number
+    of threads. Raises InputError where py4dgeo is not installed and where the map is smaller than a step.
+    """
+    grid, every = core_grid(raster.grid, config.core_step_px)
+    heights, labels = (full[every, every][: grid.height, : grid.width] for full in (raster.heights, block))
+    if heights.shape != grid.shape:
+        raise InputError("leaves no core point in the difference map", where="m3c2.core_step_px", remedy="lower it")
+    place = np.flatnonzero(np.isfinite(heights))
+    row, column = np.divmod(place, grid.width)
+    offset = (config.core_step_px // 2 + 0.5) * raster.grid.gsd  # of the pixel that is taken, from its cell's corner
+    x, y = grid.x_min + column * grid.gsd + offset, grid.y_max - row * grid.gsd - offset
+    core = np.stack([x, y, heights.ravel()[place].astype(np.float64)], axis=1)
+    distance, level = np.full((2, grid.height * grid.width), np.nan, dtype=np.float32)
+    if len(core):
+        distance[place], level[place] = _distances(reference, epoch, core, config)
+    distance, level = distance.reshape(grid.shape), level.reshape(grid.shape)
+    return M3c2Map(grid, distance, level, np.where(np.isnan(distance), WALL, labels).astype(np.int32), core, place)
+
+
+def _distances(
+    reference: FloatArray, epoch: FloatArray, core: FloatArray, config: M3c2Config
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(n,) distances, missing rock positive, and levels of detection, m, by py4dgeo; NaN with too few points."""
+    py4dgeo = _py4dgeo()
+    up = np.array([0.0, 0.0, 1.0])
+    algorithm = py4dgeo.M3C2(
+        epochs=(py4dgeo.Epoch(reference), py4dgeo.Epoch(epoch)),
+        corepoints=core,
+        cyl_radius=config.cylinder_radius_m,
+        normal_radii=[config.normal_radius_m],
+        orientation_vector=up,
+        corepoint_normals=up[None] if config.direction == "wall" else None,
+        max_distance=config.maximum_distance_m,
+        registration_error=config.registration_error_m,
+    )
+    outward, uncertainty = algorithm.run()
+    enough = (uncertainty["num_samples1"] >= _LEAST_POINTS) & (uncertainty["num_samples2"] >= _LEAST_POINTS)
+    level = uncertainty["lodetection"]
+    return tuple(np.where(enough, values, np.nan).astype(np.float32) for values in (-outward, level))  # type: ignore[return-value]
+
+
+def _py4dgeo() -> Any:
+    try:
+        import py4dgeo
+    except ImportError as error:
+        raise InputError(
+            f"needs py4dgeo, which does not load ({error})", where="m3c2", remedy="pip install 'scarpsim[m3c2]'"
+        ) from None
+    logging.getLogger("py4dgeo").setLevel(logging.WARNING)
+    return py4dgeo

@@ -1,0 +1,134 @@
+"""Who is compared: sensors out of configs, runs, bundled presets and model files, all in front of the first one's wall."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.config.bundled import bundled_config, configs_folder
+from pipeline.config.presets import is_path
+from pipeline.config.simulation import SensorName, SimulationConfig, load_config
+from scene.config import load_yaml, parse
+from scene.errors import InputError, nearest
+
+_SCENE = ("seed", "wall", "rockfall", "wetness", "texture", "illumination", "difference")
+"""What all share: taken from the first."""
+_KINDS = ("", "sites", "scanners", "noise")
+"""Subfolders of configs/ whose files can be named."""
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """A sensor with all that goes with it: its config's wall and blocks are everybody's."""
+
+    name: str
+    sensor: SensorName
+    config: SimulationConfig
+
+    @property
+    def angular_step_rad(self) -> tuple[float, float] | None:
+        """Of a laser scanner, in azimuth and in zenith; None for cameras."""
+        scanner = self.config.scanner
+        return (scanner.azimuth_step_rad, scanner.zenith_step_rad) if self.sensor == "tls" else None
+
+
+def contestants(
+    names: Sequence[str], overrides: Sequence[str] = (), seed: int | None = None, *, own_step: bool = False
+) -> list[Contestant]:
+    """The sensors that `names` stand for, in their order; a config with both sensors gives two.
+
+    A name is a config file, a run's folder or its run.json, a sensor model's file (sensor: tls ...), or a bundled name: a site,
+    a scanner preset (riegl_vz400i) or a noise model (glendale_high). Presets and models go into the first config's set-up, into
+    the demo's where they are first themselves. Scanner presets scan with that config's angular step, so that the instruments are
+    compared and not the time that they are given; own_step: with the preset's own, or the default's where it has none.
+    overrides: `--set` of every config. Raises InputError for an unknown name, with the nearest one, for one that is given twice,
+    and for whatever is wrong in a file.
+    """
+    _check_given_once(names)
+    first = next((name for name in names if not _is_part(name)), str(bundled_config("", "demo")))
+    base = _whole(first, overrides, seed)[0].config
+    shared = {key: getattr(base, key) for key in _SCENE}
+    found = [
+        each
+        for name in names
+        for each in (_part(name, base, own_step=own_step) if _is_part(name) else _whole(name, overrides, seed))
+    ]
+    placed = [replace(each, config=each.config.model_copy(update=shared)) for each in found]
+    return list(_with_own_names(placed))
+
+
+def _check_given_once(names: Sequence[str]) -> None:
+    """A sensor beside itself says nothing: the same epochs, to the byte."""
+    given: dict[Path, str] = {}
+    for name in names:
+        path = Path(name) / "run.json" if Path(name).is_dir() else Path(name)
+        file = (path if path.exists() or is_path(name) else _bundled(name)).resolve()
+        if file in given:
+            as_what = "" if given[file] == name else f", as {given[file]} and as {name}"
+            remedy = "name each sensor once; a copy of the file under another name can have other settings"
+            raise InputError(f"is given twice{as_what}", where=name, remedy=remedy)
+        given[file] = name
+
+
+def _is_part(name: str) -> bool:
+    """Whether a name stands for a scanner or a model alone, that needs a config around it."""
+    if Path(name).is_dir():
+        return False
+    if Path(name).is_file():
+        values = load_yaml(Path(name))
+        return isinstance(values, dict) and values.get("sensor") in ("stereo", "tls")
+    return not is_path(name) and _bundled(name).parent.name in ("scanners", "noise")
+
+
+def _bundled(name: str) -> Path:
+    folders = [configs_folder() / kind for kind in _KINDS]
+    path = next((folder / f"{name}.yaml" for folder in folders if (folder / f"{name}.yaml").is_file()), None)
+    if path is None:
+        known = sorted(found.stem for folder in folders for found in folder.glob("*.yaml"))
+        hint = nearest(name, known)
+        raise InputError(f"there is no file and no preset '{name}'", where="CONFIG", allowed=", ".join(known), remedy=hint)
+    return path
+
+
+def _whole(name: str, overrides: Sequence[str], seed: int | None) -> list[Contestant]:
+    """The sensors of a config file, a run or a bundled config."""
+    path = Path(name)
+    if path.is_dir():
+        path = path / "run.json"
+        if not path.is_file():
+            raise InputError("holds no run.json", where=name, remedy="name a run's folder or a config file")
+    elif not path.is_file() and not is_path(name):
+        path = _bundled(name)
+    config = load_config(path, overrides, None, seed)
+    sensors = config.sensor_names()
+    if path.suffix == ".json":
+        recorded = json.loads(path.read_text(encoding="utf-8")).get("sensor")
+        sensors = (recorded,) if recorded in ("stereo", "tls") else sensors[:1]
+    stem = path.parent.name if path.name == "run.json" else path.stem
+    return [Contestant(f"{stem}_{sensor}" if len(sensors) > 1 else stem, sensor, config) for sensor in sensors]
+
+
+def _part(name: str, base: SimulationConfig, *, own_step: bool) -> list[Contestant]:
+    """A scanner preset, with or without its own angular step, or a sensor model in the set-up of `base`."""
+    path = Path(name) if Path(name).is_file() else _bundled(name)
+    values: dict[str, Any] = base.model_dump(mode="json")
+    if path.parent.name == "scanners":
+        step = {} if own_step else {key: values["scanner"][key] for key in ("azimuth_step_rad", "zenith_step_rad")}
+        config = parse(SimulationConfig, values | {"scanner": {"preset": str(path), **step}, "sensor": []}, name)
+    else:
+        config = parse(SimulationConfig, values | {"sensor": [load_yaml(path)]}, name)
+    return [Contestant(path.stem, config.sensor[0].sensor, config)]
+
+
+def _with_own_names(found: Sequence[Contestant]) -> Iterator[Contestant]:
+    """The same with names that differ, so that each has files of its own."""
+    used: set[str] = set()
+    for each in found:
+        kind = [] if each.name.endswith(each.sensor) else [f"{each.name}_{each.sensor}"]
+        names = [each.name, *kind, *(f"{each.name}_{number}" for number in range(2, len(found) + 2))]
+        name = next(name for name in names if name not in used)
+        used.add(name)
+        yield replace(each, name=name)

@@ -1,0 +1,247 @@
+"""The config of a simulation: the model of all its sections, and how files and overrides become one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+
+from pipeline.change.annotate import AnnotationConfig
+from pipeline.change.difference import DifferenceConfig
+from pipeline.change.m3c2 import M3c2Config
+from pipeline.change.tiles import TileConfig
+from pipeline.config.bundled import bundled_config
+from pipeline.config.calibration import CalibrationConfig
+from pipeline.config.overrides import apply_overrides
+from pipeline.config.presets import is_path, model_file, spelled_out, with_preset, without_what_a_preset_sets
+from pipeline.formats.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras import PairConfig, read_cameras_yaml
+from pipeline.precision.detectability import PlanningConfig
+from pipeline.registration.register import IcpConfig
+from pipeline.surface.mesh import SurfaceConfig
+from pipeline.surface.reconstruct import FusionConfig, Reconstruction
+from pipeline.surface.stations import StationsConfig
+from scene.blocks import RockfallConfig
+from scene.config import Config, load_yaml, parse
+from scene.errors import InputError
+from scene.illumination import IlluminationConfig
+from scene.procedural import ProceduralWall
+from scene.texture import TextureConfig
+from scene.wall import WallConfig
+from scene.wetness import WetnessConfig
+from sensors.camera import CameraPair
+from sensors.exposure import ExposureConfig
+from sensors.matching import MatchingConfig
+from sensors.model import StereoModel, TlsModel
+from sensors.placement import RigConfig, StationConfig, Target
+from sensors.stereo import Quality
+from sensors.tls import ScannerConfig
+
+SensorName = Literal["stereo", "tls"]
+
+
+class CamerasFile(Config):
+    """A stereo pair out of a file: the project's cameras.yaml, Metashape's camera XML or COLMAP's text model."""
+
+    file: Path = Field(description="cameras.yaml, a Metashape camera XML, or the folder of a COLMAP text model")
+    left: str | None = Field(
+        None, description="label or image name of the left camera; none: of the only pair, told by where they stand"
+    )
+    right: str | None = Field(None, description="label or image name of the right camera")
+
+    def pair(self) -> CameraPair:
+        """The cameras, world frame."""
+        found = read_oriented(self.file)
+        return read_cameras_yaml(self.file) if found is None else stereo_pair(found, self.left, self.right, str(self.file))
+
+
+def _camera_kind(values: Any) -> str:
+    if isinstance(values, CamerasFile) or (isinstance(values, dict) and "file" in values):
+        return "in a file"
+    return "pair" if isinstance(values, PairConfig) or (isinstance(values, dict) and "left" in values) else "rig"
+
+
+CamerasConfig = Annotated[
+    Annotated[RigConfig, Tag("rig")] | Annotated[PairConfig, Tag("pair")] | Annotated[CamerasFile, Tag("in a file")],
+    Discriminator(_camera_kind),
+]
+
+
+StationChoice = Annotated[
+    Annotated[StationConfig, Tag("one")]
+    | Annotated[Annotated[tuple[StationConfig, ...], Field(min_length=1, max_length=255)], Tag("several")],
+    Discriminator(lambda values: "several" if isinstance(values, list | tuple) else "one"),
+]
+
+
+def _model_kind(values: Any) -> str:
+    return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
+
+
+SensorModel = Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_model_kind)]
+
+
+class ProductsConfig(Config):
+    """What is written beyond the raster products."""
+
+    truth_channels: bool = Field(True, description="the true range or depth of each point, as extra dimensions of points.laz")
+    world: bool | None = Field(None, description="points and surface in the wall's own coordinates too; none: for imported walls")
+    formats: tuple[Literal["ply", "xyz", "e57"], ...] = Field((), description="points in these formats too, beside points.laz")
+    block_meshes: bool = Field(
+        False, description="four meshes of each block: wall difference, intersection, niche, removed block"
+    )
+    metashape: bool = Field(False, description="stereo: depth maps and cameras with a script that loads them into Metashape")
+
+
+class SimulationConfig(Config):
+    """A simulation of one wall, observed before and after rocks fall."""
+
+    seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
+    epochs: int = Field(1, ge=1, le=9999, description="epochs after the reference, each with rockfalls of its own")
+    wall: WallConfig = Field(
+        ProceduralWall(), description="made by rule in the style of a site, or a mesh of your own: `mesh: FILE` and no `style`"
+    )
+    rockfall: RockfallConfig = RockfallConfig()
+    wetness: WetnessConfig | None = Field(None, description="wet patches of the rock, in every epoch; none: dry")
+    sensor: tuple[SensorModel, ...] = Field((), description="sensor models (noise and effects), at most one of each sensor")
+    cameras: CamerasConfig = Field(
+        RigConfig(),
+        description="two equal cameras in front of the wall's centre, or a pair of your own: `file: FILE`, `left`, `right`",
+    )
+    depth_map: Quality = Field("medium", description="depth map at 1/2 (high), 1/4 (medium), 1/8 (low) of the frame")
+    matcher: Literal["simulated", "sgbm"] = Field(
+        "simulated",
+        description="stereo: disparities by ray tracing plus noise (simulated), or photographs rendered and matched (sgbm), "
+        "whose errors are their own: the model's parallax and regularization noise then play no part",
+    )
+    illumination: IlluminationConfig = Field(IlluminationConfig(), description="light on the rock (matcher: sgbm)")
+    texture: TextureConfig = Field(TextureConfig(), description="texture of the rock (matcher: sgbm)")
+    exposure: ExposureConfig = Field(ExposureConfig(), description="from light to grey values (matcher: sgbm)")
+    matching: MatchingConfig = Field(MatchingConfig(), description="the real matcher (matcher: sgbm)")
+    scanner: ScannerConfig = Field(
+        ScannerConfig(),
+        description="the laser scanner and what it scans; `preset: riegl_vz400i` gives a real one, with its noise",
+    )
+    station: StationChoice = Field(
+        StationConfig(),
+        description="where the laser scanner stands; of several stations a list, whose first the others are joined to",
+    )
+    stations: StationsConfig = StationsConfig()
+    reconstruction: Reconstruction = Field(
+        "direct", description="surface from the sensor's own grid (direct), or by COLMAP from both depth maps (stereo)"
+    )
+    surface: SurfaceConfig = SurfaceConfig()
+    fusion: FusionConfig = FusionConfig()
+    icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: left out")
+    difference: DifferenceConfig = DifferenceConfig()
+    m3c2: M3c2Config | None = Field(None, description="M3C2 distances beside the difference maps; none: left out")
+    annotation: AnnotationConfig = AnnotationConfig()
+    tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")
+    products: ProductsConfig = ProductsConfig()
+    planning: PlanningConfig = PlanningConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_preset(cls, values: Any) -> Any:
+        return with_preset(values) if isinstance(values, dict) else values
+
+    @field_validator("sensor", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        models = [value] if isinstance(value, dict) else value
+        for model in models if isinstance(models, list) else []:
+            name = model.get("sensor") if isinstance(model, dict) else None
+            if isinstance(model, dict) and name not in ("stereo", "tls"):
+                raise ValueError("a sensor model needs `sensor: stereo` or `sensor: tls`")
+        return models
+
+    @field_validator("cameras", mode="before")
+    @classmethod
+    def _from_path(cls, value: Any) -> Any:
+        return {"file": value} if isinstance(value, str) else value
+
+    @field_validator("sensor")
+    @classmethod
+    def _one_of_each(cls, models: tuple[StereoModel | TlsModel, ...]) -> tuple[StereoModel | TlsModel, ...]:
+        if len({model.sensor for model in models}) < len(models):
+            raise ValueError("holds two models of one sensor")
+        return models
+
+    def sensor_names(self) -> tuple[SensorName, ...]:
+        """The sensors that the config has a model of; both where it has none, as then all is default."""
+        return tuple(model.sensor for model in self.sensor) or ("stereo", "tls")
+
+    def stereo_model(self) -> StereoModel:
+        return next((model for model in self.sensor if isinstance(model, StereoModel)), StereoModel())
+
+    def tls_model(self) -> TlsModel:
+        return next((model for model in self.sensor if isinstance(model, TlsModel)), TlsModel())
+
+    def stations_of_the_scanner(self) -> tuple[StationConfig, ...]:
+        """The laser scanner's stations, one or several."""
+        return (self.station,) if isinstance(self.station, StationConfig) else self.station
+
+    def camera_pair(self, target: Target) -> CameraPair:
+        """The nominal pair, world frame; a rig is placed in front of `target`."""
+        return self.cameras.place(target) if isinstance(self.cameras, RigConfig) else self.cameras.pair()
+
+
+def load_config(path: Path, overrides: Sequence[str], sensor: SensorName | None, seed: int | None) -> SimulationConfig:
+    """Read a config file, apply `--set` overrides and the seed.
+
+    Paths in the file are relative to its folder, those of overrides to the working folder; both become absolute.
+
+    The run.json of a finished run is a config too: that run again, to the byte. So is a bare sensor model (model.yaml,
+    model_after.yaml: its `sensor` is a word); all else is the demo's. A preset among the overrides goes before what the file
+    says of the instrument (pipeline/config/presets.py). Raises InputError for whatever is wrong, and where the config's only
+    models are of another sensor than `sensor` (None: any).
+    """
+    values, own = load_yaml(path), {}
+    values = {} if values is None else values
+    if not isinstance(values, dict):
+        raise InputError("is not a mapping of keys", where=str(path), remedy="write `key: value` lines; see `scarpsim init`")
+    if isinstance(values.get("config"), dict) and "schema" in values:
+        values = values["config"]
+    if isinstance(values.get("sensor"), str) and values["sensor"] in ("stereo", "tls"):
+        values, own = load_yaml(bundled_config("", "demo")), {"sensor": [values]}
+    later = spelled_out(overrides)
+    values = without_what_a_preset_sets(_with_paths(values, path.parent), later) | own
+    values = _with_paths(apply_overrides(values, later), Path.cwd())
+    if isinstance(values.get("sensor"), str):
+        values["sensor"] = load_yaml(model_file(values["sensor"]))
+    if seed is not None:
+        values["seed"] = seed
+    config = parse(SimulationConfig, values, str(path))
+    if values.get("sensor") and sensor is not None and sensor not in {model.sensor for model in config.sensor}:
+        raise InputError(
+            f"the only sensor model is of '{config.sensor[0].sensor}', and --sensor is {sensor}",
+            where=f"{path}: sensor",
+            remedy=f"add a model with `sensor: {sensor}`, or take the other --sensor",
+        )
+    return config
+
+
+def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The values with the paths in them made absolute, relative to `folder`."""
+
+    def absolute(path: Any) -> Any:
+        is_one = isinstance(path, str) and "\0" not in path  # whoever reads the others says what they are
+        return os.path.realpath(folder / path) if is_one else path  # Path.resolve raises at a loop of links
+
+    result = dict(values)
+    for section, key in (("wall", "mesh"), ("cameras", "file")):
+        if isinstance(result.get(section), dict) and key in result[section]:
+            result[section] = {**result[section], key: absolute(result[section][key])}
+    if isinstance(result.get("cameras"), str):
+        result["cameras"] = absolute(result["cameras"])
+    for key in ("scanner", "sensor"):
+        if isinstance(result.get(key), str) and is_path(result[key]):
+            result[key] = absolute(result[key])
+    scanner = result.get("scanner")
+    if isinstance(scanner, dict) and isinstance(scanner.get("preset"), str) and is_path(scanner["preset"]):
+        result["scanner"] = {**scanner, "preset": absolute(scanner["preset"])}
+    return result

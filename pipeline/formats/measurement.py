@@ -1,0 +1,308 @@
+"""A measurement as `scarpsim gap` takes it: points, the surface as known, the instrument and what is believed about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Discriminator, Field, Tag, field_validator
+
+from pipeline.change.areas import Area, in_areas
+from pipeline.formats.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras import read_cameras_yaml
+from pipeline.formats.measurement_checks import Fit, check_frame, check_inside, check_pulses, finite
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points import read_points
+from pipeline.formats.rounded_points import check_rounded_points
+from scene.config import Config, load_yaml, parse
+from scene.errors import InputError
+from scene.frame import WallFrame
+from scene.imported import read_reference
+from scene.mesh import FloatArray, TriangleMesh
+from scene.raycast import RayCaster
+from scene.winding import check_near, facing
+from sensors.camera import CameraPair, Matrix3, Vector3, check_rotation
+from sensors.model import StereoModel, TlsModel
+
+FILE = "measurement.yaml"
+Sweep = tuple[float, float, float]
+
+
+class ScannerPose(Config):
+    """Where the scanner stood, as surveyed."""
+
+    position_m: Vector3 = Field(description="scanner's centre, world frame [m]")
+    rotation: Matrix3 = Field(description="scanner to world; scanner z is the vertical axis")
+
+    @field_validator("rotation")
+    @classmethod
+    def _orthonormal(cls, rotation: Matrix3) -> Matrix3:
+        return check_rotation(rotation)
+
+
+class ScanPattern(Config):
+    """The nominal directions of a scan: start, stop and step of each angle."""
+
+    azimuth_rad: Sweep = Field(description="start, stop, step [rad]")
+    zenith_rad: Sweep = Field(description="start, stop, step [rad]")
+
+    @field_validator("azimuth_rad", "zenith_rad")
+    @classmethod
+    def _forward(cls, sweep: Sweep) -> Sweep:
+        if not (sweep[2] > 0 and sweep[1] > sweep[0]):
+            raise ValueError("needs start < stop and a step above 0")
+        if max(map(abs, sweep)) > 2 * math.pi:
+            raise ValueError(
+                f"is beyond a full turn; angles are in radians: {sweep[1]:g} degrees are {math.radians(sweep[1]):.4g}"
+            )
+        return sweep
+
+    @field_validator("zenith_rad")
+    @classmethod
+    def _above_nadir(cls, sweep: Sweep) -> Sweep:
+        if sweep[0] < -sweep[2] or sweep[1] > math.pi + sweep[2]:
+            raise ValueError("zenith angles run from 0, straight up, to pi, straight down")
+        return sweep
+
+
+class MeasurementConfig(Config):
+    """The file measurement.yaml."""
+
+    sensor: Literal["tls", "stereo"]
+    reference: Path = Field(description="the surface as known, world frame, m")
+    points: Path | list[Path] = Field(description="point cloud; several epochs: a list")
+    frame: Literal["scanner", "world"] = Field("world", description="of the points")
+    scanner: ScannerPose | None = None
+    pattern: ScanPattern | None = None
+    cameras: Path | None = Field(None, description="cameras.yaml or a Metashape XML: the nominal calibration (stereo)")
+    stable_areas: tuple[Area, ...] = Field(
+        (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]"
+    )
+    model: Path = Field(description="what the simulation believes about the sensor today")
+
+    @field_validator("points")
+    @classmethod
+    def _some(cls, points: Path | list[Path]) -> Path | list[Path]:
+        if points == []:
+            raise ValueError("names no file; give a path, or a list of one path an epoch")
+        return points
+
+
+def _kind(values: Any) -> str:
+    return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
+
+
+class _ModelFile(Config):
+    sensor: Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_kind)]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What was measured, with everything that predicts it.
+
+    cloud: points in the wall frame; reference: wall frame; station: position (3,) and rotation (3, 3) scanner to wall frame, TLS
+    only; cameras: world frame, stereo only; frame: the wall frame; order: each point's scan line and share of the scan's duration
+    (n,), None where not known, once they were counted (see `with_order`); stable_areas: outside of which the scene may have
+    changed, everywhere where there are none; notes: what should be said of the files.
+    """
+
+    sensor: Literal["tls", "stereo"]
+    cloud: PointCloud
+    reference: TriangleMesh
+    frame: WallFrame
+    model: TlsModel | StereoModel
+    pattern: ScanPattern | None = None
+    station: tuple[FloatArray, FloatArray] | None = None
+    cameras: CameraPair | None = None
+    order: tuple[FloatArray | None, FloatArray | None] | None = None
+    stable_areas: tuple[Area, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def epochs(self) -> NDArray[np.int64]:
+        """(n,) the epoch of each point, from 0."""
+        return np.asarray(self.cloud.extra.get("epoch", np.zeros(len(self.cloud.points))), dtype=np.int64)
+
+    @property
+    def stable(self) -> NDArray[np.bool_]:
+        """(n,) points in the areas where nothing moved; all where none are given."""
+        x, y = self.cloud.points[:, :2].T
+        return in_areas(self.stable_areas, x, y) if self.stable_areas else np.ones(len(x), dtype=bool)
+
+    @cached_property
+    def scene(self) -> RayCaster:
+        return RayCaster(self.reference)
+
+    @property
+    def viewpoint(self) -> FloatArray:
+        """(3,) where the rays begin, wall frame, m: the scanner's centre, the left camera's."""
+        if self.cameras is not None:
+            return self.frame.to_wall(self.cameras.left.position)
+        if self.station is None:
+            raise InputError("a TLS measurement needs `scanner`", where=FILE)
+        return self.station[0]
+
+    @property
+    def fit(self) -> Fit:
+        """How the points lie against the reference."""
+        return Fit.of(self.cloud.points, self.viewpoint, self.scene)
+
+    def changed(self, **values: Any) -> Measurement:
+        """The same with other points, cameras or pose, in front of the same ray caster."""
+        other = replace(self, **values)
+        other.__dict__["scene"] = self.scene  # where cached_property keeps it
+        return other
+
+    def part(self, rows: NDArray[np.int64]) -> Measurement:
+        """Some of the points."""
+        cloud = self.cloud
+        few = PointCloud(
+            points=cloud.points[rows],
+            intensity=None if cloud.intensity is None else cloud.intensity[rows],
+            gps_time=None if cloud.gps_time is None else cloud.gps_time[rows],
+            extra={name: values[rows] for name, values in cloud.extra.items()},
+        )
+        line, share = (None if values is None else values[rows] for values in self.order or (None, None))
+        return self.changed(cloud=few, order=self.order and (line, share))
+
+
+def read_model(path: Path) -> TlsModel | StereoModel:
+    """A file model.yaml. Raises InputError with the key that is wrong."""
+    values = load_yaml(path)
+    if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
+        raise InputError("names no sensor", where=str(path), allowed="sensor: tls, sensor: stereo")
+    return parse(_ModelFile, {"sensor": values}, str(path)).sensor
+
+
+def read_measurement(folder: Path) -> Measurement:
+    """Read a folder with measurement.yaml. Raises InputError that names the file and the key."""
+    path = folder / FILE if folder.is_dir() else folder
+    if not path.is_file():
+        raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
+    config, base = parse(MeasurementConfig, load_yaml(path), str(path)), path.parent
+    model = read_model(base / config.model)
+    if model.sensor != config.sensor:
+        raise InputError(f"model is of sensor {model.sensor}, the measurement of {config.sensor}", where=str(path))
+    cameras = _cameras(config, base, str(path))
+    file = base / config.reference
+    mesh, notes = read_reference(file)
+    viewpoints = _viewpoints(config, cameras, str(path))
+    check_near(mesh.vertices, viewpoints, str(file))
+    frame = WallFrame.fit(mesh.vertices, np.mean([*viewpoints.values()], axis=0))
+    reference = mesh.with_vertices(frame.to_wall(mesh.vertices))
+    reference, words = facing(reference, [frame.to_wall(position) for position in viewpoints.values()], str(file))
+    clouds = [finite(read_points(base / name), str(base / name)) for name in _files(config)]
+    said = [(config.reference, (*notes, words))]
+    for name, each in zip(_files(config), clouds, strict=True):
+        said.append((name, _rounding(each.points, config, model, cameras, str(base / name))))
+    cloud = _joined(clouds)
+    station = _station(config, frame)
+    found = Measurement(
+        sensor=config.sensor,
+        cloud=_in_wall_frame(cloud, config.frame, config.scanner, frame),
+        reference=reference,
+        frame=frame,
+        model=model,
+        pattern=config.pattern,
+        station=station,
+        cameras=cameras,
+        stable_areas=config.stable_areas,
+        notes=tuple(f"{name.name}: {note}" for name, texts in said for note in texts if note),
+    )
+    _check(found, cloud, config, str(path))
+    return found
+
+
+def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
+    """Raise InputError where the points (`cloud`: as read) fit neither pattern nor reference."""
+    if config.pattern is not None:
+        check_pulses(config.pattern.azimuth_rad, config.pattern.zenith_rad, len(cloud.points), where)
+    here, other = found.fit, None
+    if not here.good and config.scanner is not None:
+        unsaid: Literal["scanner", "world"] = "world" if config.frame == "scanner" else "scanner"
+        other = found.changed(cloud=_in_wall_frame(cloud, unsaid, config.scanner, found.frame)).fit
+    check_frame(here, other, config.frame, where)
+    if config.pattern is not None and found.station is not None:
+        position, rotation = found.station
+        local = np.einsum("ji,nj->ni", rotation, found.cloud.points - position)
+        check_inside(local, config.pattern.azimuth_rad, config.pattern.zenith_rad, where)
+
+
+def _files(config: MeasurementConfig) -> list[Path]:
+    return [config.points] if isinstance(config.points, Path) else config.points
+
+
+def _cameras(config: MeasurementConfig, base: Path, where: str) -> CameraPair | None:
+    if config.sensor == "tls":
+        return None
+    if config.cameras is None:
+        raise InputError("a stereo measurement needs `cameras`", where=where, remedy="name cameras.yaml or a Metashape XML")
+    file = base / config.cameras
+    found = read_oriented(file)
+    return read_cameras_yaml(file) if found is None else stereo_pair(found, None, None, str(file))
+
+
+def _viewpoints(config: MeasurementConfig, cameras: CameraPair | None, where: str) -> dict[str, FloatArray]:
+    """Where the sensors stand, by name, world frame."""
+    if cameras is not None:
+        return {"left camera": cameras.left.position, "right camera": cameras.right.position}
+    if config.scanner is None:
+        raise InputError("a TLS measurement needs `scanner`", where=where, remedy="give scanner: position_m and rotation")
+    return {"scanner": np.array(config.scanner.position_m)}
+
+
+def _rounding(
+    points: FloatArray, config: MeasurementConfig, model: TlsModel | StereoModel, cameras: CameraPair | None, where: str
+) -> tuple[str, ...]:
+    """What to say of the rounding of a file's points (n, 3), against the noise along the lines of sight."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return ()
+    if isinstance(model, TlsModel) or cameras is None:
+        viewpoint = np.zeros(3) if config.frame == "scanner" else _viewpoints(config, cameras, where)["scanner"]
+        noise = model.noise.range_sigma_m if isinstance(model, TlsModel) else np.inf
+        return check_rounded_points(points, viewpoint, noise, where)
+    left, right = cameras.left, cameras.right
+    depth = float(np.median((points - left.position) @ left.rotation[:, 2]))
+    disparity = np.hypot(model.noise.parallax_sigma_px, model.noise.regularization_sigma_px)
+    base = float(np.linalg.norm(right.position - left.position))
+    noise = depth**2 / (left.f_px * base) * disparity  # of Z = f B / d
+    return check_rounded_points(points, left.position, float(noise), where)
+
+
+def _station(config: MeasurementConfig, frame: WallFrame) -> tuple[FloatArray, FloatArray] | None:
+    if config.scanner is None:
+        return None
+    return frame.to_wall(np.array(config.scanner.position_m)), frame.rotation @ np.array(config.scanner.rotation)
+
+
+def _joined(clouds: list[PointCloud]) -> PointCloud:
+    """One cloud of all epochs, with the channels that all have."""
+    if len(clouds) == 1:
+        return clouds[0]
+    shared = set.intersection(*(set(cloud.extra) for cloud in clouds))
+    columns: dict[str, Any] = {}
+    for name in ("intensity", "gps_time"):
+        parts = [getattr(cloud, name) for cloud in clouds]
+        columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
+    extra = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in sorted(shared)}
+    extra["epoch"] = np.repeat(np.arange(len(clouds)), [len(cloud.points) for cloud in clouds])
+    return PointCloud(np.concatenate([cloud.points for cloud in clouds]), extra=extra, **columns)
+
+
+def _in_wall_frame(
+    cloud: PointCloud, of: Literal["scanner", "world"], scanner: ScannerPose | None, frame: WallFrame
+) -> PointCloud:
+    points = cloud.points
+    if of == "scanner" and scanner is not None:
+        turn = frame.rotation @ np.array(scanner.rotation)
+        points = np.einsum("ij,nj->ni", turn, points) + frame.to_wall(np.array(scanner.position_m))
+    else:
+        points = frame.to_wall(points)
+    intensity = None if cloud.intensity is None else np.asarray(cloud.intensity, dtype=np.float64)
+    return PointCloud(points, intensity, cloud.gps_time, cloud.extra)

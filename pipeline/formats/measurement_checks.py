@@ -1,0 +1,145 @@
+"""What a measurement must hold before it is used: points that are numbers, look at the reference and fit the pattern.
+
+Rays with NaN or infinity never reach the ray tracer, and nothing here takes more than a sample of the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.point_cloud import PointCloud
+from scene.errors import InputError
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+
+_SAMPLE = 20_000
+_FEWEST_HITS, _FEWEST_NEAR = 0.01, 0.25
+"""Share of the points whose rays must meet the reference, and of these the share that must lie near it."""
+_NEAR_M, _NEAR_SHARE = 1.0, 0.02
+"""A point is near the reference within this distance along its ray, or within this share of its range if that is more."""
+_FEWEST_INSIDE = 0.5
+"""Share of the points that must lie within the pattern's angles."""
+_PULSES_PER_POINT, _FEW_PULSES = 100.0, 1e6
+"""A pattern has no more pulses than so many for each point, or than so many in all."""
+_ONE_PLACE_M = 1e-6
+_LEAST_SIGMA = {"tls": (1e-6, "m", "range_sigma_m"), "stereo": (2e-4, "px", "parallax_sigma_px")}
+"""By sensor: a smaller predicted spread is none; its unit; the key that says more."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a sample of the points lies against the reference. hits: share whose rays meet it; near: of these, share near it;
+    off_m: median distance behind it along the rays (negative: before it), NaN without hits."""
+
+    hits: float
+    near: float
+    off_m: float
+
+    @classmethod
+    def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster) -> Fit:
+        """points: (n, 3), origin: (3,) of the rays; wall frame, m."""
+        away = points[:: max(len(points) // _SAMPLE, 1)] - origin
+        length = np.linalg.norm(away, axis=1)
+        away, length = away[length > _ONE_PLACE_M], length[length > _ONE_PLACE_M]
+        if not len(length):
+            return cls(0.0, 0.0, np.nan)
+        distance = reference.cast(origin, away / length[:, None])[0]
+        hit = np.isfinite(distance)
+        off = (length - distance)[hit]
+        near = np.abs(off) <= np.maximum(_NEAR_M, _NEAR_SHARE * length[hit])
+        return cls(float(hit.mean()), float(near.mean()) if len(off) else 0.0, float(np.median(off)) if len(off) else np.nan)
+
+    @property
+    def good(self) -> bool:
+        """Whether the points are of this surface."""
+        return self.hits >= _FEWEST_HITS and self.near >= _FEWEST_NEAR
+
+
+def finite(cloud: PointCloud, where: str) -> PointCloud:
+    """The points whose coordinates and recorded values are numbers. Raises InputError where there are none, or all are one."""
+    channels = [cloud.intensity, cloud.gps_time, *(cloud.extra.get(name) for name in ("pixel_x", "pixel_y"))]
+    keep: NDArray[np.bool_] = np.all(np.isfinite(cloud.points), axis=1)
+    for channel in channels:
+        if channel is not None:
+            keep = keep & np.isfinite(channel)
+    if not keep.any():
+        problem = f"holds no point with finite values ({len(keep):,} are NaN or infinite)" if len(keep) else "holds no points"
+        raise InputError(problem, where=where, remedy="export the points again")
+    if keep.sum() > 1 and np.ptp(cloud.points[keep], axis=0).max() < _ONE_PLACE_M:
+        raise InputError(f"all {keep.sum():,} points are the same one", where=where, remedy="export the points again")
+    return cloud if keep.all() else _rows(cloud, keep)
+
+
+def _rows(cloud: PointCloud, keep: NDArray[np.bool_]) -> PointCloud:
+    return PointCloud(
+        cloud.points[keep],
+        None if cloud.intensity is None else cloud.intensity[keep],
+        None if cloud.gps_time is None else cloud.gps_time[keep],
+        {name: channel[keep] for name, channel in cloud.extra.items()},
+    )
+
+
+def check_frame(here: Fit, other: Fit | None, frame: str, where: str) -> None:
+    """Raise InputError where the points do not look at the reference, naming the frame in which they would.
+
+    here: in the frame that the file names, other: in the one that it does not.
+    """
+    if here.good:
+        return
+    if other is not None and other.good:
+        fits = "world" if frame == "scanner" else "scanner"
+        problem = f"the points are no points of the reference in `frame: {frame}`, but are in `frame: {fits}`"
+        raise InputError(problem, where=where, remedy=f"write `frame: {fits}`")
+    if here.hits < _FEWEST_HITS:
+        problem = f"{100 * here.hits:.2g} % of the points lie in a direction in which the sensor sees the reference"
+        remedy = "check `frame`, the sensor's position and rotation, and the coordinate system of points and reference (m)"
+        raise InputError(problem, where=where, allowed=f"{100 * _FEWEST_HITS:g} % and more", remedy=remedy)
+
+
+def check_near(here: Fit) -> None:
+    """Raise InputError where most points lie far from the reference, so that no pose or effect explains it."""
+    if here.good:
+        return
+    problem = (
+        f"the points lie {abs(here.off_m):.3g} m {'behind' if here.off_m > 0 else 'before'} the reference (median along the rays)"
+    )
+    allowed = f"a quarter of them within {_NEAR_M:g} m or {100 * _NEAR_SHARE:g} % of the range"
+    remedy = "check the sensor's position, the unit (m) and that points and reference are of one wall"
+    raise InputError(problem, where="measurement.yaml", allowed=allowed, remedy=remedy)
+
+
+def check_pulses(azimuth: tuple[float, float, float], zenith: tuple[float, float, float], points: int, where: str) -> None:
+    """Raise InputError for a pattern (start, stop, step) of far more pulses than points."""
+    pulses = float(np.prod([(stop - start) / step + 1 for start, stop, step in (azimuth, zenith)]))
+    most = max(_PULSES_PER_POINT * points, _FEW_PULSES)
+    if pulses > most:
+        raise InputError(
+            f"'pattern' has {pulses:.3g} pulses, for {points:,} points", where=where, allowed=f"at most {most:.3g}",
+            remedy="check the steps (third value, rad), or leave `pattern` out",
+        )  # fmt: skip
+
+
+def check_inside(points: FloatArray, azimuth: tuple[float, float, float], zenith: tuple[float, float, float], where: str) -> None:
+    """Raise InputError where a pattern does not hold the points (n, 3), scanner frame."""
+    x, y, z = points.T
+    angle = np.arccos(np.clip(z / np.maximum(np.linalg.norm(points, axis=1), _ONE_PLACE_M), -1, 1))
+    turned = np.mod(np.arctan2(y, x) - azimuth[0] + azimuth[2], 2 * np.pi)
+    inside = turned <= azimuth[1] - azimuth[0] + 2 * azimuth[2]
+    inside &= (angle >= zenith[0] - zenith[2]) & (angle <= zenith[1] + zenith[2])
+    if inside.mean() < _FEWEST_INSIDE:
+        raise InputError(
+            f"'pattern' holds {100 * inside.mean():.2g} % of the points", where=where,
+            allowed=f"{100 * _FEWEST_INSIDE:g} % and more",
+            remedy="azimuth is atan2(y, x), zenith counts from +z, both in the scanner frame, rad; or leave `pattern` out",
+        )  # fmt: skip
+
+
+def check_noise(sensor: str, sigma: FloatArray) -> None:
+    """Raise InputError where the model predicts no spread (n,), against which no residual means anything."""
+    least, unit, key = _LEAST_SIGMA[sensor]
+    if sigma.min(initial=np.inf) < least:
+        problem = f"the model predicts a spread of {sigma.min():.2g} {unit}"
+        raise InputError(problem, where="model.yaml: noise", allowed=f"{least:g} {unit} and more", remedy=f"state `{key}`")

@@ -1,0 +1,229 @@
+"""What may explain a disagreement: an effect of the catalogue, or a free form of one covariate, as columns of a design."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.mesh import FloatArray
+
+Rows = NDArray[np.int64]
+Explanation = tuple[str, bool]
+"""An effect, or all free forms of a covariate: its name, and whether it is empirical."""
+_KNOTS = 5
+_STEPS = 13
+"""Places at which a step in a covariate is tried: quantiles of it."""
+_MOST_CYCLES = 12.0
+_CHUNK = 32
+PLACE = "place along"
+HARMONICS, SURFACE = "harmonics", "surface"
+_DEGREE = 4
+_OVERTONES = range(2, 6)
+_DIRECTIONS = (30, 60, 120, 150)
+"""Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
+
+
+@dataclass(frozen=True)
+class Wave:
+    """A searched sine: columns factor * sin, factor * cos of 2 pi x / period. key: the parameter that holds the period."""
+
+    key: str
+    factor: FloatArray
+    x: FloatArray
+
+    def columns(self, period: float) -> FloatArray:
+        """(n, 2) the two columns at one period."""
+        angle = 2 * np.pi / period * self.x
+        return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+    def with_slope(self, period: float, coefficients: FloatArray) -> FloatArray:
+        """(n, 3) the two columns, and the change of their sum, weighted by `coefficients` (2,), by the frequency 1 / period."""
+        sine, cosine = self.columns(period).T
+        slope = 2 * np.pi * self.x * (coefficients[0] * cosine - coefficients[1] * sine)
+        return np.stack([sine, cosine, slope], axis=1)
+
+    def part(self, rows: Rows) -> Wave:
+        """The wave on some of the points."""
+        return Wave(self.key, self.factor[rows], self.x[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One explanation. matrix: (n, k) observable per unit of each coefficient; parameters: coefficients to the effect's values.
+
+    names: the parameters that the coefficients stand for; fixed: searched or chosen values that belong to this variant, such as
+    the camera; form: of an empirical one; wave: of a searched sine, whose period is `period` (that of harmonics too);
+    precision: (k,) inverse variance of the coefficients by what is typical of the effect, None where nothing is known.
+    """
+
+    name: str
+    matrix: FloatArray | None
+    parameters: Callable[[FloatArray], dict[str, float]]
+    names: tuple[str, ...]
+    fixed: Mapping[str, float | str] = field(default_factory=dict)
+    empirical: bool = False
+    form: str = ""
+    wave: Wave | None = None
+    period: float = 0.0
+    precision: FloatArray | None = None
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """(n, k) the design."""
+        if self.matrix is not None:
+            return self.matrix
+        assert self.wave is not None
+        return self.wave.columns(self.period)
+
+    def part(self, rows: Rows) -> Candidate:
+        """The candidate on some of the points."""
+        matrix = None if self.matrix is None else self.matrix[rows]
+        return replace(self, matrix=matrix, wave=None if self.wave is None else self.wave.part(rows))
+
+    @property
+    def family(self) -> str:
+        """Variants of one family differ in searched or chosen values only."""
+        return f"free {self.name} {self.form}" if self.empirical else self.name
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A sine of which evenly spaced frequencies are tried. amplitude: name of the parameter; fixed: values of all variants."""
+
+    name: str
+    amplitude: str
+    wave: Wave
+    frequencies: FloatArray
+    fixed: Mapping[str, float | str] = field(default_factory=dict)
+    empirical: bool = False
+
+    def candidate(self, index: int) -> Candidate:
+        """The variant at one of the frequencies."""
+        return self.at(1 / float(self.frequencies[index]))
+
+    def at(self, period: float) -> Candidate:
+        """The variant of any period: its coefficients are those of sine and cosine, and where given a change of the frequency."""
+        amplitude, key = self.amplitude, self.wave.key
+
+        def parameters(values: FloatArray) -> dict[str, float]:
+            changed = 1 / (1 / period + (values[2] if len(values) > 2 else 0.0))
+            return amplitude_and_phase(values[:2], amplitude) | {key: float(changed)}
+
+        names = (amplitude, "phase_rad", key)
+        form = "wave" if self.empirical else ""
+        fixed = {**self.fixed, key: period}
+        return Candidate(self.name, None, parameters, names, fixed, self.empirical, form, self.wave, period)
+
+    def chunks(self, rows: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
+        """Some frequencies at a time, with their columns (n, 2 f) times `rows` (n,): sine and cosine of each, one after another.
+
+        Frequencies are evenly spaced, so that each is the one before turned by the same angle.
+        """
+        count = len(self.frequencies)
+        spacing = float(self.frequencies[1] - self.frequencies[0]) if count > 1 else 0.0
+        factor, turn = self.wave.factor * rows, np.exp(2j * np.pi * spacing * self.wave.x)
+        for start in range(0, count, _CHUNK):
+            stop = min(start + _CHUNK, count)
+            columns = np.empty((2 * (stop - start), len(factor)))
+            phasor = factor * np.exp(2j * np.pi * float(self.frequencies[start]) * self.wave.x)
+            for row in range(stop - start):
+                columns[2 * row], columns[2 * row + 1] = phasor.imag, phasor.real
+                phasor = phasor * turn
+            yield slice(start, stop), columns.T
+
+    def part(self, rows: Rows) -> Grid:
+        """The grid on some of the points."""
+        return replace(self, wave=self.wave.part(rows))
+
+
+def variants(families: list[Candidate | Grid]) -> list[Candidate]:
+    """Every candidate, the searched ones at each of their frequencies."""
+    return [
+        candidate
+        for family in families
+        for candidate in (
+            [family.candidate(index) for index in range(len(family.frequencies))] if isinstance(family, Grid) else [family]
+        )
+    ]
+
+
+def amplitude_and_phase(values: FloatArray, amplitude: str) -> dict[str, float]:
+    """a sin x + b cos x as amplitude and phase."""
+    return {amplitude: float(np.hypot(*values)), "phase_rad": float(np.arctan2(values[1], values[0]))}
+
+
+def frequencies(low: float, high: float, step: float, most: int = 200) -> FloatArray:
+    """Evenly from low to high by about `step`, at most some hundreds."""
+    return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
+
+
+def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> list[Candidate | Grid]:
+    """Forms of one covariate that stand for no effect: a line, a parabola, a smooth curve, a step, a wave.
+
+    highest: frequency from which on a wave is an effect of the catalogue.
+    """
+    x = (values - values.mean()) / (float(values.std()) or 1.0)
+    knots = np.quantile(x, np.linspace(0, 1, _KNOTS)[1:-1])
+    columns = [x, x**2, x**3, *(np.maximum(x - knot, 0) ** 3 for knot in knots)]
+    smooth = np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
+    steps = np.unique(np.quantile(x, np.linspace(0, 1, _STEPS + 2)[1:-1]))
+    found: list[Candidate | Grid] = [
+        _free(covariate, "line", smooth[:, :1]),
+        _free(covariate, "parabola", smooth[:, :2]),
+        _free(covariate, "smooth", smooth),
+        *(_free(covariate, "step", (x > place).astype(np.float64)[:, None]) for place in steps),
+    ]
+    reach = float(np.ptp(np.quantile(x, [0.005, 0.995])))
+    if reach > 0:
+        tried = frequencies(0.8 / reach, _MOST_CYCLES / reach, 0.5 / reach)
+        tried = tried[tried < highest * float(values.std())]
+        if len(tried) > 1:
+            found.append(Grid(covariate, "amplitude", Wave("period", np.ones_like(x), x), tried, {}, True))
+    return found
+
+
+def moved_to(candidate: Candidate, period: float) -> Candidate:
+    """The same sine with another period."""
+    wave = candidate.wave
+    assert wave is not None
+    return Grid(candidate.name, candidate.names[0], wave, np.empty(0), candidate.fixed, candidate.empirical).at(period)
+
+
+def precision_of(candidate: Candidate, width: int) -> FloatArray:
+    """(width,) of its coefficients; 0 where nothing is known of them."""
+    return np.zeros(width) if candidate.precision is None else candidate.precision
+
+
+def harmonics(covariate: str, sine: Candidate) -> Candidate:
+    """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the fifth."""
+    wave = sine.wave
+    assert wave is not None
+    columns = np.concatenate([wave.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
+    return replace(_free(covariate, HARMONICS, columns), period=sine.period)
+
+
+def surface_form(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:
+    """A polynomial of two covariates (n,) together, which stands for no effect."""
+    s, t = ((values - values.mean()) / (float(values.std()) or 1.0) for values in (x, y))
+    powers = [(a, degree - a) for degree in range(1, _DEGREE + 1) for a in range(degree + 1)]
+    columns = np.stack([s**a * t**b for a, b in powers], axis=1)
+    return _free(f"{first} and {second}", SURFACE, columns / columns.std(axis=0))
+
+
+def places(at: FloatArray) -> list[Candidate | Grid]:
+    """Free forms of places (n, 2) on the wall in slanting directions, which no sensor knows of.
+
+    What they gain is the reference's doing, in all likelihood, and so may as much be that a covariate gains which changes along
+    the wall too.
+    """
+    turned = [(angle, at @ np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])) for angle in _DIRECTIONS]
+    return [form for angle, x in turned for form in free_forms(f"{PLACE} {angle}", x)]
+
+
+def _free(covariate: str, form: str, matrix: FloatArray) -> Candidate:
+    names = tuple(f"c{index}" for index in range(matrix.shape[1]))
+    return Candidate(covariate, matrix, lambda c: dict(zip(names, map(float, c), strict=True)), names, {}, True, form)

@@ -1,0 +1,224 @@
+"""Mean effects by generalised least squares, with a correlated error of the reference.
+
+The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over
+metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process plus the
+noise of a mean; the deviations within cells are white. Both parts add their information on b. How the reference's error is
+correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms (isotropic waves of about one length, the covariance
+of each being Bessel's J0) of several lengths are kept as far as the data allow. For each of them one eigendecomposition serves
+every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised over the covariance too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.spatial.distance import cdist
+from scipy.special import j0
+
+from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.residuals.residuals import NOT_SHARED, SharedNoise
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+
+_ROUGH, _SMOOTH, _WAVY = (0.7, 1.5, 3.0), (1.0, 2.0), (1.7, 2.5, 3.5, 5.0)
+"""Lengths in cells of the three forms of correlation; of some 30 x 25 cells, so that the longest are still local."""
+_BAND = 0.7, 1.9, 6
+"""Wavelengths of a wavy error, from and to, of its length, and how many stand for the band."""
+_RATIOS = np.geomspace(0.003, 300.0, 25)
+"""Variance of the reference's error over the median variance of a cell's mean."""
+_MOST_RATIOS = 6
+_WORSE = 12.0
+"""A length of correlation whose likelihood falls short of the best by more, whatever is fitted, is not carried along."""
+_RIDGE = 1e-12
+_NOTHING = 1e-14
+"""Columns so much smaller than the largest are rounding, and count as absent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """One covariance of the cell means. length: number of the basis; ratio: of the correlated part; weight: (m,) inverse
+    eigenvalues."""
+
+    length: int
+    ratio: float
+    weight: FloatArray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Coefficients (k,) and covariance (k, k) of the design's columns; log_likelihood and the covariance it was reached with."""
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    log_likelihood: float
+    at: Covariance
+
+
+class MeanModel:
+    """The linear algebra of one set of points. Rows of whatever it takes are those of `rows`: points in cells, cell by cell."""
+
+    def __init__(self, cells: Cells, sigma: FloatArray, shared_noise: SharedNoise = NOT_SHARED) -> None:
+        inside = np.flatnonzero(cells.cell >= 0)
+        self.rows = inside[np.argsort(cells.cell[inside], kind="stable")]
+        self._cell = cells.cell[self.rows]
+        self._starts = np.flatnonzero(np.diff(self._cell, prepend=-1))
+        self.root = 1 / sigma[self.rows]
+        self._total = np.add.reduceat(self.root**2, self._starts)
+        variance = 1 / self._total + shared_noise.of_means(cells.side_m)
+        scale = np.sqrt(variance)
+        self._share = 1 / np.sqrt(self._total * variance)
+        self.typical_sigma = typical = float(np.median(scale))
+        distance = cdist(cells.centre, cells.centre) / cells.side_m
+        self._bases: list[tuple[FloatArray, FloatArray]] = []
+        for kernel in _correlations(distance):
+            values, vectors = eigh(kernel * (typical**2 / np.outer(scale, scale)), driver="evd", overwrite_a=True)
+            self._bases.append((np.maximum(values, 0.0), vectors))
+        self._white = Covariance(0, 0.0, np.ones(len(self._total)))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def _at(self, length: int, ratio: float) -> Covariance:
+        return Covariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
+
+    def narrowed(self, designs: list[Projected], value: Projected) -> tuple[list[Covariance], list[int]]:
+        """Covariances under which the value is likely, whichever of the designs is fitted (the least and the most of them).
+
+        Bases that none of them needs are forgotten: returns also which are kept, for `Projected.kept` of what there is already.
+        """
+        ratios = [0.0, *map(float, _RATIOS)]
+        tops = np.empty((len(designs), len(self._bases)), dtype=int)
+        heights = np.empty(tops.shape)
+        for row, design in enumerate(designs):
+            normal = _Normal.of(design, value)
+            for basis in range(len(self._bases)):
+                found = [normal.at(self._at(basis, ratio)).log_likelihood for ratio in ratios]
+                tops[row, basis], heights[row, basis] = int(np.argmax(found)), max(found)
+        kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
+        self._bases = [self._bases[basis] for basis in kept]
+        chosen: list[Covariance] = []
+        for number, basis in enumerate(kept):
+            low, high = max(tops[:, basis].min() - 1, 0), min(tops[:, basis].max() + 1, len(ratios) - 1)
+            places = np.unique(np.rint(np.linspace(low, high, min(_MOST_RATIOS, high - low + 1))).astype(int))
+            chosen += [self._at(number, ratios[place]) for place in places]
+        return [*dict.fromkeys(chosen)], kept
+
+    @property
+    def fine(self) -> list[Covariance]:
+        """Every covariance of the bases in use."""
+        return [self._at(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
+
+    def sums(self, weighted: FloatArray) -> FloatArray:
+        """(m, k) sums over each cell of columns (n, k)."""
+        return np.asarray(np.add.reduceat(weighted, self._starts, axis=0))
+
+    def means(self, weighted: FloatArray) -> FloatArray:
+        """(m, k) cell means over their standard deviations, of columns (n, k) that are already over sigma."""
+        return self.sums(weighted * self.root[:, None]) / np.sqrt(self._total)[:, None]
+
+    def within(self, weighted: FloatArray, means: FloatArray, rows: slice = slice(None)) -> FloatArray:
+        """Deviations from the cells' means, of `rows`; columns over sigma."""
+        cell = self._cell[rows]
+        spread = (means / np.sqrt(self._total)[:, None])[cell] * self.root[rows, None]
+        return np.asarray(weighted[rows] - spread)
+
+    def between(self, means: FloatArray) -> list[FloatArray]:
+        """Cell means (m, k) in each basis."""
+        return [vectors.T @ (means * self._share[:, None]) for _, vectors in self._bases]
+
+    def project(self, weighted: FloatArray) -> Projected:
+        """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
+        means = self.means(weighted)
+        return Projected(self.within(weighted, means), self.between(means))
+
+    def null_draws(self, at: Covariance, count: int, random: KeyedRandom) -> list[FloatArray]:
+        """Draws of the cell means under the covariance `at`, (m, count) in each basis."""
+        draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
+        vectors = self._bases[at.length][1]
+        return [draws if index == at.length else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
+
+
+def _correlations(distance: FloatArray) -> Iterator[FloatArray]:
+    """Correlation matrices for cells at these distances, in cells."""
+    for length in _ROUGH:
+        reach = np.sqrt(3.0) * distance / length
+        yield (1 + reach) * np.exp(-reach)
+    for length in _SMOOTH:
+        yield np.exp(-0.5 * (distance / length) ** 2)
+    for length in _WAVY:
+        waves = length * np.geomspace(*_BAND)
+        yield np.mean([j0(2 * np.pi * distance / wave) for wave in waves], axis=0)
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Columns on both parts of the data. within: (n, k); between: (m, k) per basis."""
+
+    within: FloatArray
+    between: list[FloatArray]
+
+    def some(self, columns: list[int]) -> Projected:
+        """Some of the columns."""
+        return Projected(self.within[:, columns], [part[:, columns] for part in self.between])
+
+    def kept(self, bases: list[int]) -> Projected:
+        """In some of the bases."""
+        return Projected(self.within, [self.between[basis] for basis in bases])
+
+    def beside(self, other: Projected) -> Projected:
+        """These columns and then those of another."""
+        both = zip(self.between, other.between, strict=True)
+        return Projected(np.concatenate([self.within, other.within], axis=1), [np.concatenate(pair, axis=1) for pair in both])
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """What the normal equations of one design hold at any covariance."""
+
+    columns: Projected
+    value: Projected
+    gram: FloatArray
+    right: FloatArray
+    square: float
+
+    @classmethod
+    def of(cls, columns: Projected, value: Projected) -> _Normal:
+        y = value.within[:, 0]
+        return cls(columns, value, columns.within.T @ columns.within, columns.within.T @ y, float(y @ y))
+
+    def at(self, at: Covariance, precision: FloatArray | None = None) -> Fit:
+        """All columns fitted. precision: (k, k) inverse covariance of the coefficients, around 0, before there are data."""
+        basis, y = self.columns.between[at.length], self.value.between[at.length][:, 0]
+        weighted = basis * at.weight[:, None]
+        constant = 0.5 * (np.log(at.weight).sum() - y @ (at.weight * y) - self.square)
+        matrix = self.gram + weighted.T @ basis
+        matrix = matrix if precision is None else matrix + precision
+        return _solve(matrix, self.right + weighted.T @ y, float(constant), at)
+
+
+def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> Fit:
+    """All columns fitted to one value, at the most likely of the covariances. precision: (k, k) as in `_Normal.at`.
+
+    The likelihood is that of what the columns leave (REML, Patterson & Thompson 1971), and the coefficients' covariance is a mean
+    over all covariances by it, with what they differ: which of them is true is not known.
+    """
+    normal = _Normal.of(columns, value)
+    fits = [normal.at(each, precision) for each in covariances]
+    likelihood = np.array([fit.log_likelihood + 0.5 * np.linalg.slogdet(fit.covariance)[1] for fit in fits])
+    best = fits[int(np.argmax(likelihood))]
+    weights = np.exp(likelihood - likelihood.max())
+    weights /= weights.sum()
+    moves = np.stack([fit.coefficients - best.coefficients for fit in fits])
+    covariance = np.einsum("f,fij->ij", weights, np.stack([fit.covariance for fit in fits]))
+    return replace(best, covariance=covariance + np.einsum("f,fi,fj->ij", weights, moves, moves))
+
+
+def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> Fit:
+    size = np.sqrt(np.diag(matrix))
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max())
+    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(right))) * np.outer(scale, scale)
+    coefficients = inverse @ right
+    return Fit(coefficients, inverse, constant + 0.5 * float(right @ coefficients), at)

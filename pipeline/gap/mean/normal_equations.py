@@ -1,0 +1,187 @@
+"""The normal equations of all candidates at every covariance of the cell means, so that any set of them can be compared at once.
+
+Columns are of two kinds: fixed ones, whose products with each other are all known, and searched sines, of each of which only the
+products with itself and with the fixed columns are. A sine that is to stand beside others becomes fixed first (`extended`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.gap.mean.candidates import Grid
+from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
+from scene.mesh import FloatArray
+
+_SMALLEST = 1e-9
+"""Share of a column that others have to leave of it, in variance, for its gain to be told from rounding."""
+_RIDGE = 1e-12
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Products of w sines (2 w columns) on the deviations within cells. fixed: (2 w, k) with fixed columns; own: (w, 2, 2);
+    right: (2 w, v) with the values; noise: (2 w, d) with draws of white noise; means: (m, 2 w) of the cells."""
+
+    fixed: FloatArray
+    own: FloatArray
+    right: FloatArray
+    noise: FloatArray
+    means: FloatArray
+
+    @classmethod
+    def of(
+        cls, model: MeanModel, grids: list[Grid], fixed: FloatArray, value: FloatArray, noise: FloatArray, rows: slice
+    ) -> Waves:
+        """fixed, value: (n, .) within cells; noise: (n', .) on some `rows` of the points."""
+        parts: list[tuple[FloatArray, ...]] = []
+        beside = np.concatenate([fixed, value], axis=1)
+        for grid in grids:
+            for _, columns in grid.chunks(model.root):
+                means = model.means(columns)
+                products = columns.T @ beside
+                pairs, spread = columns.T.reshape(-1, 2, len(columns)), means.T.reshape(-1, 2, len(means))
+                own = pairs @ pairs.transpose(0, 2, 1) - spread @ spread.transpose(0, 2, 1)
+                parts.append((products, own, model.within(columns, means, rows).T @ noise, means.T))
+        if not parts:
+            empty = np.zeros((0, fixed.shape[1])), np.zeros((0, 2, 2)), np.zeros((0, value.shape[1]))
+            return cls(*empty, np.zeros((0, noise.shape[1])), np.zeros((len(model.means(fixed[:, :1])), 0)))
+        products, own, drawn, means = (np.concatenate([part[k] for part in parts]) for k in range(4))
+        return cls(products[:, : fixed.shape[1]], own, products[:, fixed.shape[1] :], drawn, means.T)
+
+
+def wave_products(grids: list[Grid], within: FloatArray, root: FloatArray) -> FloatArray:
+    """(2 w, k) of all sines with further columns (n, k), which are within cells."""
+    found = [columns.T @ within for grid in grids for _, columns in grid.chunks(root)]
+    return np.concatenate(found) if found else np.zeros((0, within.shape[1]))
+
+
+@dataclass(frozen=True)
+class Equations:
+    """For each of C covariances. fixed: (C, k, k); right: (C, k, v); constant: (C, v) log-likelihood without any column;
+    wave_fixed: (C, 2 w, k); wave_own: (C, w, 2, 2); wave_right: (C, 2 w, v); at: the covariances."""
+
+    at: list[Covariance]
+    fixed: FloatArray
+    right: FloatArray
+    constant: FloatArray
+    wave_fixed: FloatArray
+    wave_own: FloatArray
+    wave_right: FloatArray
+
+    def with_precision(self, precision: FloatArray) -> Equations:
+        """The same where the fixed columns' coefficients are known to lie about 0. precision: (k,) inverse variances."""
+        return replace(self, fixed=self.fixed + np.diag(precision))
+
+    def of_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> Equations:
+        """The same columns with other values."""
+        return replace(self, right=right, constant=constant, wave_right=wave_right)
+
+    def some(self, chosen: list[int]) -> Equations:
+        """At some of the covariances."""
+        arrays = (self.fixed, self.right, self.constant, self.wave_fixed, self.wave_own, self.wave_right)
+        return Equations([self.at[index] for index in chosen], *(array[chosen] for array in arrays))
+
+    def log_likelihood(self, base: list[int]) -> FloatArray:
+        """(C, v) with the fixed columns `base`."""
+        right = self.right[:, base]
+        return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self._solved(base, right)))
+
+    def _solved(self, base: list[int], right: FloatArray) -> FloatArray:
+        matrix = self.fixed[:, base][:, :, base]
+        scale = 1 / np.sqrt(np.maximum(np.einsum("ckk->ck", matrix), 1e-300))
+        regular = matrix * scale[:, :, None] * scale[:, None, :] + _RIDGE * np.eye(len(base))
+        return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
+
+    def profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Largest log-likelihoods over the covariances: (v,) of `base`, (f, v) with each list of columns added, (w, v) with each
+        sine added."""
+        count = self.right.shape[2]
+        wanted = sorted({column for columns in fixed for column in columns})
+        place = {column: row for row, column in enumerate(wanted)}
+        beside = self.fixed[:, base][:, :, wanted]
+        waves = self.wave_fixed[:, :, base].transpose(0, 2, 1)
+        solved = self._solved(base, np.concatenate([self.right[:, base], beside, waves], axis=2))
+        value, others, sines = np.split(solved, [count, count + len(wanted)], axis=2)
+        plain = self.constant + 0.5 * np.einsum("ckv,ckv->cv", self.right[:, base], value)
+        left = self.right[:, wanted] - beside.transpose(0, 2, 1) @ value
+        own = self.fixed[:, wanted][:, :, wanted]
+        rest = own - beside.transpose(0, 2, 1) @ others
+        gains = np.stack(
+            [(plain + _gain(rest, own, left, [place[column] for column in columns])).max(axis=0) for columns in fixed]
+        ) if fixed else np.zeros((0, count))  # fmt: skip
+        turned = self.wave_right - self.wave_fixed[:, :, base] @ value
+        return plain.max(axis=0), gains, self._wave_profile(plain, turned, sines, base)
+
+    def _wave_profile(self, plain: FloatArray, right: FloatArray, solved: FloatArray, base: list[int]) -> FloatArray:
+        """Two columns at a time: the explained square by the inverse of a 2 x 2 matrix."""
+        count = self.wave_own.shape[1]
+        crossed = self.wave_fixed[:, :, base].reshape(len(self.at), count, 2, len(base))
+        mine = solved.transpose(0, 2, 1).reshape(len(self.at), count, 2, len(base))
+        matrix = self.wave_own - crossed @ mine.transpose(0, 1, 3, 2)
+        a, b, d = (matrix[:, :, i, j][..., None] for i, j in ((0, 0), (0, 1), (1, 1)))
+        r, s = right[:, 0::2], right[:, 1::2]
+        determinant = a * d - b * b
+        whole = (self.wave_own[:, :, 0, 0] * self.wave_own[:, :, 1, 1])[..., None]
+        explained = np.where(determinant > _SMALLEST * whole, 0.5 * (r * r * d - 2 * r * s * b + s * s * a), 0.0)
+        gains = explained / np.where(determinant > _SMALLEST * whole, determinant, 1.0)
+        return np.asarray((plain[:, None] + np.maximum(gains, 0.0)).max(axis=0))
+
+
+def _gain(rest: FloatArray, own: FloatArray, left: FloatArray, columns: list[int]) -> FloatArray:
+    """(C, v) explained by some columns of what the base leaves: `rest` of their products `own`, `left` of the right side."""
+    matrix, right = rest[:, columns][:, :, columns], left[:, columns]
+    scale = np.sqrt(np.maximum(np.einsum("ckk->ck", own)[:, columns], 1e-300))
+    values, vectors = np.linalg.eigh(matrix / scale[:, :, None] / scale[:, None, :])
+    turned = vectors.transpose(0, 2, 1) @ (right / scale[:, :, None])
+    share = np.where(values > _SMALLEST, 1 / np.maximum(values, _SMALLEST), 0.0)
+    return np.asarray(0.5 * np.einsum("ck,ckv->cv", share, turned**2))
+
+
+def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: Projected, waves: Waves) -> Equations:
+    """The equations at the covariances `at`."""
+    between = model.between(waves.means)
+    gram, right = fixed.within.T @ fixed.within, fixed.within.T @ value.within
+    square = np.einsum("nv,nv->v", value.within, value.within)
+    columns: list[tuple[FloatArray, ...]] = []
+    for each in at:
+        basis, y, sines = fixed.between[each.length], value.between[each.length], between[each.length]
+        weight = each.weight[:, None]
+        turned = (sines * weight).T
+        pairs = turned.reshape(-1, 2, len(weight)), sines.T.reshape(-1, 2, len(weight))
+        constant = 0.5 * (np.log(each.weight).sum() - np.sum(y * weight * y, axis=0) - square)
+        columns.append(
+            (
+                gram + (basis * weight).T @ basis,
+                right + (basis * weight).T @ y,
+                constant,
+                waves.fixed + turned @ basis,
+                waves.own + pairs[0] @ pairs[1].transpose(0, 2, 1),
+                waves.right + turned @ y,
+            )
+        )
+    return Equations(at, *(np.stack(parts) for parts in zip(*columns, strict=True)))
+
+
+def extended(
+    model: MeanModel,
+    equations: Equations,
+    had: Projected,
+    value: Projected,
+    added: Projected,
+    waves: FloatArray,
+    means: FloatArray,
+) -> Equations:
+    """With further fixed columns. had: the fixed columns so far; waves: (2 w, a) products with the sines; means: theirs."""
+    between = model.between(means)
+    cross, own = had.within.T @ added.within, added.within.T @ added.within
+    right = added.within.T @ value.within
+    fixed, sides, sines = [], [], []
+    for row, each in enumerate(equations.at):
+        weighted = added.between[each.length] * each.weight[:, None]
+        beside = cross + had.between[each.length].T @ weighted
+        fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.length].T @ weighted]]))
+        sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.length]]))
+        sines.append(np.concatenate([equations.wave_fixed[row], waves + between[each.length].T @ weighted], axis=1))
+    return replace(equations, fixed=np.stack(fixed), right=np.stack(sides), wave_fixed=np.stack(sines))

@@ -1,0 +1,134 @@
+"""How each effect of the catalogue on the mean would show in the residuals: columns that are linear in amplitudes.
+
+The equations are the effects' own (`Effect.mean`); those of the cameras follow from projecting through the changed pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.mean.candidates import Candidate, Grid, Wave, amplitude_and_phase, frequencies, variants
+from pipeline.gap.residuals.nominal_pair import NominalPair, StereoGeometry, real_pair, seen_disparities
+from pipeline.gap.residuals.residuals import Residuals
+from scene.mesh import FloatArray
+from sensors.effects import catalogue
+from sensors.effects.base import Effect, Search, ShowsIn
+from sensors.effects.camera_effect import CameraEffect
+from sensors.effects.pixel_locking import PixelLocking
+
+_SIDES = ("left", "right", "both")
+_STEP = 0.1
+"""Of a parameter's typical size, in finite differences."""
+_PHASE = "phase_rad"
+_SCALE_UNKNOWN = 0.03
+_REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
+
+
+def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
+    """Every effect of the catalogue on the mean that the recorded fields allow, cameras and searched parameters as variants."""
+    return variants(mean_families(residuals, measurement))
+
+
+def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | Grid]:
+    """The same with each searched sine as one grid."""
+    geometry = residuals.geometry
+    shown = [effect for effect in catalogue(residuals.sensor) if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
+    cameras: list[type[CameraEffect]] = [effect for effect in shown if issubclass(effect, CameraEffect)]
+    found = _of_cameras(cameras, geometry, measurement) if cameras else []
+    for effect in shown:
+        if effect not in cameras:
+            sides: list[dict[str, str]] = [{"camera": side} for side in _SIDES[:2]] if "camera" in effect.model_fields else [{}]
+            found += [form for fixed in sides for form in _families(effect, geometry, fixed)]
+    return [*found, *_locking(geometry)] if residuals.sensor == "stereo" else found
+
+
+def _families(effect: type[Effect], geometry: Any, fixed: dict[str, Any]) -> Iterator[Candidate | Grid]:
+    """What one effect allows, by its own equation at typical sizes."""
+    if effect.searched is not None:
+        yield from _searched(effect, effect.searched, geometry, fixed)
+    elif _PHASE in effect.model_fields:
+        (amplitude,) = effect.typical_sizes()
+        yield Candidate(
+            effect.tag(),
+            _sine_and_cosine(effect, geometry, fixed),
+            lambda values: amplitude_and_phase(values, amplitude) | fixed,
+            (amplitude, _PHASE),
+            fixed,
+        )
+    else:
+        sizes = effect.typical_sizes()
+        for keys in effect.sets or (tuple(sizes),):
+            columns = [effect(**fixed, **{key: sizes[key]}).mean(geometry) / sizes[key] for key in keys]
+            yield Candidate(effect.tag(), np.stack(columns, axis=1), partial(_by_name, keys), keys, fixed)
+
+
+def _sine_and_cosine(effect: type[Effect], geometry: Any, fixed: dict[str, Any]) -> FloatArray:
+    """(n, 2) a sin(x + phase) = (a cos phase) sin x + (a sin phase) cos x, of amplitude 1."""
+    ((amplitude, size),) = effect.typical_sizes().items()
+    values = (effect(**fixed, **{amplitude: size, _PHASE: phase}).mean(geometry) / size for phase in (0.0, np.pi / 2))
+    return np.stack([*values], axis=1)
+
+
+def _searched(effect: type[Effect], search: Search, geometry: Any, fixed: dict[str, Any]) -> Iterator[Grid]:
+    """A grid of periods as fine as the reach of what the sine runs along can tell apart."""
+    (amplitude,) = effect.typical_sizes()
+    x = np.asarray(effect(**fixed).argument(geometry), dtype=np.float64)
+    reach = max(float(np.ptp(np.quantile(x, [0.01, 0.99]))), search.shortest)
+    low = 1 / search.longest if search.longest else search.cycles / reach
+    if low >= 1 / search.shortest:
+        return
+    angle = 2 * np.pi * x / search.shortest
+    columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
+    factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
+    yield Grid(effect.tag(), amplitude, Wave(search.period, factor, x), frequencies(low, 1 / search.shortest, 0.3 / reach), fixed)
+
+
+def _of_cameras(effects: list[type[CameraEffect]], geometry: StereoGeometry, measurement: Measurement) -> list[Candidate | Grid]:
+    """By finite differences: the changed pair sees other disparities."""
+    nominal = NominalPair.of(measurement)
+    sets = {effect: effect.sets or (tuple(effect.nulls()),) for effect in effects}
+    varied = [
+        (effect, side, key, _STEP * next(iter(effect.typical_sizes().values())))
+        for effect in effects
+        for side in _SIDES
+        for key in sorted({key for keys in sets[effect] for key in keys})
+    ]
+    changed = (real_pair(nominal, (effect(camera=side, **{key: step}),), measurement) for effect, side, key, step in varied)
+    base, *seen = seen_disparities(nominal, [nominal.pair, *changed], geometry)
+    columns = {(effect, side, key): (each - base) / step for (effect, side, key, step), each in zip(varied, seen, strict=True)}
+    return [
+        Candidate(
+            effect.tag(),
+            np.stack([columns[effect, side, key] for key in keys], axis=1),
+            partial(_by_name, keys),
+            keys,
+            {"camera": side},
+        )
+        for effect in effects
+        for side in _SIDES
+        for keys in sets[effect]
+    ]
+
+
+def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
+    return dict(zip(names, map(float, values), strict=True))
+
+
+def _locking(geometry: StereoGeometry) -> list[Grid]:
+    """A sine of the disparity with the pixels of the matched image, full or reduced, at any phase.
+
+    The rectification in which the disparities were found is not part of a measurement: its principal distance (the period) is
+    known to some percent, its offset (the phase) not at all. Locking that acts on the noise too leaves little of its mean.
+    """
+    reach = max(float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99]))), 1.0)
+    one = np.ones_like(geometry.disparity)
+    return [
+        Grid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity), tried)
+        for reduction in _REDUCTIONS
+        if (tried := frequencies((1 - _SCALE_UNKNOWN) / reduction, (1 + _SCALE_UNKNOWN) / reduction, 0.3 / reach, 80)).size
+    ]

@@ -1,0 +1,54 @@
+"""Every explanation of the mean that a measurement allows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.mean.candidates import Candidate, Grid, free_forms, places, surface_form
+from pipeline.gap.mean.signatures import mean_families
+from pipeline.gap.naming.entries import PLANES
+from pipeline.gap.residuals.residuals import Residuals
+from sensors.effects import EFFECTS, effect_of
+
+PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
+"""Sines, and along what: an error that repeats but is no sine is not theirs."""
+_NOT_FREE = ("edge_step", "line", "disparity_fraction")
+_LARGEST = 20.0
+"""Standard deviation of an effect's size before there are data, in typical sizes."""
+
+
+def believes(measurement: Measurement, name: str) -> bool:
+    """Whether the model holds an effect already."""
+    return any(effect.name == name for effect in measurement.model.effects)
+
+
+def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | Grid]:
+    """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
+    named = mean_families(part, measurement)
+    lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, Grid) and each.name in PERIODIC}
+    free = [
+        form
+        for name, values in part.covariates.items()
+        if name not in _NOT_FREE and np.ptp(values) > 0
+        for form in free_forms(name, values, highest=lowest.get(name, np.inf))
+    ]
+    first, second = PLANES[part.sensor]
+    both = surface_form(first, second, part.covariates[first], part.covariates[second])
+    return [*map(_with_precision, named), *free, both, *places(part.at)]
+
+
+def _with_precision(candidate: Candidate | Grid) -> Candidate | Grid:
+    """With what is typical of its effect: two effects that nearly cancel each other must not do so at any size."""
+    if isinstance(candidate, Grid):
+        return candidate
+    typical = effect_of(candidate.name).typical_sizes()
+    units = np.eye(len(candidate.names))
+    first = next(iter(typical.values()))
+    sizes = [
+        typical.get(key, first) / max(abs(candidate.parameters(unit)[key]), 1e-300) if not key.startswith("phase") else first
+        for key, unit in zip(candidate.names, units, strict=True)
+    ]
+    return replace(candidate, precision=1 / (_LARGEST * np.array(sizes)) ** 2)

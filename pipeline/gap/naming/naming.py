@@ -1,0 +1,146 @@
+"""Naming: effects on the mean and on the spread, from the points that selection may look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.mean.candidates import PLACE
+from pipeline.gap.mean.selection import MeanSearch, Tried
+from pipeline.gap.naming.entries import Named, from_comb, from_locking, from_mean, from_spread, within_bounds
+from pipeline.gap.naming.families import believes, families_of
+from pipeline.gap.naming.relinearised import Points, beyond, followed_up, noisier, weighed
+from pipeline.gap.other.locking import find_locking
+from pipeline.gap.other.quantization import find_comb
+from pipeline.gap.other.spread import SpreadFound, SpreadTried, find_spread, share_of_spread
+from pipeline.gap.other.stereo_noise import find_nodes, told_apart
+from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.residuals.registration import registered
+from pipeline.gap.residuals.residuals import Residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.pixel_locking import PixelLocking
+from sensors.effects.range_quantization import RangeQuantization
+from sensors.effects.regularization_noise import RegularizationNoise
+from sensors.model import StereoModel
+
+_NODES = RegularizationNoise.tag()
+
+
+@dataclass(frozen=True)
+class Naming:
+    """What the selection leaves beside the effects: what was tried for the mean and for the spread, notes, and the standard
+    deviation of the reference.
+
+    moving: names of the effects on the mean; p_value, p_alone: of what remains beside all of them, and without any; None where
+    nothing was tried; share: `share_of_spread`.
+    """
+
+    tried: tuple[Tried, ...]
+    spread_tried: tuple[SpreadTried, ...]
+    moving: frozenset[str]
+    p_value: float | None
+    p_alone: float | None
+    share: float
+    notes: tuple[str, ...]
+    identifiability: dict[str, Any]
+    reference_sigma: float
+
+    def p_beside(self, named: Sequence[Named]) -> float | None:
+        """Of what remains beside those that were kept of the effects on the mean; None where that was not drawn."""
+        kept = self.moving & {item.name for item in named}
+        if kept == self.moving:
+            return self.p_value
+        return None if kept else self.p_alone
+
+
+def name_effects(
+    measurement: Measurement,
+    part: Residuals,
+    scale: float,
+    random: KeyedRandom,
+    left_out: frozenset[tuple[str, bool]] = frozenset(),
+) -> tuple[list[Named], Naming]:
+    """Effects on the mean and on the spread.
+
+    What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
+    slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread; left_out:
+    families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word.
+    """
+    named: list[Named] = []
+    whole, whole_scale, added = part, scale, 0.0
+    tls = part.sensor == "tls"
+    comb = find_comb(part.geometry.measured_m) if tls and not believes(measurement, RangeQuantization.tag()) else None
+    if comb is not None:
+        named.append(from_comb(comb, part))
+        added, scale = comb.step_m**2 / 12, 1.0
+    locking = (
+        None if tls or believes(measurement, PixelLocking.tag()) else find_locking(part.geometry.found, part.geometry.disparity)
+    )
+    found_apart = set()
+    if locking is not None:
+        named.append(from_locking(locking))
+        added = locking.amplitude_px**2 / 2
+        found_apart.add((PixelLocking.tag(), False))
+    part = noisier(part, added)
+    allowed = (each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out | found_apart)
+    families = list(allowed)
+    spread, spread_tried = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
+    if wrong := _too_wide(measurement, spread):
+        return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
+    points = Points(measurement, part, families, spread, (scale, added), random)
+    first = MeanSearch(weighed(part, spread, scale), families, random)
+    found = followed_up(points, first)
+    wrong = beyond(measurement, found.estimates, found.at)
+    left = found.search.without(found.beside)
+    if found.chosen and not wrong:
+        spread, spread_tried = _spread(measurement, found.at, found.search.cells, left, random, left_out)
+    if not spread and isinstance(measurement.model, StereoModel) and (_NODES, False) not in left_out:
+        nodes = find_nodes(found.at, left, measurement.model, random)
+        spread = [] if nodes is None else [nodes]
+    if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
+        return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
+    moving = [from_mean(each, found.at) for each in found.estimates]
+    named += moving
+    named += [from_spread(each, part.sensor) for each in spread]
+    names, cosines, survival = first.identifiability()
+    share = 1.0 if spread else share_of_spread(found.at, found.search.cells, left)
+    notes = (*part.notes, *_words(left_out))
+    p_value = found.search.p_value(found.tried[0].score) if found.tried else None
+    alone = first.tried(()) if moving else ()
+    p_alone = first.p_value(alone[0].score) if alone else p_value
+    names_moving = frozenset(each.name for each in moving)
+    table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
+    tried = found.chosen[0].tried if found.chosen else found.tried
+    shown = tuple(item for item in tried if not item.name.startswith(PLACE))
+    sigma = found.search.reference_sigma(found.beside)
+    return named, Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma)
+
+
+def _spread(
+    measurement: Measurement,
+    part: Residuals,
+    cells: Cells,
+    value: FloatArray,
+    random: KeyedRandom,
+    left_out: frozenset[tuple[str, bool]],
+) -> tuple[list[SpreadFound], list[SpreadTried]]:
+    """Effects on the spread of residuals (n,) without the mean effects found, and what was tried."""
+    names = frozenset(name for name, empirical in left_out if not empirical)
+    found, tried = find_spread(part, cells, value, random, names)
+    model = measurement.model
+    apart = told_apart(found, part, value, model) if found and isinstance(model, StereoModel) else found
+    return [each for each in apart if each.effect not in names], tried
+
+
+def _too_wide(measurement: Measurement, spread: list[SpreadFound]) -> frozenset[tuple[str, bool]]:
+    """Families of the spread whose values lie beyond the bounds of the effect that is to hold them."""
+    entries = {each.effect: from_spread(each, measurement.sensor).entry for each in spread}
+    return frozenset((name, False) for name, entry in entries.items() if not within_bounds(measurement.model, entry))
+
+
+def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
+    said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out))
+    return [f"{what} left out: the best value is beyond what a config may hold" for what in said]

@@ -1,0 +1,265 @@
+"""Explanations of the mean with the effects in the model, where the first search had only slopes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, Grid, harmonics, precision_of
+from pipeline.gap.mean.selection import Chosen, MeanSearch, Tried
+from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, with_effects
+from pipeline.gap.naming.families import PERIODIC, families_of
+from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.residuals.registration import registered, settled
+from pipeline.gap.residuals.residuals import OUTLIER, BoolArray, Residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects import effect_of
+from sensors.effects.matching_noise import MatchingNoise
+
+_SLOPES_SERVE = 10.0
+"""Log-likelihood by which slopes may be wrong on an effect for them to serve."""
+_LEAST_KEPT = 0.9
+"""Share of the points whose rays must still meet the reference with an effect."""
+_MOST_CONVERGED, _ROUNDS, _CONVERGED = 3, 4, 1.0
+"""Effects whose values are sought exactly, by so many rounds, while the log-likelihood rises by so much."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """What the searches for effects on the mean share. spread: effects on it that are known; noise: how many predicted sigmas the
+    residuals spread, and variance to add to the predicted one."""
+
+    measurement: Measurement
+    part: Residuals
+    families: list[Candidate | Grid]
+    spread: list[SpreadFound]
+    noise: tuple[float, float]
+    random: KeyedRandom
+
+
+@dataclass(frozen=True)
+class Explained:
+    """Effects that a search chose, and what a search beside them, taken exactly, found.
+
+    estimates: of both; search, at, tried: the last search, its residuals and what it tried; beside: what it chose.
+    """
+
+    chosen: list[Chosen]
+    estimates: list[Estimate]
+    search: MeanSearch
+    at: Residuals
+    beside: list[Chosen]
+    tried: tuple[Tried, ...]
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Empirical terms, and all effects."""
+        return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
+
+
+@dataclass(frozen=True)
+class _Alone:
+    """One effect in the model. at: residuals against that; log_likelihood: of all points."""
+
+    chosen: Chosen
+    estimate: Estimate
+    at: Residuals
+    there: Measurement
+    log_likelihood: float
+
+    @classmethod
+    def of(cls, points: Points, first: MeanSearch, chosen: Chosen, estimate: Estimate) -> _Alone | None:
+        """None where it is beyond what can be, or where the rays of many points would miss the reference with it."""
+        if beyond(points.measurement, [estimate], points.part):
+            return None
+        there, found = _with(points, [estimate])
+        rough, _, scale = registered(found)
+        largest = OUTLIER * scale * found.sigma
+        value, kept = np.zeros(len(points.part)), _kept(found, points.part)
+        if kept.mean() < _LEAST_KEPT:
+            return None
+        value[kept] = np.where(found.smooth, np.clip(rough, -largest, largest), 0.0)
+        return cls(chosen, estimate, _at_points(found, points.part), there, first.log_likelihood(value, estimate.candidate))
+
+    def better(self, points: Points, first: MeanSearch) -> _Alone | None:
+        """With its values moved by the slopes here."""
+        candidate = _renewed(self.estimate.candidate, families_of(self.there, self.at))
+        columns = np.concatenate([self.at.pose, candidate.columns], axis=1) / self.at.sigma[:, None]
+        known = np.concatenate([np.zeros(6), precision_of(candidate, candidate.columns.shape[1])])
+        step = np.linalg.solve(columns.T @ columns + np.diag(known), columns.T @ (self.at.value / self.at.sigma))
+        return _Alone.of(points, first, self.chosen, replace(self.estimate, values=self.estimate.values + step[6:]))
+
+
+def followed_up(points: Points, first: MeanSearch) -> Explained:
+    """What the first search chose, with what stands beside it when it is taken exactly.
+
+    Slopes miss some of a large effect, and others then make up for it: where one alone, taken exactly, needs fewer beside it,
+    that is the explanation.
+    """
+    together, tried = first.select()
+    plain = Explained(together, _estimates(first, together), first, points.part, together, tried)
+    one = _largest_alone(points, first) if together else None
+    if one is None:
+        return _beside(points, plain)
+    by_itself = _beside(points, replace(plain, chosen=[one.chosen], estimates=[one.estimate]))
+    if len(by_itself.estimates) == 1:
+        return by_itself
+    found = [each for each in (_beside(points, plain), by_itself) if not beyond(points.measurement, each.estimates, each.at)]
+    return min(found, key=lambda each: each.complexity, default=plain)
+
+
+def _largest_alone(points: Points, first: MeanSearch) -> _Alone | None:
+    """The effect that explains most by itself, of those that explain much; None where slopes say all."""
+    found: list[_Alone] = []
+    for candidate in first.leading():
+        chosen = first.alone(candidate)
+        (estimate,) = _estimates(first, [chosen])
+        alone = _Alone.of(points, first, chosen, estimate)
+        if alone is None:
+            continue
+        if not found and abs(alone.log_likelihood - first.log_likelihood(points.part.value, candidate)) < _SLOPES_SERVE:
+            return None
+        found.append(alone)
+    likely = sorted(found, key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
+    return max((_converged(points, first, each) for each in likely), key=lambda each: each.log_likelihood, default=None)
+
+
+def _converged(points: Points, first: MeanSearch, alone: _Alone) -> _Alone:
+    """At the values that explain most."""
+    for _ in range(_ROUNDS):
+        better = alone.better(points, first)
+        if better is None or better.log_likelihood < alone.log_likelihood + _CONVERGED:
+            break
+        alone = better
+    return alone
+
+
+def _beside(points: Points, chosen: Explained) -> Explained:
+    """With what a search finds beside the effects, unless they are beyond what can be."""
+    physical = [each for each in chosen.estimates if not each.candidate.empirical]
+    if not physical or beyond(points.measurement, chosen.estimates, chosen.at):
+        return chosen
+    search, at, estimates, beside, tried = _again(points, physical, chosen.search.gains_alone)
+    return replace(chosen, estimates=estimates, search=search, at=at, beside=beside, tried=tried)
+
+
+def beyond(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
+    """Families whose estimate lies beyond the bounds of the effect."""
+    wrong = [each for each in estimates if not is_possible(measurement.model, from_mean(each, part).entry)]
+    return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
+
+
+def noisier(part: Residuals, variance: float) -> Residuals:
+    return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
+
+
+def weighed(part: Residuals, spread: list[SpreadFound], scale: float) -> Residuals:
+    """With the spread that the points really have."""
+    if not spread:
+        return replace(part, sigma=part.sigma * scale)
+    made = (effect_of(each.effect)(**each.parameters) for each in spread if each.parameters)
+    shared = [effect for effect in made if isinstance(effect, MatchingNoise) and effect.shared]
+    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in spread))
+    return replace(part, sigma=sigma, shared_noise=part.shared_noise.beside(shared))
+
+
+def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
+    candidates, fit = search.refined([item.candidate for item in chosen])
+    places = search.split(np.arange(len(fit.coefficients)), candidates)
+    return [
+        Estimate(item, candidate, fit.coefficients[place], fit.covariance[np.ix_(place, place)])
+        for item, candidate, place in zip(chosen, candidates, places, strict=True)
+    ]
+
+
+def _again(
+    points: Points, had: list[Estimate], alone: Mapping[Explanation, float]
+) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]]:
+    """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
+
+    alone: what each explanation gains by itself. Returns the search, its residuals, the effects with what was found beside them,
+    that only, and what was tried last.
+    """
+    part, noise = points.part, points.noise
+    there, found = _with(points, had)
+    at = noisier(_at_points(found, part), noise[1])
+    renewed = families_of(there, at)
+    allowed = {(family.name, family.empirical) for family in points.families}
+    names = {each.candidate.name for each in had}
+    others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
+    known = [replace(each, candidate=_renewed(each.candidate, renewed)) for each in had]
+    columns = [_columns(each) for each in known]
+    others += [harmonics(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
+    heavier = weighed(at, [replace(each, variance=each.variance[_kept(at, part)]) for each in points.spread], noise[0])
+    precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
+    search = MeanSearch(
+        replace(heavier, pose=np.concatenate([at.pose, *columns], axis=1)),
+        others,
+        points.random.child("again"),
+        np.concatenate([np.zeros(at.pose.shape[1]), *precision]),
+        alone,
+    )
+    chosen, tried = search.select()
+    fit = search.refined([item.candidate for item in chosen])[1]
+    kept, start = [], at.pose.shape[1]
+    for each, matrix in zip(known, columns, strict=True):
+        place = slice(start, start := start + matrix.shape[1])
+        kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
+    return search, at, _without_sines([*kept, *_estimates(search, chosen)]), chosen, tried
+
+
+def _with(points: Points, effects: list[Estimate]) -> tuple[Measurement, Residuals]:
+    """The measurement with some effects in its model, settled, and its residuals."""
+    model = with_effects(points.measurement.model, [from_mean(each, points.part).entry for each in effects])
+    return settled(points.measurement.changed(model=model), points.part.index)[:2]
+
+
+def _without_sines(estimates: list[Estimate]) -> list[Estimate]:
+    """A named sine with overtones becomes one empirical term."""
+    found = list(estimates)
+    for overtones in (each for each in estimates if each.candidate.form == HARMONICS):
+        sine = next(each for each in estimates if PERIODIC.get(each.candidate.name) == overtones.candidate.name)
+        both = np.concatenate([sine.candidate.columns, overtones.candidate.columns], axis=1)
+        width = sine.candidate.columns.shape[1]
+        values = np.concatenate([sine.values[:width], overtones.values])
+        found = [each for each in found if each is not sine and each is not overtones]
+        found.append(replace(overtones, candidate=replace(overtones.candidate, matrix=both), values=values))
+    return found
+
+
+def _at_points(found: Residuals, part: Residuals) -> Residuals:
+    """What was found at the points of a part, where the surface is smooth there too and they are no outliers."""
+    rough, _, scale = registered(found)
+    good = found.smooth & (np.abs(rough) < OUTLIER * scale * found.sigma)
+    place = np.full(int(max(found.index.max(), part.index.max())) + 1, -1)
+    place[found.index[good]] = np.flatnonzero(good)
+    rows = place[part.index]
+    return found.part(rows[rows >= 0])
+
+
+def _kept(at: Residuals, part: Residuals) -> BoolArray:
+    """Which points of the part are left."""
+    return np.isin(part.index, at.index)
+
+
+def _renewed(candidate: Candidate, families: list[Candidate | Grid]) -> Candidate:
+    """The same candidate for other rays."""
+    key = "" if candidate.wave is None else candidate.wave.key
+    chosen = {name: value for name, value in candidate.fixed.items() if name != key}
+    for family in families:
+        if family.name == candidate.name and not family.empirical and dict(family.fixed) == chosen:
+            if isinstance(family, Grid):
+                return family.at(candidate.period)
+            if family.names == candidate.names:
+                return family
+    raise KeyError(candidate.name)
+
+
+def _columns(found: Estimate) -> FloatArray:
+    """(n, k) of its coefficients, a sine's with that of its frequency."""
+    wave = found.candidate.wave
+    return found.candidate.columns if wave is None else wave.with_slope(found.candidate.period, found.values[:2])

@@ -1,0 +1,36 @@
+"""Which further measurement would part the effects of a class, at this site and for this sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
+from pipeline.gap.survey.planned import measured_survey
+
+_POINTS = 4000
+_IN_GENERAL = {
+    "tls": "a second station at another range and azimuth, or targets of known position",
+    "stereo": "a second distance, or check points of known position across the whole frame",
+}
+
+
+def with_splits(measurement: Measurement, named: list[Named]) -> list[Named]:
+    """Effects that are alike to others with what would split them, by their signatures in the survey and one measurement more."""
+    if not any(item.alike for item in named):
+        return named
+    found = identifiability(measured_survey(measurement.changed(order=None), _POINTS))
+    return [replace(item, split_by=_split(found, item)) if item.alike else item for item in named]
+
+
+def _split(found: Identifiability, item: Named) -> str:
+    known = [found.names.index(name) for name in item.alike if name in found.names]
+    if item.name not in found.names or len(known) < len(item.alike):
+        return _IN_GENERAL[found.sensor]  # effects on the spread have no signature in the mean
+    own = found.names.index(item.name)
+    cosine = {each.name: max(float(each.cosines[own, other]) for other in known) for each in found.extensions}
+    best = min(cosine, key=lambda name: cosine[name])
+    if cosine[best] < ALIKE:
+        return " or ".join(name for name in sorted(cosine, key=lambda name: cosine[name]) if cosine[name] < ALIKE)
+    return f"no single further measurement; {best} comes nearest (cosine {cosine[best]:.2f})"

@@ -1,0 +1,105 @@
+"""The verdict, and what may be said beside it: both follow from the same numbers, so that words never contradict them.
+
+`no_gap` says that the model is not rejected: the gap before is within its uncertainty of the floor, and what remains is no more
+than chance would give. A number that was not drawn speaks for nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.verify import Gap
+from sensors.model import StereoModel, TlsModel
+
+LEAST_P = 0.01
+"""Of what remains: at or below it the model is rejected."""
+VERDICTS = {
+    "no_gap": "The measurement agrees with the model: nothing was found that the model does not hold.",
+    "named": "One effect explains where measurement and model disagree.",
+    "several": "More than one effect is needed to explain where measurement and model disagree.",
+    "ambiguous": "An effect is there, but this measurement cannot tell it from others that would look the same.",
+    "unknown": "The model is rejected, and no effect of the catalogue passes its own test; an empirical term describes it.",
+    "insufficient_data": "There are too few points on smooth parts of the reference to say anything.",
+}
+_NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px", "regularization_sigma_px")
+NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
+TOO_NOISY = "No effect is missing, but the model does not agree: its noise is too large."
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The numbers that a verdict rests on.
+
+    gap: on held-out points, None where there are too few; p_value: of what remains, None where it was not drawn; spread: share of
+    the predicted standard deviation that the residuals have where that is clearly less, else 1.
+    """
+
+    gap: Gap | None
+    p_value: float | None
+    spread: float = 1.0
+
+    @property
+    def rejects(self) -> bool:
+        """Whether what remains is more than chance would give."""
+        return self.p_value is not None and self.p_value <= LEAST_P
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the model without any effect is not rejected: by the gap on held-out points, and by what remains."""
+        return self.gap is not None and not self.gap.above_floor and self.p_value is not None and not self.rejects
+
+
+def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
+    """What the effects that were named, and the numbers, come to."""
+    if not named:
+        if evidence.gap is None and not evidence.rejects:
+            return "insufficient_data"
+        return "no_gap" if evidence.agrees else "unknown"
+    if any(item.kind == "empirical" for item in named):
+        return "unknown"
+    if len(named) > 1:
+        return "several"
+    return "ambiguous" if named[0].alike else "named"
+
+
+def in_a_sentence(verdict: str, named: Sequence[Named], spread: float) -> str:
+    """A verdict in words."""
+    if verdict == "unknown" and not any(item.kind == "empirical" for item in named):
+        return NOT_DESCRIBED
+    return TOO_NOISY if verdict == "no_gap" and spread < 1.0 else VERDICTS[verdict]
+
+
+def left_over(named: Sequence[Named], evidence: Evidence) -> str:
+    """Words for what is left beside what was named, "" where that may be chance."""
+    if not named or not evidence.rejects:
+        return ""
+    return f"That does not explain all of it: what remains has a p-value of {evidence.p_value:.2g}."
+
+
+def closing(gap: Gap, named: bool) -> str:
+    """How far the gap closes, in words."""
+    if gap.closed is None:
+        return "before and floor differ by no more than their uncertainty"
+    if not named:
+        return "before is above the floor by more than its uncertainty, and nothing closes that"
+    share = round(100 * gap.closed)
+    return f"{share} % of the gap is closed" if share > 0 else "none of the gap is closed"
+
+
+def lower_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float]:
+    """The noise that a model would need for the residuals' spread, all of it lowered alike; empty where it fits."""
+    if spread >= 1.0:
+        return {}
+    values = model.noise.model_dump(include=set(_NOISES))
+    return {key: float(f"{spread * value:.3g}") for key, value in values.items() if value > 0}
+
+
+def too_noisy(spread: float, lower: dict[str, float]) -> list[str]:
+    """Words for a model that predicts more spread than there is."""
+    if spread >= 1.0:
+        return []
+    said = f"the residuals spread {spread:.0%} of what the model predicts: its noise is too large, which no effect can mend"
+    proposed = ", ".join(f"{key} {value:g}" for key, value in lower.items())
+    return [f"{said}; a noise that fits: {proposed}"] if proposed else [said]

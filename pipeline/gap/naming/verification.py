@@ -1,0 +1,122 @@
+"""The last step: the gap with the named effects in the model. What makes the model predict worse is taken out again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.naming.entries import Named, with_effects
+from pipeline.gap.naming.verify import LOSS_MEASURE, Gap, Version, measure_gap, measure_losses, thinned
+from pipeline.gap.other.missing import MissingFound
+from pipeline.gap.residuals.registration import pose_of, settled
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.base import ShowsIn
+from sensors.model import StereoModel, TlsModel
+
+_FEWEST_POINTS = 100
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The model with some effects, (n,) residuals against it, registered, the pose (6,) of that, and the gap that is left."""
+
+    named: list[Named]
+    model: TlsModel | StereoModel
+    value: FloatArray
+    pose: FloatArray
+    gap: Gap | None
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the model predicts no better with the effects than without them.
+
+        Of losses that is no judge: a shrub before the held-out blocks has more to say than a few drops.
+        """
+        gap = self.gap
+        return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
+
+
+@dataclass(frozen=True)
+class Showing:
+    """What a gap is measured with.
+
+    measurement: where its sensor stood; residuals: against its model, of which the rows `chosen` register; tested, learned: (n,)
+    points that no step has looked at, and those that naming may; losses: what was found of them, and the pulses that it was not
+    fitted to; reference_sigma: in the observable's unit; largest: predicted sigmas by which points may be off.
+    """
+
+    measurement: Measurement
+    residuals: Residuals
+    chosen: NDArray[np.int64]
+    tested: BoolArray
+    learned: BoolArray
+    losses: tuple[MissingFound, BoolArray] | None
+    reference_sigma: float
+    largest: float
+    random: KeyedRandom
+
+    @property
+    def pose(self) -> FloatArray:
+        """(6,) by which the model as it is is registered."""
+        return pose_of(self.residuals, self.chosen)
+
+    def show(self, named: list[Named]) -> tuple[Shown, list[str]]:
+        """The gap on points that no step has used, and words for effects that are taken out.
+
+        As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
+        one goes without which those are predicted best. What is described, not named, stays: without it nothing would be said
+        to be wrong.
+        """
+        shown, words = self._of(named, self.tested), []
+        learned = self._of(named, self.learned) if shown.is_worse else shown
+        while shown.is_worse:
+            doubtful = [item for item in shown.named if item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES]
+            fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in doubtful]
+            best = min(fewer, key=_score, default=learned)
+            if _score(best) >= _score(learned):
+                break
+            out = next(item for item in shown.named if item not in best.named)
+            words.append(f"{out.name} dropped: with it the model predicts worse")
+            shown, learned = self._of(best.named, self.tested), best
+        return shown, words
+
+    def _of(self, named: list[Named], rows: BoolArray) -> Shown:
+        model = with_effects(self.measurement.model, [item.entry for item in named])
+        before = self.pose
+        if named:
+            value, pose = self._registered(model)
+        else:
+            value, pose = self.residuals.value - self.residuals.pose @ before, before
+        versions = Version(self.measurement.model, before), Version(model, pose)
+        return Shown(named, model, value, pose, self._gap(named, versions, rows))
+
+    def _registered(self, model: TlsModel | StereoModel) -> tuple[FloatArray, FloatArray]:
+        """(n,) residuals of the same points against another model, NaN where that misses the reference; the pose (6,)."""
+        trusted = self.residuals.index[self.chosen]
+        _, found, there = settled(self.measurement.changed(model=model), trusted)
+        rest = pose_of(found, found.smooth & np.isin(found.index, trusted))
+        value = np.full(len(self.measurement.cloud.points), np.nan)
+        value[found.index] = found.value - found.pose @ rest
+        return np.asarray(value[self.residuals.index]), there + rest
+
+    def _gap(self, named: list[Named], versions: tuple[Version, Version], rows: BoolArray) -> Gap | None:
+        missing = self.residuals.missing
+        if self.losses is not None and missing is not None and named and named[0].name == f"tls.{self.losses[0].name}":
+            found, held_out = self.losses
+            share = np.full(len(held_out), float(missing.lost.mean()))
+            return measure_losses(missing, share if found.covariate else found.chance, held_out)
+        places = np.flatnonzero(rows)
+        if len(places) < _FEWEST_POINTS:
+            return None
+        part = self.residuals.part(places[thinned(len(places))])
+        random = self.random.child("verify")
+        return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.largest, random)
+
+
+def _score(shown: Shown) -> float:
+    return shown.gap.after if shown.gap else np.inf

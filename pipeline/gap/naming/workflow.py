@@ -1,0 +1,380 @@
+"""The four steps of `scarpsim gap`: locate, name, add, show."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement_checks import check_near, check_noise
+from pipeline.gap.mean.selection import Tried
+from pipeline.gap.naming.entries import Named, from_missing, from_shape, from_tails, only_within_bounds, with_effects
+from pipeline.gap.naming.families import believes
+from pipeline.gap.naming.held_out import score_effects
+from pipeline.gap.naming.naming import Naming, name_effects
+from pipeline.gap.naming.splitting import with_splits
+from pipeline.gap.naming.verdict import Evidence, lower_noise, too_noisy, verdict_of
+from pipeline.gap.naming.verification import Showing
+from pipeline.gap.naming.verify import Gap
+from pipeline.gap.other.footprint import find_footprint
+from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
+from pipeline.gap.other.shapes import ShapeFound
+from pipeline.gap.other.spread import SpreadTried, find_tails
+from pipeline.gap.other.stereo_shapes import find_shapes
+from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
+from pipeline.gap.residuals.changes import SceneChange, find_changes
+from pipeline.gap.residuals.registration import registered, residuals_of, settled
+from pipeline.gap.residuals.residuals import OUTLIER, BoolArray, Residuals
+from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.tls_residuals import missing_returns, with_order
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.beam_divergence import BeamDivergence
+from sensors.effects.occlusion_fill import OcclusionFill
+from sensors.effects.smoothing import Smoothing
+from sensors.model import StereoModel, TlsModel
+
+STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
+"""The steps of `diagnose` and about what each takes, s."""
+FEWEST_POINTS = 800
+_FEWEST_EPOCHS = 3
+"""From so many epochs on the last is held out as a whole."""
+_MOST_POINTS = 60_000
+"""Points that take part in the selection; more add little to 1,100 cells."""
+_LEFT_OVER = 0.02
+"""Of the gain of an empirical term on the mean, what a spread gains that is only the part of the form that the term misses."""
+_EARLY_SIGMAS, _EARLY_M = 8.0, 0.5
+_NOT_FREE = {"tls": ("edge_step", "line"), "stereo": ("edge_step", "incidence")}
+"""Covariates by sensor that an empirical term cannot be a function of."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found.
+
+    held_out: (n,) points never used in naming; before, after: (n,) residuals with registration taken off, in the observable's
+    unit; pose: (6,) shift (m) and turn (rad) of the sensor, wall frame; timings: s by step.
+    """
+
+    verdict: str
+    effects: tuple[Named, ...]
+    changes: tuple[SceneChange, ...]
+    residuals: Residuals
+    held_out: BoolArray
+    before: FloatArray
+    after: FloatArray
+    pose: FloatArray
+    model_after: TlsModel | StereoModel
+    gap: Gap | None
+    tried: tuple[Tried, ...]
+    spread_tried: tuple[SpreadTried, ...]
+    remaining: dict[str, Any]
+    identifiability: dict[str, Any]
+    seconds: float
+    timings: dict[str, float]
+
+    @property
+    def evidence(self) -> Evidence:
+        """The numbers that the verdict and its words rest on."""
+        return Evidence(self.gap, self.remaining["p_value"], self.remaining["spread"])
+
+
+def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], None] | None = None) -> Diagnosis:
+    """Find what separates the measurement from its model, name it, add it and measure the gap again.
+
+    progress: called with the name of each step of `STEPS` that is done.
+    """
+    with threadpool_limits(1, "blas"):  # the same sums on any number of threads, and none that wait for each other
+        return _diagnose(measurement, _Clock(progress), KeyedRandom(seed, ("gap",)))
+
+
+def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> Diagnosis:
+    measurement = with_order(measurement) if measurement.sensor == "tls" else measurement
+    check_near(measurement.fit)
+    first = residuals_of(measurement)
+    check_noise(first.sensor, first.sigma)
+    held_points = np.zeros(len(measurement.cloud.points), dtype=bool)
+    held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
+    held_points |= _held_epoch(measurement.epochs)
+    there, plain, surveyed = settled(measurement, first.index[~held_points[first.index]], first)
+    if measurement.sensor == "tls":
+        plain = replace(plain, missing=missing_returns(there, plain))
+    clock.lap("residuals")
+    if plain.smooth.sum() < FEWEST_POINTS:
+        return _insufficient(measurement, plain, clock)
+    explained = _named(there, plain, held_points, random)
+    state, named, naming = explained.state, explained.named, explained.naming
+    losses = _missing(there, state)
+    lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
+    named = sorted([*named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
+    named, wide = only_within_bounds(there.model, named)
+    clock.lap("naming")
+    named, dropped = _confirmed(there, state, named, naming.reference_sigma)
+    showing = Showing(
+        measurement=there,
+        residuals=plain,
+        chosen=state.chosen,
+        tested=state.shown & state.held_out,
+        learned=state.shown & ~state.held_out,
+        losses=losses,
+        reference_sigma=naming.reference_sigma,
+        largest=OUTLIER * state.scale,
+        random=random,
+    )
+    shown, harmful = showing.show(named)
+    lower = lower_noise(there.model, naming.share)
+    notes = [*naming.notes, *too_noisy(naming.share, lower), *wide, *dropped, *harmful]
+    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share)
+    value = plain.value - plain.pose @ showing.pose
+    clock.lap("verification")
+    return Diagnosis(
+        verdict=verdict_of(shown.named, evidence),
+        effects=tuple(shown.named),
+        changes=tuple(state.changes),
+        residuals=replace(plain, smooth=state.residuals.smooth),
+        held_out=state.held_out,
+        before=value,
+        after=np.where(np.isfinite(shown.value), shown.value, value),
+        pose=surveyed + shown.pose,
+        model_after=shown.model,
+        gap=shown.gap,
+        tried=naming.tried,
+        spread_tried=naming.spread_tried,
+        remaining=_remaining(evidence.p_value, notes, naming.share, lower),
+        identifiability=naming.identifiability,
+        seconds=clock.total,
+        timings=clock.laps,
+    )
+
+
+def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
+    """(n,) points of the last epoch where there are enough to learn from without it."""
+    last = int(epochs.max(initial=0))
+    return epochs == last if last + 1 >= _FEWEST_EPOCHS else np.zeros(len(epochs), dtype=bool)
+
+
+@dataclass(frozen=True)
+class _State:
+    """What naming starts from, once effects where the surface is not smooth are known.
+
+    shaped: the measurement with them in its model; residuals: against that; touched, changed, held_out: (n,) points that they
+    touch, that lie in changes of the scene, and that no step before the last may look at; rough: (n,) registered residuals, which
+    spread `scale` predicted sigmas; chosen: rows that selection may look at.
+    """
+
+    shapes: list[ShapeFound]
+    shaped: Measurement
+    residuals: Residuals
+    touched: BoolArray
+    changes: list[SceneChange]
+    changed: BoolArray
+    rough: FloatArray
+    scale: float
+    cells: Cells
+    held_out: BoolArray
+    chosen: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, there: Measurement, plain: Residuals, held_points: BoolArray, shapes: list[ShapeFound], touched_points: BoolArray
+    ) -> _State:
+        """held_points, touched_points: of the measurement."""
+        touched = touched_points[plain.index]
+        shaped, residuals = _shaped(there, plain, shapes, touched)
+        rough, _, scale = registered(residuals)
+        sight = Sight.of(there, residuals)
+        changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
+        rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
+        cells = Cells.over(residuals.at)
+        held_out = held_points[residuals.index]
+        usable = residuals.smooth & ~changed & (np.abs(rough) < OUTLIER * scale * residuals.sigma)
+        chosen = _thinned(np.flatnonzero(usable & ~held_out))
+        return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
+
+    @property
+    def shown(self) -> BoolArray:
+        """(n,) points on which a gap may be measured: on smooth surface, or where an effect was found that shows elsewhere."""
+        return np.asarray((self.residuals.smooth | self.touched) & ~self.changed)
+
+    @property
+    def part(self) -> tuple[Measurement, Residuals]:
+        """What selection may look at."""
+        return few(self.shaped, self.residuals, self.chosen)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """What naming started from and what it named."""
+
+    state: _State
+    named: list[Named]
+    naming: Naming
+
+    @classmethod
+    def of(cls, state: _State, random: KeyedRandom) -> _Attempt:
+        return cls(state, *name_effects(*state.part, state.scale, random))
+
+    @property
+    def shapes(self) -> set[str]:
+        """Effects where the surface is not smooth."""
+        return {each.name for each in self.state.shapes}
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Empirical terms, and all effects and changes of the scene."""
+        state = self.state
+        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(state.shapes) + len(state.changes)
+
+
+def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random: KeyedRandom) -> _Attempt:
+    """What the naming started from in the end, and what it named.
+
+    What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
+    what was named; and where there seemed to be some, beside what is named without them. Fewer effects are the explanation.
+    """
+
+    def beside(found: _Attempt) -> _Attempt:
+        if not found.named:
+            return found
+        model = with_effects(there.model, [item.entry for item in found.named])
+        seen = settled(there.changed(model=model), plain.index[~held_points[plain.index]])[:2]
+        again = _State.of(there, plain, held_points, *_shapes(*seen, held_points))
+        names = {each.name for each in again.shapes}
+        # rays that are not quite where they are thought to be look like a low-pass
+        feigned = Smoothing.tag() in names - found.shapes
+        return found if names == found.shapes or feigned else _Attempt.of(again, random)
+
+    first = _Attempt.of(_State.of(there, plain, held_points, *_shapes(there, plain, held_points)), random)
+    found = [beside(first)]
+    if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
+        untouched = np.zeros(len(held_points), dtype=bool)
+        smooth = _Attempt.of(_State.of(there, plain, held_points, [], untouched), random)
+        if smooth.named:
+            found.append(beside(smooth))
+    return min(found, key=lambda each: each.complexity)
+
+
+def _confirmed(there: Measurement, state: _State, named: list[Named], reference_sigma: float) -> tuple[list[Named], list[str]]:
+    """The effects that hold on held-out blocks, with heavy tails and what would split each class; and words for the others."""
+    fit = state.residuals.smooth & ~state.changed
+    tested = _thinned(np.flatnonzero(fit & state.held_out))
+    rows = np.concatenate([state.chosen, tested])
+    trained = np.arange(len(rows)) < len(state.chosen)
+    scored = score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
+    words = [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
+    described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
+    left = [item for item in scored.named if item.spreads and item.gain < _LEFT_OVER * max(described, default=0.0)]
+    words += [f"{item.name} dropped: so much is left over by the empirical term" for item in left]
+    steady = _thinned(np.flatnonzero(fit & ~state.held_out))
+    kept = [item for item in scored.named if item not in left]
+    return with_splits(there, _with_tails(*few(there, state.residuals, steady), kept, state.cells.side_m)), words
+
+
+def _thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    return rows[:: max(len(rows) // _MOST_POINTS, 1)]
+
+
+def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> tuple[list[ShapeFound], BoolArray]:
+    """Effects where the surface is not smooth that the model does not hold, and which of the measurement's points they touch.
+
+    held_points: of the measurement's points those that have no say.
+    """
+    rough, _, scale = registered(residuals)
+    found: list[ShapeFound] = []
+    if measurement.sensor == "stereo":
+        found = find_shapes(measurement, residuals, rough, held_points[residuals.index])
+    elif not believes(measurement, BeamDivergence.tag()):
+        found = find_footprint(measurement, residuals, rough, scale, held_points[residuals.index])
+    touched = np.zeros(len(measurement.cloud.points), dtype=bool)
+    for each in found:
+        touched[residuals.index] |= each.touched
+    return found, touched
+
+
+def _shaped(
+    measurement: Measurement, residuals: Residuals, shapes: list[ShapeFound], touched: BoolArray
+) -> tuple[Measurement, Residuals]:
+    """The measurement with these effects in its model, and the residuals of the same points against that."""
+    if not shapes:
+        return measurement, residuals
+    entries = [from_shape(shape).entry for shape in shapes]
+    shaped = measurement.changed(model=with_effects(measurement.model, entries))
+    found = residuals_of(shaped)
+    value = np.full(len(measurement.cloud.points), np.nan)
+    value[found.index] = found.value
+    there = value[residuals.index]
+    smooth = residuals.smooth & ~touched & np.isfinite(there)
+    return shaped, replace(residuals, value=np.where(np.isfinite(there), there, residuals.value), smooth=smooth)
+
+
+def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
+    """The measurement with the points of some rows of its residuals alone, and their residuals."""
+    part = residuals.part(rows)
+    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)
+
+
+def _with_tails(measurement: Measurement, residuals: Residuals, named: list[Named], side_m: float) -> list[Named]:
+    """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes but two: strips that
+    are filled are also cells that had no match by chance, and drops return early."""
+    if any(item.effect is OcclusionFill or item.entry.get("early_share") for item in named):
+        return named
+    model = with_effects(measurement.model, [item.entry for item in named])
+    found = settled(measurement.changed(model=model))[1]
+    part = found.part(np.flatnonzero(found.smooth))
+    value, _, scale = registered(part)
+    tails = find_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
+    if tails is None:
+        return named
+    kept = [item for item in named if not item.spreads]
+    heavy = only_within_bounds(measurement.model, [from_tails(part.sensor, tails * float(np.median(part.sigma)), len(part))])[0]
+    return [*kept, *heavy] if heavy else named
+
+
+class _Clock:
+    def __init__(self, told: Callable[[str], None] | None) -> None:
+        self._start = self._last = time.perf_counter()
+        self._told = told
+        self.laps: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name], self._last = now - self._last, now
+        if self._told is not None:
+            self._told(name)
+
+    @property
+    def total(self) -> float:
+        return time.perf_counter() - self._start
+
+
+def _remaining(p_value: float | None, notes: list[str], spread: float = 1.0, lower_noise: dict[str, float] | None = None) -> Any:
+    """As gap.json holds it. spread: share of the predicted one that the residuals have where that is clearly less."""
+    return {"p_value": p_value, "note": "; ".join(notes), "spread": spread, "lower_noise": lower_noise or {}}
+
+
+def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> Diagnosis:
+    note = f"{int(residuals.smooth.sum())} points on smooth parts of the reference and stable ground, {FEWEST_POINTS} are needed"
+    empty = np.zeros(len(residuals))
+    return Diagnosis(
+        "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, np.zeros(6), measurement.model,
+        None, (), (), _remaining(None, [note]), {"names": [], "cosines": [], "survival": []}, clock.total, clock.laps,
+    )  # fmt: skip
+
+
+def _missing(measurement: Measurement, state: _State) -> tuple[MissingFound, BoolArray] | None:
+    """The effect on the returns, and the pulses that it was not fitted to."""
+    residuals = state.residuals
+    missing = residuals.missing
+    if missing is None or any(believes(measurement, name) for name in LOSSES):
+        return None
+    held_out = held_out_blocks(missing.at, state.cells.side_m)
+    early = residuals.smooth & ~state.changed & (state.rough < -np.maximum(_EARLY_SIGMAS * residuals.sigma, _EARLY_M))
+    drops = isolated(residuals.at, early)
+    found = find_missing(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
+    return None if found is None else (found, held_out)

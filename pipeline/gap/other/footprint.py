@@ -1,0 +1,72 @@
+"""A beam with a footprint, by the points at edges: their ranges lie between what is near and what is far (mixed pixels)."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.scan_simulation import mean_model, simulate_ranges
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.beam_divergence import BeamDivergence
+from sensors.footprint import Mode
+from sensors.model import TlsModel
+
+_MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
+_DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
+_FINER = (1.12, 1.03)
+_MOST_POINTS = 30_000
+_FEWEST = 20
+_BLOCK_SIGMAS = 2.0
+"""By how much the blocks have to agree: four of four. No other effect puts points between the two sides of an edge: of 60
+development cases without a footprint none came to half of the gain that is asked for, or to 1.9."""
+_PROFILE = 0.12
+"""Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
+
+
+def find_footprint(
+    measurement: Measurement, residuals: Residuals, rough: FloatArray, scale: float, held_out: BoolArray
+) -> list[ShapeFound]:
+    """The divergence that points at edges ask for, if any. rough: (n,) registered residuals, m; scale: sigmas they spread;
+    held_out: (n,) points that have no say."""
+    sigma = scale * residuals.sigma
+    thin = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
+    some = np.flatnonzero(~held_out)[thin]
+    wide = _moved(measurement, residuals, some, "mean", _DIVERGENCES_RAD[-1])
+    some = some[np.abs(wide) > sigma[some]]
+    if len(some) < _FEWEST:
+        return []
+    blocks = Blocks(Blocks.over(residuals.at).number[some])
+
+    def gains(mode: Mode, divergence_rad: float) -> FloatArray:
+        moved = _moved(measurement, residuals, some, mode, divergence_rad)
+        none = np.zeros_like(moved)
+        more = log_density(rough[some], moved, sigma[some]) - log_density(rough[some], none, sigma[some])
+        return np.where(moved == 0, 0.0, more)
+
+    tops = {mode: refined(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
+    mode = max(tops, key=lambda each: float(gains(each, tops[each]).sum()))
+    gain = blocks.tested(gains(mode, tops[mode]), _BLOCK_SIGMAS)
+    if gain is None:
+        return []
+    divergence = refined(partial(gains, mode), [tops[mode]], _FINER)
+    std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE * divergence))}
+    touched = np.abs(_moved(measurement, residuals, np.arange(len(residuals)), mode, 1.5 * divergence)) > sigma
+    return [ShapeFound(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
+
+
+def _moved(
+    measurement: Measurement, residuals: Residuals, rows: np.ndarray[tuple[int], np.dtype[np.int64]], mode: Mode, angle: float
+) -> FloatArray:
+    """(m,) range of a beam of divergence `angle` less that of its axis, m; 0 where either does not come back."""
+    model = measurement.model
+    assert isinstance(model, TlsModel)
+    plain = mean_model(model)
+    beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle, mode=mode))})
+    geometry, random = residuals.geometry.part(rows), KeyedRandom(0, ("gap", "mean"))
+    whole, axis = (simulate_ranges(measurement, each, geometry, random) for each in (beam, plain))
+    return np.asarray(np.nan_to_num(whole - axis))

@@ -1,0 +1,90 @@
+"""Effects that show where the surface is not smooth: what was found, and when blocks all over the wall bear it out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.gap.residuals.cells import patches
+from pipeline.gap.residuals.residuals import BoolArray
+from scene.mesh import FloatArray
+from sensors.effects.base import Effect
+
+_LEAST_GAIN, _BLOCK_SIGMAS = 30.0, 3.0
+"""Total gain, and its ratio to that of the blocks' sums with signs drawn at random."""
+_MOST = 3.0
+"""What one point may say at the most where blocks are asked to agree."""
+_STRAY = 1e-3
+_SLACK = 0.15
+"""Share of what an effect adds by which its height on the reference may be off."""
+_POINTS_PER_BLOCK = 100.0
+
+
+@dataclass(frozen=True)
+class ShapeFound:
+    """An effect on the shape. effect: with its values; std: of the parameters; touched: (n,) points where it cannot be predicted
+    to the noise."""
+
+    effect: Effect
+    std: dict[str, float]
+    gain: float
+    touched: BoolArray
+
+    @property
+    def name(self) -> str:
+        """The catalogue's."""
+        return self.effect.name
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """number: (n,) of the block of the wall in which each point lies."""
+
+    number: NDArray[np.int64]
+
+    @classmethod
+    def over(cls, at: FloatArray) -> Blocks:
+        """Of about a hundred points each; at: (n, 2)."""
+        return cls(patches(at, _POINTS_PER_BLOCK))
+
+    def sums(self, gains: FloatArray) -> FloatArray:
+        """Gains (n,) by block."""
+        return np.asarray(np.bincount(self.number, gains))
+
+    def tested(self, gains: FloatArray, least_sigmas: float = _BLOCK_SIGMAS) -> float | None:
+        """Total of gains (n,), None where they do not convince: blocks all over the wall have to agree."""
+        total, sums = float(gains.sum()), self.sums(np.clip(gains, -_MOST, _MOST))
+        sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
+        if total < _LEAST_GAIN or sigmas < least_sigmas:
+            return None
+        return total
+
+    def std(self, gains: Callable[[float], FloatArray], value: float) -> float:
+        """Standard deviation of a value at the top of its gains, by how the blocks' slopes scatter (sandwich)."""
+        width = 0.05 * value
+        low, middle, high = (self.sums(gains(each)) for each in (value - width, value, value + width))
+        slopes, curvature = (high - low) / (2 * width), float((high - 2 * middle + low).sum()) / width**2
+        return float(np.linalg.norm(slopes)) / max(-curvature, 1e-12)
+
+
+def log_density(rough: FloatArray, moved: FloatArray, sigma: FloatArray) -> FloatArray:
+    """(n,) log density of residuals that an effect moves by `moved`: Gaussian, with some that may lie anywhere."""
+    spread = np.hypot(sigma, _SLACK * moved)
+    return np.asarray(np.log(np.exp(-0.5 * ((rough - moved) / spread) ** 2) / spread + _STRAY))
+
+
+def refined(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
+    """The value of the largest total gain: on a grid, on finer ones around the best, at the top of a parabola through three."""
+    best = max(values, key=lambda each: float(gains(each).sum()))
+    step = 0.0
+    for factor in factors:
+        tried = [float(gains(best * factor**power).sum()) for power in range(-4, 5)]
+        top = int(np.argmax(tried[1:-1])) + 1
+        low, middle, high = tried[top - 1 : top + 2]
+        curvature = low - 2 * middle + high
+        step = float(np.clip(0.5 * (low - high) / curvature, -1.0, 1.0)) if curvature < 0 else 0.0
+        best *= factor ** (top - 4)
+    return float(best * factors[-1] ** step) if factors else best

@@ -1,0 +1,361 @@
+"""Which effects explain the spread: the Gaussian likelihood of deviations within cells, sigma_i^2 = model + theta f_k(i)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipeline.change.robust import nmad
+from pipeline.gap.residuals.cells import Cells, block_numbers
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects import catalogue
+from sensors.effects.base import Effect, ShowsIn
+
+DRAWS = 1999
+_ALPHA = 0.004
+_LEAST_GAIN = 6.0
+_LEAST_EXCESS = 0.04
+"""Added variance, as a share of the model's, below which the reference's own small errors may be meant."""
+_LEAST_BETWEEN = 0.75
+"""Share of the added variance by which neighbours must differ: an error of the reference, correlated over metres, moves both."""
+_LEAST_SHARE = 0.9
+"""Of the predicted spread: less is worth a word."""
+_CLIP = 4.5
+_LEAST_LEFT = 0.3
+"""Share of a point's variance that its cell's plane must leave."""
+_CLASS_MARGIN = 5.0
+"""Scores within this of the best belong to its class: more than for the mean, as a few steep blocks decide. In three development
+scans the right one was 9 to 15 ahead of its nearest, and that by 1.0 to 1.4 times what the blocks' sums scatter."""
+_FREE_MARGIN, _FREE_GAIN, _FREE_BLOCK_SIGMAS = 6.0, 15.0, 2.0
+_SECOND_GAIN = 3.0
+_BINS = 8
+_FAR, _MOST_FAR, _CUT = 4.0, 0.004, 12.0
+"""Share of residuals beyond so many sigmas: up to 0.0016 in development cases without an effect, 0.02 with 3 % of outliers."""
+_ONE_BLOCK = 0.2
+"""Of the far residuals, the share that one block of the wall may have: more is a change of the scene."""
+_HIGHEST = 0.999
+"""Quantile of a form of the variance beyond which it is held."""
+_OF_A_TRIAL = 0.5
+"""Cost of a value of which some are tried."""
+_ROUNDS, _BLOCK_SIGMAS = 25, 3.0
+
+
+@dataclass(frozen=True)
+class SpreadCandidate:
+    """variance: (n, k) forms that are scaled by theta (k,); parameters: their square roots times `scale`, by name; cost: free
+    parameters; fixed: values that tell variants apart."""
+
+    name: str
+    variance: FloatArray
+    scale: tuple[float, ...]
+    names: tuple[str, ...]
+    cost: float = 1.0
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+    def parameters(self, theta: FloatArray) -> dict[str, float]:
+        """The effect's values."""
+        return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
+
+    def errors(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
+        """Their standard deviations, from those of theta; of one that is 0, what it may be."""
+        root = np.sqrt(theta)
+        std = np.where(theta > error, error / np.maximum(2 * root, 1e-300), np.sqrt(error))
+        return dict(zip(self.names, map(float, std * np.array(self.scale)), strict=True))
+
+
+@dataclass(frozen=True)
+class SpreadFound:
+    """An effect on the spread.
+
+    effect: the catalogue's that comes nearest, which carries an empirical one; std: of the parameters by the curvature of the
+    likelihood; variance: (n,) that it adds.
+    """
+
+    name: str
+    effect: str
+    alike: tuple[str, ...]
+    p_value: float
+    gain: float
+    parameters: dict[str, float]
+    std: dict[str, float]
+    empirical: bool
+    variance: FloatArray
+
+
+@dataclass(frozen=True)
+class SpreadTried:
+    """What one form of the spread gains in log-likelihood over the model; score: less what it costs; empirical: of no effect."""
+
+    name: str
+    gain: float
+    score: float
+    empirical: bool = False
+
+
+def standardised(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
+    """(n,) deviations from the cells' planes over the predicted spread, of unit variance if the model is right; NaN outside.
+
+    A plane in each cell takes away what the reference's error, correlated over metres, does within it.
+    """
+    inside = cells.cell >= 0
+    cell = cells.cell[inside]
+    offset = (residuals.at[inside] - cells.centre[cell]) / cells.side_m
+    weight = 1 / residuals.sigma[inside]
+    basis = np.stack([np.ones(len(cell)), offset[:, 0], offset[:, 1]], axis=1) * weight[:, None]
+    y = value[inside] * weight
+
+    def total(column: FloatArray) -> FloatArray:
+        return np.bincount(cell, column, len(cells)).astype(np.float64)
+
+    matrix = np.stack([np.stack([total(basis[:, i] * basis[:, j]) for j in range(3)], axis=-1) for i in range(3)], axis=-2)
+    right = np.stack([total(basis[:, i] * y) for i in range(3)], axis=-1)
+    inverse = np.linalg.pinv(matrix, rcond=1e-8, hermitian=True)
+    fitted = np.einsum("ni,nij,nj->n", basis, inverse[cell], right[cell])
+    left = 1 - np.einsum("ni,nij,nj->n", basis, inverse[cell], basis)
+    z = np.full(len(residuals), np.nan)
+    z[inside] = np.where(left > _LEAST_LEFT, (y - fitted) / np.sqrt(np.maximum(left, _LEAST_LEFT)), np.nan)
+    return z
+
+
+def spread_candidates(residuals: Residuals) -> list[SpreadCandidate]:
+    """The catalogue's forms of the variance of single points, by what is recorded; without noise that neighbours share."""
+    found = []
+    for effect in catalogue(residuals.sensor):
+        if effect.shows_in == ShowsIn.SPREAD and not effect.shared and effect.known(residuals.geometry):
+            key, tried = effect.trials or ("", ())
+            found += [_candidate(effect, residuals.geometry, {key: value}) for value in tried] or [
+                _candidate(effect, residuals.geometry, {})
+            ]
+    return found
+
+
+def _candidate(effect: type[Effect], geometry: Any, fixed: dict[str, float]) -> SpreadCandidate:
+    """Of the effect at its typical sizes, one column for each of them; a few extreme points must not carry a form alone."""
+    sizes = effect.typical_sizes()
+    columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
+    columns = np.minimum(columns, np.quantile(columns, _HIGHEST, axis=0))
+    cost = len(sizes) + _OF_A_TRIAL * len(fixed)
+    return SpreadCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), cost, fixed)
+
+
+def find_spread(
+    residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom, left_out: frozenset[str] = frozenset()
+) -> tuple[list[SpreadFound], list[SpreadTried]]:
+    """The effects that the spread asks for, at most two, and all that were tried, best first.
+
+    value: (n,) residuals without the mean effects found; left_out: effects that are no candidates.
+    """
+    candidates = [each for each in spread_candidates(residuals) if each.name not in left_out]
+    if not candidates:
+        return [], []
+    weighed = residuals
+    for again in (True, False):
+        # noisy points move a cell's plane, and with that what its quiet points show, unless they have the weight they deserve
+        z = standardised(weighed, cells, value)
+        kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, nmad(z, 0.0)))
+        squared = (z * weighed.sigma / residuals.sigma)[kept] ** 2
+        forms = [candidate.variance[kept] / residuals.sigma[kept, None] ** 2 for candidate in candidates]
+        singles = [_Joint.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
+        best = max(singles, key=lambda fit: fit.score)
+        if again:
+            added = candidates[best.members[0]].variance @ best.theta[0]
+            weighed = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
+    excess = float(np.mean(best.added(forms)))
+    block = block_numbers(residuals.at[kept], cells.side_m)
+    p_value = _p_value(squared, [form.sum(axis=1) for form in forms], block, random)
+    tried = [SpreadTried(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
+    tried = sorted(_best_variants(tried), key=lambda item: -item.score)
+    if best.gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
+        return [], tried
+    # of disparities `stereo_noise` looks at neighbours, which noise on nodes moves alike too
+    if residuals.sensor == "tls" and _between_neighbours(residuals, value, kept, best.added(forms)) < _LEAST_BETWEEN:
+        return [], tried
+    pairs = [
+        _Joint.fitted(squared, forms, [first, second], candidates)
+        for first, second in combinations(range(len(forms)), 2)
+        if candidates[first].name != candidates[second].name
+    ]
+    pair = max(pairs, key=lambda fit: fit.score, default=best)
+    free_name, free_score, free = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()})
+    # where one effect leaves something over, a second of the catalogue comes before a form of no effect
+    needed = _SECOND_GAIN if free_score > best.score + _FREE_MARGIN else _LEAST_GAIN
+    agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
+    chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
+    empirical = free_score > chosen.score + _FREE_MARGIN and _blocks_prefer(squared, chosen.added(forms), free, block)
+    if empirical:
+        chosen = best
+    tried = sorted([*tried, SpreadTried(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
+    found = []
+    for place, number in enumerate(chosen.members):
+        candidate, theta = candidates[number], chosen.theta[place]
+        others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _differ_by(fit, chosen, number)]
+        near = {candidates[n].name for fit in others if fit.score > chosen.score - _CLASS_MARGIN for n in fit.members}
+        alike = near - {candidates[each].name for each in chosen.members}
+        parameters = candidate.parameters(theta)
+        std = candidate.errors(theta, chosen.error[place])
+        gain = chosen.gain - max(
+            (fit.gain for fit in singles if fit.members != (number,) and fit.members[0] in chosen.members), default=0.0
+        )
+        name = f"spread by {free_name}" if empirical else candidate.name
+        found.append(
+            SpreadFound(
+                name,
+                candidate.name,
+                tuple(sorted(alike)),
+                p_value,
+                gain,
+                parameters,
+                std,
+                empirical,
+                candidate.variance @ theta,
+            )
+        )
+    return found, tried
+
+
+def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray, added: FloatArray) -> float:
+    """Share of an added variance, of the points `kept` and over the predicted one, that differences of neighbours show."""
+    at, value, predicted = residuals.at[kept], value[kept], residuals.sigma[kept] ** 2
+    other = cKDTree(at).query(at, k=2)[1][:, 1]
+    variance = predicted + predicted[other]
+    more = (added * predicted + (added * predicted)[other]) / variance
+    weight = more / (1 + more) ** 2
+    return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * more))
+
+
+def share_of_spread(residuals: Residuals, cells: Cells, value: FloatArray) -> float:
+    """How many of the predicted standard deviations the residuals really spread where that is clearly less, else 1.
+
+    No effect takes noise away: the model's own is too large.
+    """
+    z = standardised(residuals, cells, value)
+    kept = np.isfinite(z)
+    squared = np.minimum(z[kept] ** 2, _CUT**2)
+    means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
+    below = float(means.sum()) < -_BLOCK_SIGMAS * float(np.linalg.norm(means))
+    share = float(np.sqrt(squared.mean()))
+    return share if below and share < _LEAST_SHARE else 1.0
+
+
+def _best_variants(tried: list[SpreadTried]) -> list[SpreadTried]:
+    """One of each name: of an effect with variants the one that scores most."""
+    best: dict[str, SpreadTried] = {}
+    for item in tried:
+        if item.name not in best or item.score > best[item.name].score:
+            best[item.name] = item
+    return list(best.values())
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """Some candidates fitted together. theta, error: of each; gain in log-likelihood over the model; score: less cost."""
+
+    members: tuple[int, ...]
+    theta: tuple[FloatArray, ...]
+    error: tuple[FloatArray, ...]
+    gain: float
+    score: float
+
+    @classmethod
+    def fitted(
+        cls, squared: FloatArray, forms: list[FloatArray], members: list[int], candidates: list[SpreadCandidate]
+    ) -> _Joint:
+        """By Fisher scoring on 1 + sum theta f, theta at least 0."""
+        columns = np.concatenate([forms[number] for number in members], axis=1)
+        scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
+        columns = columns * scale
+        theta = np.full(len(scale), max(float(np.mean(squared)) - 1, 1e-3) / len(scale))
+        information = np.eye(len(scale))
+        for _ in range(_ROUNDS):
+            total = 1 + columns @ theta
+            slope = 0.5 * columns.T @ ((squared - total) / total**2)
+            information = 0.5 * (columns / total[:, None] ** 2).T @ columns
+            free = (theta > 0) | (slope > 0)
+            step = np.zeros(len(theta))
+            step[free] = np.linalg.lstsq(information[np.ix_(free, free)], slope[free], rcond=1e-10)[0]
+            theta = np.maximum(theta + step, 0.0)
+        gain = _gain(squared, columns @ theta)
+        error = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
+        ends = np.cumsum([forms[number].shape[1] for number in members])[:-1]
+        score = gain - sum(candidates[number].cost for number in members)
+        return cls(tuple(members), tuple(np.split(theta * scale, ends)), tuple(np.split(error * scale, ends)), gain, score)
+
+    def added(self, forms: list[FloatArray]) -> FloatArray:
+        """(n,) variance that it adds, over the predicted one."""
+        return np.asarray(sum(forms[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))
+
+
+def _differ_by(fit: _Joint, chosen: _Joint, number: int) -> bool:
+    """Whether a fit has another form in place of one of the chosen."""
+    return number not in fit.members and set(chosen.members) - {number} <= set(fit.members)
+
+
+def _blocks_agree(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
+    """Whether the gain of one variance over another is common to the blocks and not due to a few."""
+    gain, sigmas = _gain_over(squared, first, second, block)
+    return gain > 0 and sigmas > _BLOCK_SIGMAS
+
+
+def _blocks_prefer(squared: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
+    """The same of a free form, which only has to say that the named one does not fit."""
+    gain, sigmas = _gain_over(squared, first, free, block)
+    return gain > _FREE_GAIN and sigmas > _FREE_BLOCK_SIGMAS
+
+
+def _gain_over(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
+    """Gain in log-likelihood of one variance over another, and how many times it is that of blocks with signs drawn at random."""
+    terms = 0.5 * (squared * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
+    sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
+    return float(sums.sum()), float(sums.sum() / max(float(np.linalg.norm(sums)), 1e-300))
+
+
+def _gain(squared: FloatArray, added: FloatArray) -> float:
+    return float(0.5 * np.sum(squared * added / (1 + added) - np.log1p(added)))
+
+
+def _p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
+    """Of the largest standardised score over the forms, by signs drawn block by block: (1 + b) / (1 + N)."""
+    _, number = np.unique(block, return_inverse=True)
+    scores = np.stack([np.bincount(number, (squared - 1) * form) for form in forms])
+    size = np.sqrt(np.sum(scores**2, axis=1))
+    signs = random.child("spread").generator().choice([-1.0, 1.0], size=(scores.shape[1], DRAWS))
+    largest = np.max(scores @ signs / size[:, None], axis=0)
+    return float((1 + np.sum(largest >= np.max(scores.sum(axis=1) / size))) / (1 + DRAWS))
+
+
+def find_tails(z: FloatArray, block: NDArray[np.int64]) -> float | None:
+    """Standard deviation, in predicted ones, of noise with heavy tails that normal noise of the predicted spread leaves; or None.
+
+    z: (n,) residuals over the spread that all effects together predict; of normal ones 6e-5 lie beyond 4.
+    """
+    far = np.abs(z) > _FAR
+    if far.mean() < _MOST_FAR:
+        return None
+    sums = np.bincount(np.unique(block, return_inverse=True)[1], far)
+    spread_out = float(sums.max()) < _ONE_BLOCK * float(sums.sum())
+    excess = float(np.mean(np.minimum(z**2, _CUT**2))) - 1
+    return float(np.sqrt(max(excess, 0.0))) if spread_out else None
+
+
+def _free_form(squared: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
+    """The covariate along which a variance free in each of some bins explains most, its score, and what it adds (n,)."""
+    best: tuple[str, float, FloatArray] = ("", -np.inf, np.zeros(len(squared)))
+    for name, values in covariates.items():
+        if name in ("edge_step", "line"):
+            continue
+        edges = np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1])
+        group = np.searchsorted(edges, values)
+        count = np.maximum(np.bincount(group, minlength=_BINS), 1)
+        variance = np.maximum(np.bincount(group, squared, _BINS) / count, 1e-9)
+        score = float(0.5 * np.sum(count * (variance - 1 - np.log(variance)))) - _BINS
+        if score > best[1]:
+            best = name, score, (variance - 1)[group]
+    return best

@@ -1,0 +1,216 @@
+"""White noise of a disparity, or noise on the nodes of a grid: told apart by how neighbours differ.
+
+Half the mean squared difference of two pixels h apart (the semivariogram) is, beyond what the model predicts,
+
+    g(h) = w + r^2 (4/9 - B(hx / s) B(hy / s)) + c h^2
+
+w the variance of white noise, r and s the standard deviation and the step of a grid of nodes that is interpolated bilinearly, B
+the cubic B-spline (2/3 at 0, 0 from 2 on: two hat functions convolved), and c h^2 the reference's error, which is smooth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.robust import nmad
+from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.residuals.cells import patches
+from pipeline.gap.residuals.disparity_raster import spacing
+from pipeline.gap.residuals.residuals import Residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.regularization_noise import RegularizationNoise
+from sensors.model import StereoModel
+
+_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+_LONGEST_PX = 256.0
+_STEPS_PX = tuple(8.0 * 2 ** (half / 2) for half in range(9))
+_POINTS_PER_BLOCK = 400.0
+_FEWEST_BLOCKS, _FEWEST_LAGS = 12, 3
+_CLIP = 4.5
+_FINEST = 2.0
+"""Cells of the raster from which on a grid of nodes differs from white noise."""
+_MARGIN = 6.0
+"""Difference of chi^2 from which on one of the two is named alone."""
+_RIDGE, _FEW = 0.02, 0.2
+"""Share of the covariance of lags added to its diagonal: always, and times lags per block of the wall: few blocks mistake it."""
+_DRAWS = 1999
+_ALONE, _LEAST_SIGMAS = 12.0, 4.0
+"""Difference of chi^2 and standard deviations of its variance that noise on nodes needs where points by themselves show none."""
+_LARGEST_REFERENCE_M = 0.02
+"""Error of the reference, correlated over metres, that there may be: smaller noise on nodes cannot be told from it."""
+
+
+@dataclass(frozen=True)
+class _Variogram:
+    """step: px of the raster; lag: (k, 2) px; blocks: (k, b) px^2 less what the model predicts, of each block of the wall times
+    its share of all points; root: (k, k) whitens their sum (root @ value has unit variance)."""
+
+    step: float
+    lag: FloatArray
+    blocks: FloatArray
+    root: FloatArray
+
+    @property
+    def value(self) -> FloatArray:
+        """(k,) of all blocks, px^2."""
+        return np.asarray(self.blocks.sum(axis=1))
+
+    def fitted(self, form: FloatArray) -> _Form:
+        """A form (k,) beside the reference's error; both at least 0."""
+        smooth = np.sum(self.lag**2, axis=1)
+        columns = self.root @ np.stack([form, smooth / smooth.max()], axis=1)
+        value = self.root @ self.value
+        weights = np.linalg.pinv(columns)
+        if weights[1] @ value < 0:
+            columns, weights = columns[:, :1], np.linalg.pinv(columns[:, :1])
+        best = weights @ value
+        square = float(np.sum((value - columns @ best) ** 2))
+        shares = weights[0] @ self.root @ self.blocks
+        worse = np.sqrt(max(square / (len(value) - columns.shape[1]), 1.0))  # than a form of the right kind would fit
+        error = max(worse * float(np.linalg.norm(weights[0])), float(np.linalg.norm(shares - shares.mean())))
+        return _Form(square, float(best[0]), error, shares)
+
+    @property
+    def smooth_square(self) -> float:
+        """chi^2 of the reference's error alone."""
+        smooth = np.sum(self.lag**2, axis=1)
+        column, value = self.root @ (smooth / smooth.max()), self.root @ self.value
+        return float(value @ value - max(column @ value, 0.0) ** 2 / (column @ column))
+
+    def best_nodes(self) -> tuple[_Form, float, list[float]] | None:
+        """The grid of nodes that fits best with its step, px, and steps that fit as well; None where all are too fine for it."""
+        trials = [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= _FINEST * self.step]
+        if not trials:
+            return None
+        form, step = min(trials, key=lambda trial: trial[0].square)
+        return form, step, [each for trial, each in trials if trial.square < form.square + 1]
+
+
+@dataclass(frozen=True)
+class _Form:
+    """A form of the semivariogram fitted. square: chi^2; variance and its standard deviation, px^2; blocks: (b,) shares of the
+    variance."""
+
+    square: float
+    variance: float
+    error: float
+    blocks: FloatArray
+
+
+def told_apart(found: list[SpreadFound], part: Residuals, value: FloatArray, model: StereoModel) -> list[SpreadFound]:
+    """Noise that was taken for white, named by how neighbours differ; a class of both where that does not tell.
+
+    Noise on nodes seems to change with any covariate, as few of them have one value of it: it goes before an empirical term.
+    value: (n,) residuals without the mean effects found.
+    """
+    named = [_named(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
+    return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
+
+
+def find_nodes(part: Residuals, value: FloatArray, model: StereoModel, random: KeyedRandom) -> SpreadFound | None:
+    """Noise on nodes so far apart that the points around one do not differ by it; larger than a reference may be wrong.
+
+    value: (n,) residuals without the mean effects found.
+    """
+    variogram = _variogram(part, value, model)
+    best = None if variogram is None else variogram.best_nodes()
+    if variogram is None or best is None:
+        return None
+    form, step, near = best
+    without = min(variogram.smooth_square, variogram.fitted(np.ones(len(variogram.lag))).square)
+    certain = form.square < without - _ALONE and form.variance > _LEAST_SIGMAS * form.error
+    if not certain or np.sqrt(form.variance) * float(np.median(part.unit_m)) < _LARGEST_REFERENCE_M:
+        return None
+    signs = random.child("nodes").generator().choice([-1.0, 1.0], size=(len(form.blocks), _DRAWS))
+    p_value = float((1 + np.sum(np.abs(form.blocks @ signs) >= form.variance)) / (1 + _DRAWS))
+    name = RegularizationNoise.tag()
+    found = SpreadFound(name, name, (), p_value, (without - form.square) / 2, {}, {}, False, np.zeros(len(part)))
+    return _on_nodes(found, form, step, near)
+
+
+def _named(white: SpreadFound, part: Residuals, value: FloatArray, model: StereoModel) -> SpreadFound:
+    both = replace(white, alike=tuple(sorted({*white.alike, RegularizationNoise.tag()})))
+    variogram = _variogram(part, value, model)
+    if variogram is None:
+        return both
+    plain = variogram.fitted(np.ones(len(variogram.lag)))
+    if plain.variance > 0:
+        both = _with_variance(both, plain, 1.0)
+    resolved = _FINEST * variogram.step <= _STEPS_PX[0]  # else a grid may be too fine for this raster to tell
+    white = replace(both, alike=white.alike) if resolved else both
+    best = variogram.best_nodes()
+    if best is None or plain.square < best[0].square - _MARGIN:
+        return white
+    if best[0].variance <= 0 or plain.square < best[0].square + _MARGIN:
+        return both
+    nodes = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), alike=())
+    return _on_nodes(nodes, *best)
+
+
+def _on_nodes(found: SpreadFound, form: _Form, step: float, near: list[float]) -> SpreadFound:
+    """With the parameters of a grid of nodes."""
+    nodes = _with_variance(found, form, RegularizationNoise(sigma_px=1.0).total_variance)
+    parameters, std = {**nodes.parameters, "step_px": step}, {**nodes.std, "step_px": max(float(np.std(near)), 0.2 * step)}
+    return replace(nodes, parameters=parameters, std=std)
+
+
+def _with_variance(found: SpreadFound, form: _Form, share: float) -> SpreadFound:
+    """With the standard deviation sigma_px that a variance with its error gives. share: of it that a disparity has on average."""
+    sigma = float(np.sqrt(form.variance))
+    return replace(
+        found,
+        parameters={"sigma_px": sigma},
+        std={"sigma_px": form.error / (2 * sigma)},
+        variance=np.full(len(found.variance), share * form.variance),
+    )
+
+
+def _variogram(part: Residuals, value: FloatArray, model: StereoModel) -> _Variogram | None:
+    """Along rows and columns, with its covariance by blocks of the wall; None where the pixels are on no raster."""
+    g = part.geometry
+    step = spacing(g.u)
+    if step is None:
+        return None
+    column, row = (np.rint((x - x.min()) / step).astype(np.int64) for x in (g.u, g.v))
+    bound = _CLIP * nmad(value)
+    raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
+    raster[row, column] = np.where(np.abs(value) < bound, value, np.nan)
+    block = np.zeros(raster.shape, dtype=np.int64)
+    block[row, column] = patches(part.at, _POINTS_PER_BLOCK)
+    count = int(block.max()) + 1
+    lags = [each for each in _LAGS if each * step <= _LONGEST_PX]
+    found = [_by_block(raster, block, lag, axis, count) for axis in (0, 1) for lag in lags]
+    pairs, sums = (np.stack(each) for each in zip(*found, strict=True))
+    full = (pairs > 0).all(axis=0)
+    if full.sum() < _FEWEST_BLOCKS or len(lags) < _FEWEST_LAGS:
+        return None
+    means = sums[:, full] / pairs[:, full]
+    weight = pairs[:, full].sum(axis=0) / pairs[:, full].sum()
+    mean = means @ weight
+    left = (means - mean[:, None]) * np.sqrt(weight)
+    covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
+    covariance += (_RIDGE + _FEW * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
+    offsets = np.array([[lag * step * (axis == 1), lag * step * (axis == 0)] for axis in (0, 1) for lag in lags])
+    blocks = (means - model.semivariogram(offsets)[:, None]) * weight
+    return _Variogram(step, offsets, blocks, np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _by_block(raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """(count,) pairs and half their squared differences, by the block of the first of each pair."""
+    first, second = (raster[:-lag], raster[lag:]) if axis == 0 else (raster[:, :-lag], raster[:, lag:])
+    there = block[:-lag] if axis == 0 else block[:, :-lag]
+    half = 0.5 * (first - second) ** 2
+    known = np.isfinite(half)
+    return (
+        np.bincount(there[known], minlength=count).astype(np.float64),
+        np.bincount(there[known], half[known], count).astype(np.float64),
+    )
+
+
+def _nodes(lag: FloatArray, step: float) -> FloatArray:
+    """(k,) semivariogram of a grid of nodes of variance 1."""
+    return RegularizationNoise(sigma_px=1.0, step_px=step).semivariogram(lag)

@@ -1,0 +1,205 @@
+"""Effects on the shape of a disparity map: outlines that grow, a low-pass, half-occluded strips that are filled.
+
+Each is predicted on the reference's own raster; what bears witness is that the measured disparities lie nearer to the shape
+with the effect than to that without, in blocks all over the wall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.robust import nmad
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
+from pipeline.gap.residuals.disparity_raster import DisparityRaster
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from scene.mesh import FloatArray
+from sensors.effects.base import Effect
+from sensors.effects.edge_fattening import EdgeFattening
+from sensors.effects.occlusion_fill import OcclusionFill
+from sensors.effects.raster_effect import RasterEffect
+from sensors.effects.smoothing import Smoothing
+
+_RADII = (1, 2, 3, 4, 5, 6, 8)
+_SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
+"""Cells that outlines grow by, and standard deviations of the low-pass in cells."""
+_FINER = (1.1, 1.03)
+_CLEAR = 3.0
+"""Predicted sigmas by which an effect at depth steps must move a point for it to bear witness."""
+_CLEAR_STEP = 1.3
+"""How many times the least depth step it must be: what counts as one, matchers do not agree."""
+_FEWEST_FILLED, _LEAST_FILLED_GAIN = 8, 10.0
+_LEAST_HELD = 0.6
+_FILLED, _STRAY_FILLED = 0.9, 0.02
+"""Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
+_NEAR_STEPS = 2
+_FILTERED = 0.02
+"""Share by which a low-pass is off since the reference is filtered for the rock, at its own cells and up to its own borders."""
+
+
+@dataclass(frozen=True)
+class _Witnesses:
+    """raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px; sigma: (n,) their spread; blocks; held_out:
+    (n,) points that have no say."""
+
+    raster: DisparityRaster
+    disparity: FloatArray
+    rough: FloatArray
+    sigma: FloatArray
+    blocks: Blocks
+    held_out: BoolArray
+
+    def gains(self, beside: list[Effect], effect: Effect) -> FloatArray:
+        """(n,) log-likelihood with an effect beside others less that of the others alone."""
+        without = self.raster.moved(beside, self.disparity)
+        moved = self.raster.moved([*beside, effect], self.disparity)
+        if isinstance(effect, EdgeFattening):
+            clear = np.maximum(_CLEAR * self.sigma, _CLEAR_STEP * self.raster.jump_px)
+            moved = np.where(np.abs(moved - without) > clear, moved, without)
+        more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
+        return np.where((moved == without) | self.held_out, 0.0, more)
+
+    def likelier(self, beside: list[Effect], found: list[ShapeFound]) -> ShapeFound:
+        """Of effects that may feign each other, the one that explains more of the points that any of them moves clearly."""
+        without = self.raster.moved(beside, self.disparity)
+        moved = [self.raster.moved([*beside, each.effect], self.disparity) for each in found]
+        clear = ~self.held_out & np.any([np.abs(each - without) > _CLEAR * self.sigma for each in moved], axis=0)
+        gains = [float(log_density(self.rough, each, self.sigma)[clear].sum()) for each in moved]
+        return found[int(np.argmax(gains))]
+
+
+def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArray, held_out: BoolArray) -> list[ShapeFound]:
+    """The effects on the shape that the points ask for, one after another. rough: (n,) registered residuals, px; held_out: (n,)
+    points that have no say.
+
+    None where the points are on no raster, or where the model holds the effect already.
+    """
+    raster = DisparityRaster.of(measurement, residuals.geometry)
+    if raster is None:
+        return []
+    scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
+    believed = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+    witnesses = _Witnesses(
+        raster,
+        residuals.geometry.disparity,
+        rough + raster.moved(believed, residuals.geometry.disparity),
+        scale * residuals.sigma,
+        Blocks.over(residuals.at),
+        held_out,
+    )
+    found: list[ShapeFound] = []
+
+    def smoothing(untouched: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+        touched = np.any([np.zeros(len(rough), dtype=bool), *(each.touched for each in found)], axis=0)
+        return _smoothing(replace(untouched, held_out=held_out | touched), beside)
+
+    trials: dict[str, Callable[[_Witnesses, list[Effect]], ShapeFound | None]] = {
+        EdgeFattening.tag(): _fattening,
+        Smoothing.tag(): smoothing,
+        OcclusionFill.tag(): _filling,
+    }
+    for name in {effect.name for effect in believed}:
+        del trials[name]
+    while trials:
+        beside = [*believed, *(each.effect for each in found)]
+        tried = {name: each for name, trial in trials.items() if (each := trial(witnesses, beside)) is not None}
+        if not tried:
+            break
+        feigned = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
+        likely = [witnesses.likelier(beside, feigned)] if feigned else []
+        found.append(max([*likely, *tried.values()], key=lambda each: each.gain))
+        del trials[found[-1].name]
+    return found
+
+
+def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+    """Radii are whole cells: any between one and the next does the same."""
+    step, raster = witnesses.raster.step, witnesses.raster
+    trials = [(radius, witnesses.gains(beside, _grown(radius, step))) for radius in _RADII]
+    radius, gains = max(trials, key=lambda trial: float(trial[1].sum()))
+    gain = witnesses.blocks.tested(gains)
+    if gain is None:
+        return None
+    touched = raster.moved([_grown(radius + _NEAR_STEPS, step)], witnesses.disparity) != 0
+    return ShapeFound(_grown(radius, step), {"radius_px": step / np.sqrt(12)}, gain, touched)
+
+
+def _grown(radius: int, step: float) -> EdgeFattening:
+    return EdgeFattening(radius_px=(radius + 0.5) * step)
+
+
+def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+    """The standard deviation at the top of the likelihood."""
+    step = witnesses.raster.step
+
+    def gains(sigma: float) -> FloatArray:
+        return witnesses.gains(beside, Smoothing(sigma_px=sigma))
+
+    sigma = refined(gains, [step * each for each in _SIGMAS], _FINER)
+    gain = witnesses.blocks.tested(gains(sigma))
+    if gain is None:
+        return None
+    std = float(np.hypot(witnesses.blocks.std(gains, sigma), _FILTERED * sigma))
+    return ShapeFound(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain, np.zeros(len(witnesses.rough), dtype=bool))
+
+
+def _filling(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+    """Points where the right camera sees nothing, at the disparity of the background beside them.
+
+    Without it hardly any of those cells holds a point (up to a fifth, by edges that are not quite where the reference has them).
+    """
+    raster = witnesses.raster
+    before = raster.after(beside)
+    points = np.isnan(raster.at_points(before)) & raster.at_points(raster.hidden)
+    gain = float(witnesses.gains(beside, OcclusionFill(reach_px=1e5))[points].sum())
+    if points.sum() < _FEWEST_FILLED or gain < _LEAST_FILLED_GAIN:
+        return None
+    widths, held = _strips(before, raster)
+    reach, std = _reach(widths, held, raster.step)
+    narrow = held[widths <= reach / raster.step]
+    if narrow.mean() < _LEAST_HELD:
+        return None
+    return ShapeFound(OcclusionFill(reach_px=reach), {"reach_px": std}, gain, points)
+
+
+def _strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArray[np.int64], BoolArray]:
+    """Of the half-occluded cells: how wide the strip is in which each lies, in cells, and whether it holds a point."""
+    held = np.zeros(before.shape, dtype=bool)
+    held[raster.row, raster.column] = True
+    width = _widths(before)
+    inside = (width > 0) & raster.hidden
+    return width[inside], held[inside]
+
+
+def _reach(widths: NDArray[np.int64], held: BoolArray, step: float) -> tuple[float, float]:
+    """Widest strip that is filled and its standard deviation, px: by which strips hold points.
+
+    Where all of them do, the widest is the least that the reach may be; how much more it is, is known as before: as much as is
+    typical, give or take that (an exponential distribution).
+    """
+    tried = np.unique(widths)
+    best = int(np.argmax([_log_chance(held, widths <= each) for each in tried]))
+    low = float(tried[best])
+    if best + 1 == len(tried):
+        typical = OcclusionFill.typical_sizes()["reach_px"]
+        return (low + 0.5) * step + typical, typical
+    return (low + tried[best + 1]) / 2 * step, (tried[best + 1] - low) / np.sqrt(12) * step
+
+
+def _log_chance(held: BoolArray, filled: BoolArray) -> float:
+    """Of cells that hold points or not, where strips are filled or not."""
+    chance = np.where(filled, _FILLED, _STRAY_FILLED)
+    return float(np.sum(np.log(np.where(held, chance, 1 - chance))))
+
+
+def _widths(disparity: FloatArray) -> NDArray[np.int64]:
+    """(rows, columns) width in cells of the unmatched run between two matched ones in which a cell lies, 0 elsewhere."""
+    columns = disparity.shape[1]
+    matched, column = ~np.isnan(disparity), np.arange(columns)
+    before = np.maximum.accumulate(np.where(matched, column, -1), axis=1)
+    after = np.minimum.accumulate(np.where(matched, column, columns)[:, ::-1], axis=1)[:, ::-1]
+    return np.where(~matched & (before >= 0) & (after < columns), after - before - 1, 0)

@@ -1,0 +1,234 @@
+"""The pictures of a diagnosis: maps and profiles before and after, the gap as a bar, the identifiability matrix; PNG bytes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from pipeline.change.robust import nmad
+from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.workflow import Diagnosis
+from pipeline.gap.report.covariate_ranking import bins, standardised, steady
+from pipeline.gap.report.in_words import with_unit
+from pipeline.report.figures import COLOURS, dress_map
+from pipeline.report.pictures import png
+from scene.mesh import FloatArray
+from sensors.model import StereoModel
+
+_BINS = 24
+_POINTS_PER_PIXEL = 8.0
+_BEFORE, _AFTER, _NAMED = "#D55E00", "#0072B2", "black"
+DEPTH_LABEL = "surface deeper than predicted, mm; missing rock positive"
+_MOST_NMAD = 6.0
+"""Of a map's values, beyond which those that are more have no say in its colours."""
+_PLATE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+_COLUMNS = 3
+_CROWDED = ("edge_step",)
+"""Covariates of which most values lie near zero, the rest over decades."""
+_MOST_PIXELS = 400
+"""Of a map, each way, of points however narrow a strip they fill."""
+_MANY = 300.0
+"""Span of a logarithmic axis from which on it has a number per decade, else two."""
+
+
+def maps_figure(found: Diagnosis) -> bytes:
+    """Residuals before and after on one scale: means of small pixels, and their spread over what each model predicts."""
+    unit, pixels = 1e3 * found.residuals.depth_m, _Pixels(found)
+    left, right, low, high = pixels.extent
+    figure = Figure(figsize=(11.5, float(np.clip(10.0 * (high - low) / (right - left), 4.0, 12.0)) + 2.2), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True, sharey=True)
+    means = [pixels.mean(values * unit) for values in (found.before, found.after)]
+    limit = _limit(means[0])
+    sigmas = found.residuals.sigma, sigma_after(found)
+    spreads = [pixels.spread(values / sigma) for values, sigma in zip((found.before, found.after), sigmas, strict=True)]
+    for panel, values, title in zip(panels[0], means, ("before", "after"), strict=True):
+        image = panel.imshow(values, cmap=COLOURS, vmin=-limit, vmax=limit, extent=pixels.extent, origin="lower")
+        panel.set_title(f"mean residual, {title}", fontsize=10)
+    _bar(figure, image, panels[0], DEPTH_LABEL)
+    for panel, values, title in zip(panels[1], spreads, ("before", "after"), strict=True):
+        image = panel.imshow(values, cmap="PuOr_r", vmin=0.4, vmax=1.6, extent=pixels.extent, origin="lower")
+        panel.set_title(f"spread over the predicted one, {title}", fontsize=10)
+    _bar(figure, image, panels[1], "1: as predicted")
+    for panel in panels.ravel():
+        panel.set_facecolor("0.85")
+        dress_map(panel, pixels.extent[0], pixels.extent[2])
+        panel.label_outer()
+        for change in found.changes:
+            corner, opposite = change.bounds[:, :2]
+            panel.add_patch(Rectangle(tuple(corner), *(opposite - corner), fill=False, edgecolor="black", linewidth=1.0))
+    return png(figure)
+
+
+def _limit(means: FloatArray) -> float:
+    """Where the colours of a map end: at the 98 % quantile of its values, or sooner where some lie far beyond all others."""
+    known = np.abs(means[np.isfinite(means)])
+    usual = _MOST_NMAD * nmad(known, 0.0) if known.size else 0.0
+    top = float(np.quantile(known, 0.98)) if known.size else 0.0
+    return (min(top, usual) if usual > 0 else top) or 1.0
+
+
+def _bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: str) -> None:
+    """A colour bar beneath a row of maps, where the label has room however low the maps are."""
+    figure.colorbar(image, ax=panels, label=label, extend="both", location="bottom", shrink=0.6, aspect=45)
+
+
+def sigma_after(found: Diagnosis) -> FloatArray:
+    """(n,) spread that the model with the named effects predicts, in the observable's unit."""
+    model, residuals = found.model_after, found.residuals
+    if isinstance(model, StereoModel):
+        return np.asarray(np.sqrt(np.broadcast_to(model.variance, len(residuals))))
+    return np.asarray(np.sqrt(model.variance(residuals.geometry)))
+
+
+def profiles_figure(found: Diagnosis) -> bytes:
+    """Means and spreads against each covariate, with two standard errors, and what the named effects explain on top."""
+    names = [name for name, _, _ in standardised(found)]
+    rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
+    figure = Figure(figsize=(11.5, 4.0 * rows), layout="constrained")
+    panels = np.atleast_2d(figure.subplots(2 * rows, _COLUMNS, height_ratios=[1.4, 1.0] * rows))
+    kept = steady(found)
+    unit = 1e3 * found.residuals.depth_m[kept]
+    before, after = found.before[kept] * unit, found.after[kept] * unit
+    predicted = found.residuals.sigma[kept] * np.abs(unit), sigma_after(found)[kept] * np.abs(unit)
+    for number, name in enumerate(names):
+        row, column = divmod(number, _COLUMNS)
+        upper, lower = panels[2 * row, column], panels[2 * row + 1, column]
+        x = found.residuals.covariates[name][kept]
+        edges, group = bins(x, _BINS)
+        if len(edges) < 3:
+            upper.set_visible(False)
+            lower.set_visible(False)
+            continue
+        middle = (edges[1:] + edges[:-1]) / 2
+        for values, colour, label in ((before, _BEFORE, "before"), (after, _AFTER, "after")):
+            _mean_band(upper, middle, group, values, colour, label)
+            _spread_band(lower, middle, group, values, colour)
+        if found.effects:
+            upper.plot(middle, _means(group, before - after, len(middle)), color=_NAMED, linewidth=1.4, label="named effects")
+        for sigma, colour in zip(predicted, (_BEFORE, _AFTER), strict=True):
+            lower.plot(middle, np.sqrt(_means(group, sigma**2, len(middle))), color=colour, linestyle="--", linewidth=1.0)
+        upper.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
+        upper.set_title(with_unit(name, found.residuals.sensor), fontsize=9)
+        upper.set_ylabel("mean depth, mm", fontsize=8)
+        lower.set_ylabel("spread, mm", fontsize=8)
+        for panel in (upper, lower):
+            panel.tick_params(labelsize=7)
+            if name in _CROWDED:
+                _log_axis(panel)
+        if number == 0:
+            upper.legend(fontsize=7)
+    for panel in panels.ravel():
+        if not panel.has_data():
+            panel.set_visible(False)
+    return png(figure)
+
+
+def _log_axis(panel: Axes) -> None:
+    """Few and plain numbers along x."""
+    panel.set_xscale("log")
+    low, high = panel.get_xlim()
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < _MANY * low else (1.0,)))
+    panel.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    panel.xaxis.set_minor_formatter(NullFormatter())
+
+
+def gap_figure(gap: Gap) -> bytes:
+    """One bar from the floor over the score after to the score before."""
+    factor, unit = gap.shown
+    floor, after, before = (factor * value for value in (gap.floor, gap.after, gap.before))
+    figure = Figure(figsize=(9.0, 2.0), layout="constrained")
+    panel = figure.add_subplot()
+    panel.barh(0, before - after, left=after, color="#56B4E9", height=0.5, label="closed")
+    panel.barh(0, max(after - floor, 0.0), left=floor, color=_BEFORE, height=0.5, label="left")
+    errors = {"before": factor * gap.error, "after": factor * gap.floor_error}
+    for name, value, level in (("floor", floor, -0.4), ("after", after, 0.4), ("before", before, 0.72)):  # a row for each
+        panel.plot([value, value], [min(level, -0.33), max(level, 0.33)], color="black", linewidth=1.2)
+        place: dict[str, Any] = {"ha": "center", "va": "bottom" if level > 0 else "top"}
+        panel.text(value, level, f"{name} {value:.3f}", fontsize=8, bbox=_PLATE, **place)
+        if name in errors:
+            panel.errorbar(value, 0, xerr=2 * errors[name], color="black", linewidth=0.8, capsize=3)
+    scores, whisker = (floor, after, before), 2 * max(errors.values())
+    room = whisker + 0.25 * max(np.ptp(scores), whisker, 1e-6)
+    panel.set_xlim(min(scores) - room, max(scores) + room)
+    panel.set_ylim(-0.75, 1.1)
+    panel.set_yticks([])
+    what = f"score of what was held out, {unit} (whiskers: two standard errors of the differences)"
+    panel.set_xlabel(what, fontsize=8)
+    panel.tick_params(labelsize=8)
+    return png(figure)
+
+
+def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -> bytes:
+    """Absolute cosines of the signatures after the pose fit, and beside them the share of each that survives it."""
+    short, count = [name.partition(".")[2] for name in names], len(names)
+    figure = Figure(figsize=(2.8 + 0.62 * count, 1.9 + 0.44 * count), layout="constrained")
+    matrix, bars = figure.subplots(1, 2, width_ratios=[count, 3.0], sharey=True)
+    image = matrix.imshow(cosines, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    for row, column in zip(*np.nonzero((cosines >= 0.3) & ~np.eye(count, dtype=bool)), strict=True):
+        value = cosines[row, column]
+        colour = "white" if value > 0.6 else "black"
+        matrix.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+    matrix.set_xticks(range(count), short, rotation=60, ha="right", fontsize=8)
+    matrix.set_yticks(range(count), short, fontsize=8)
+    matrix.set_title("cosine of the signatures after the pose fit", fontsize=9)
+    figure.colorbar(image, ax=matrix, shrink=0.7)
+    bars.barh(range(count), 100 * survival, color=_AFTER)
+    bars.set_title("survives the pose, %", fontsize=9)
+    bars.set_xlim(0, 100)
+    bars.tick_params(labelsize=8)
+    return png(figure)
+
+
+class _Pixels:
+    """Square pixels over the smooth points, with some points in each."""
+
+    def __init__(self, found: Diagnosis) -> None:
+        residuals = found.residuals
+        self._kept = residuals.smooth if residuals.smooth.any() else ~residuals.smooth
+        at = residuals.at[self._kept]
+        low, extent = at.min(axis=0), np.ptp(at, axis=0)
+        side = max(float(np.sqrt(np.prod(extent) * _POINTS_PER_PIXEL / len(at))), float(extent.max()) / _MOST_PIXELS) or 1.0
+        columns, rows = (int(size / side) + 1 for size in extent)
+        column, row = (np.floor((at[:, axis] - low[axis]) / side).astype(np.int64) for axis in (0, 1))
+        self._shape, self._pixel = (rows, columns), row * columns + column
+        self._count = np.bincount(self._pixel, minlength=rows * columns)
+        self.extent = (float(low[0]), float(low[0] + columns * side), float(low[1]), float(low[1] + rows * side))
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """(rows, columns) mean of (n,) values, NaN without points."""
+        total = np.bincount(self._pixel, values[self._kept], len(self._count))
+        return np.where(self._count > 0, total / np.maximum(self._count, 1), np.nan).reshape(self._shape)
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """(rows, columns) standard deviation about the pixel's mean, free of bias, NaN for fewer than three points."""
+        mean = self.mean(values).ravel()
+        square = np.bincount(self._pixel, (values[self._kept] - mean[self._pixel]) ** 2, len(self._count))
+        found = np.sqrt(square / np.maximum(self._count - 1, 1))
+        return np.where(self._count > 2, found, np.nan).reshape(self._shape)
+
+
+def _means(group: Any, values: FloatArray, size: int) -> FloatArray:
+    return np.asarray(np.bincount(group, values, size) / np.maximum(np.bincount(group, minlength=size), 1))
+
+
+def _mean_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str, label: str) -> None:
+    mean = _means(group, values, len(middle))
+    count = np.maximum(np.bincount(group, minlength=len(middle)), 1)
+    error = 2 * np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0) / count)
+    panel.plot(middle, mean, color=colour, linewidth=1.0, label=label)
+    panel.fill_between(middle, mean - error, mean + error, color=colour, alpha=0.25, linewidth=0)
+
+
+def _spread_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str) -> None:
+    mean = _means(group, values, len(middle))
+    spread = np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0))
+    error = 2 * spread / np.sqrt(2 * np.maximum(np.bincount(group, minlength=len(middle)), 1))
+    panel.plot(middle, spread, color=colour, linewidth=1.0)
+    panel.fill_between(middle, spread - error, spread + error, color=colour, alpha=0.25, linewidth=0)

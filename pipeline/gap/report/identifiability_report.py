@@ -1,0 +1,111 @@
+"""The files of an identifiability analysis: identifiability.json, report.html and a picture of the matrix for each sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.atomic import write_json, write_text, writing
+from pipeline.gap.report.figures import matrix_figure
+from pipeline.gap.report.in_words import listed, number
+from pipeline.gap.survey.identifiability import ALIKE, NAMED_AT, Identifiability
+from pipeline.gap.survey.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE
+from pipeline.report.page import template
+from pipeline.report.provenance import versions
+
+_INSTRUMENTS = {"stereo": "Stereo pair", "tls": "Laser scanner"}
+_HELPS = 0.8
+"""A further measurement is worth naming where it lowers the value that is named to this share."""
+_NEVER = "never"
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One effect of the page's table."""
+
+    name: str
+    parameter: str
+    survival: str
+    seen_from: str
+    named_from: str
+    alike: str
+    extension: str
+
+
+def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
+    """Write the files of one analysis per sensor into `out`; returns report.html."""
+    record = {"schema": 1, "surveys": [each.to_dict() for each in found], "versions": versions()}
+    write_json(out / "identifiability.json", record)
+    pictures = {each.sensor: matrix_figure(list(each.names), each.cosines, each.survival) for each in found}
+    for sensor, picture in pictures.items():
+        with writing(out / f"identifiability_{sensor}.png") as temporary:
+            temporary.write_bytes(picture)
+    page = template("gap/report/identifiability.html.jinja").render(
+        parts=[_part(each, pictures[each.sensor]) for each in found],
+        alike=ALIKE,
+        seen_at=SIGNAL_TO_NOISE,
+        named_at=NAMED_AT,
+        length_m=REFERENCE_LENGTH_M,
+    )
+    write_text(out / "report.html", page)
+    return out / "report.html"
+
+
+def in_words(found: Identifiability) -> str:
+    """What the analysis says, in plain words."""
+    weak = [name for name, share in zip(found.names, found.survival, strict=True) if share < 0.1]
+    pairs = found.pairs()
+    parts = [f"{_INSTRUMENTS[found.sensor]}, {found.points:,} points on smooth parts of the wall."]
+    if weak:
+        parts.append(f"A shift or turn of the sensor takes up more than 90 % of {listed(weak)}.")
+    if pairs:
+        a, b = pairs[0]
+        parts.append(
+            f"{len(pairs)} pairs of effects look alike (cosine of at least {ALIKE:g}), most of all {found.names[a]} and"
+            f" {found.names[b]} ({found.cosines[a, b]:.3f}): from this survey alone the two cannot be named apart."
+        )
+        counts = {e.name: sum(bool(e.cosines[pair] < ALIKE) for pair in pairs) for e in found.extensions}
+        best = max(counts, key=lambda name: counts[name])
+        verb = f"would part {counts[best]} of the {len(pairs)}" if counts[best] else "would part any of them"
+        parts.append(f"{'None of the further measurements' if not counts[best] else best.capitalize()} {verb}.")
+    else:
+        parts.append("No two effects on the mean look alike.")
+    return " ".join(parts)
+
+
+def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:
+    return {
+        "instrument": _INSTRUMENTS[found.sensor],
+        "words": in_words(found),
+        "picture": picture,
+        "rows": [_row(found, row) for row in range(len(found.names))],
+        "extensions": [extension.name for extension in found.extensions],
+        "pairs": [
+            (found.names[a], found.names[b], found.cosines[a, b], [e.cosines[a, b] for e in found.extensions])
+            for a, b in found.pairs()
+        ],
+        "others": [(each, _value(each.parameter, each.seen_from)) for each in found.others],
+        "reference_error_m": found.reference_error_m,
+    }
+
+
+def _row(found: Identifiability, row: int) -> _Row:
+    best, named = found.best_extension(row), found.named_from[row]
+    helps = best.named_from[row] < _HELPS * named
+    return _Row(
+        name=found.names[row] + (f" ({found.shown[row]})" if found.shown[row] else ""),
+        parameter=found.parameters[row],
+        survival=f"{found.survival[row]:.1%}",
+        seen_from=_value("", found.seen_from[row]),
+        named_from=_value("", named),
+        alike=", ".join(f"{found.names[other].partition('.')[2]} {found.cosines[row, other]:.2f}" for other in found.alike(row)),
+        extension=f"{_value('', best.named_from[row])} with {best.name}" if helps else "",
+    )
+
+
+def _value(parameter: str, value: float) -> str:
+    return f"{parameter} {number(value, 2) if np.isfinite(value) else _NEVER}".strip()

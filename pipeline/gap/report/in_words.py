@@ -1,0 +1,173 @@
+"""A diagnosis in plain words: the paragraph at the top of the report, and what became of each explanation that was tried."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.gap.mean.selection import Tried
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.verdict import closing, in_a_sentence, left_over
+from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.workflow import Diagnosis
+from pipeline.gap.other.spread import SpreadTried
+from pipeline.gap.report.quantities import with_std
+from pipeline.report.page import true_minus
+from sensors.effects.base import ShowsIn
+
+_INSTRUMENTS = {"tls": "ranges of a laser scan", "stereo": "disparities of a stereo pair"}
+_STATISTICS = {"mean": "mean", "spread": "spread", "shape": "outliers", "missing": "lost returns"}
+_CLEAR = 0.01
+_UNITS = {
+    "range": "m", "depth": "m", "azimuth": "rad", "zenith": "rad", "incidence": "rad", "image_x": "px",
+    "image_y": "px", "radius": "px", "disparity": "px", "intensity": "ln of power over its median", "line": "number",
+    "time": "share of the scan", "disparity_fraction": "px", "log_power": "ln of relative power",
+}  # fmt: skip
+
+
+def title(found: Diagnosis) -> str:
+    """The outcome in a few words."""
+    names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
+    match found.verdict:
+        case "no_gap":
+            return "No effect is missing" + (", but the model is too noisy" if found.evidence.spread < 1.0 else "")
+        case "insufficient_data":
+            return "Too few data to say what is missing"
+        case "unknown" if not found.effects:
+            return "Measurement and model disagree, and nothing that was tried says why"
+        case "unknown":
+            return "Missing: something that is not in the catalogue" + (f", and {listed(names)}" if names else "")
+        case _:
+            return f"Missing: {listed(names)}"
+
+
+def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
+    """What was compared, what was found, how far the gap closes. rows: as `where` gives them."""
+    parts = [f"{len(found.residuals):,} {_INSTRUMENTS[found.residuals.sensor]} were compared with what the model predicts."]
+    parts.append(in_a_sentence(found.verdict, found.effects, found.evidence.spread))
+    parts += [_effect(effect) for effect in found.effects]
+    parts += [each for each in (left_over(found.effects, found.evidence), _shown_most(found, rows)) if each]
+    if found.gap is not None:
+        parts.append(_gap(found.gap, bool(found.effects)))
+    if found.changes:
+        volume = sum(abs(change.volume_m3) for change in found.changes)
+        regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
+        parts.append(f"{regions} where the rock itself moved ({volume:.2g} m\N{SUPERSCRIPT THREE} in all) were set aside.")
+    if found.remaining.get("note"):
+        parts.append(f"Note: {found.remaining['note']}.")
+    return " ".join(parts)
+
+
+def _shown_most(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
+    """Where the disagreement is; where nothing describes it, also how large it is there."""
+    if found.verdict in ("no_gap", "insufficient_data") or not rows:
+        return ""
+    clear = [row for row in rows if row["p_value"] <= _CLEAR]
+    first = (clear or rows)[0]
+    statistic = _STATISTICS[first["statistic"]]
+    if not found.effects:
+        what = first["covariate"].replace("_", " ")
+        region = " to ".join(number(first["region"][key]) for key in ("from", "to"))
+        size = f"{number(1e3 * abs(first['size_m']), 2)} mm"
+        size = f"{first['share_lost']:.0%} lost" if first["statistic"] == "missing" else size
+        return f"It shows most in the {statistic} against {what}, from {region}: {size} there."
+    if not clear:
+        return ""
+    seen = [row["covariate"].replace("_", " ") for row in clear[:3] if row["statistic"] == first["statistic"]]
+    return f"Before anything was named it showed most in the {statistic} against {listed(seen)}."
+
+
+def outcome(found: Diagnosis, tried: Sequence[Tried], item: Tried) -> str:
+    """What became of one of the explanations `tried`, best first: named, in the class of a named one, or rejected."""
+    if item.empirical:
+        added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
+        best = next(each for each in tried if each.empirical and each.name == item.name)
+        return "added as empirical" if item is best and item.name in added else "rejected"
+    return _outcome_of(found, item.name)
+
+
+def spread_outcome(found: Diagnosis, item: SpreadTried) -> str:
+    """What became of one of the explanations of the spread."""
+    if item.empirical:
+        added = any(effect.kind == "empirical" and effect.spreads for effect in found.effects)
+        return "added as empirical" if added else "rejected"
+    return _outcome_of(found, item.name)
+
+
+def _outcome_of(found: Diagnosis, effect: str) -> str:
+    """What became of an effect of the catalogue."""
+    name = f"{found.residuals.sensor}.{effect}"
+    physical = [each for each in found.effects if each.kind == "physical"]
+    if any(each.name == name for each in physical):
+        return "named"
+    alike = {other for each in physical for other in each.alike}
+    return "cannot be told from the named one" if name in alike else "rejected"
+
+
+def listed(words: Sequence[str]) -> str:
+    """a, b and c."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def with_unit(covariate: str, sensor: str) -> str:
+    """A covariate as a report shows it, with the unit of its values."""
+    return f"{covariate}, {_UNITS.get(covariate, 'm' if sensor == 'tls' else 'px')}"
+
+
+def number(value: float, digits: int = 4) -> str:
+    """With at most so many significant digits, written out below a million and above a ten-thousandth."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
+def decimal(value: float) -> str:
+    """With one decimal, without any from ten thousand on."""
+    return true_minus(value, 1) if abs(value) < 9999.95 else number(value, 5)
+
+
+def rounded(value: Any) -> Any:
+    """A value of an effect's entry with at most five significant digits in each number."""
+    if isinstance(value, dict):
+        return {key: rounded(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each) for each in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def values(effect: Named) -> str:
+    """Parameters with their standard deviations."""
+    return ", ".join(_value(key, value, effect.std.get(key)) for key, value in effect.entry.items() if key != "name")
+
+
+def _value(key: str, value: Any, std: float | None) -> str:
+    if isinstance(value, dict):
+        cycle = f", repeated every {number(value['period'])}" if value.get("period") else ""
+        return f"{key} {number(value['low'])} to {number(value['high'])}{cycle}"
+    if isinstance(value, list):
+        flat = [each for row in value for each in row]
+        return f"{key} {len(value)} x {len(value[0])} from {number(min(flat), 3)} to {number(max(flat), 3)}"
+    if not isinstance(value, float):
+        return f"{key} {value}"
+    return f"{key} {with_std(key, value, std)}"
+
+
+def _effect(effect: Named) -> str:
+    if effect.kind == "empirical":
+        return f"The disagreement {_described(effect)}; it is described, not explained, by {effect.name}."
+    said = f"It is {effect.name} ({values(effect)})."
+    return f"{said} It looks like {', '.join(effect.alike)}; what would split them: {effect.split_by}." if effect.alike else said
+
+
+def _described(effect: Named) -> str:
+    covariates = [effect.entry[key] for key in ("covariate", "second") if effect.entry.get(key)]
+    if covariates:
+        return f"depends on {listed(covariates)}"
+    lost = effect.effect.shows_in == ShowsIn.RETURNS
+    return "is in the directions from which nothing returns" if lost else "is larger than the model says"
+
+
+def _gap(gap: Gap, named: bool) -> str:
+    factor, unit = gap.shown
+    before, after, floor = (f"{factor * value:.3f} {unit}" for value in (gap.before, gap.after, gap.floor))
+    scores = f"{before} before, {after} after" if named else f"{before} before"
+    text = f"On blocks that no step has used, the gap is {scores}; the model's own noise leaves {floor}"
+    return f"{text}{', so ' if gap.closed is None else ': '}{closing(gap, named)}."

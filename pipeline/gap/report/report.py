@@ -1,0 +1,137 @@
+"""The files of a diagnosis: gap.json, the model after, points before and after, report and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pipeline.formats.atomic import write_json, write_text, writing
+from pipeline.formats.laz import write_laz
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.naming.verdict import closing, in_a_sentence
+from pipeline.gap.naming.workflow import FEWEST_POINTS, Diagnosis
+from pipeline.gap.report.covariate_ranking import steady, where
+from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
+from pipeline.gap.report.in_words import (
+    decimal,
+    number,
+    outcome,
+    paragraph,
+    rounded,
+    spread_outcome,
+    title,
+    values,
+    with_unit,
+)
+from pipeline.gap.report.quantities import with_std
+from pipeline.report.page import p_value_in_words, template
+
+_MOST_TRIED = 25
+REQUEST = (
+    f"At least {FEWEST_POINTS} points on smooth rock of stable ground, spread over the wall: scan or match more densely, take in "
+    "more of the wall, or widen stable_areas (wall frame, m) where they leave out what did not move."
+)
+"""What insufficient_data asks for."""
+
+
+def to_dict(found: Diagnosis, measurement: Measurement) -> dict[str, Any]:
+    """gap.json."""
+    shift, turn = found.pose[:3], found.pose[3:]
+    axes = measurement.frame.rotation
+    return {
+        "schema": 1,
+        "verdict": found.verdict,
+        "effects": [effect.to_dict() for effect in found.effects],
+        "where": where(found),
+        "scene_changes": [change.to_dict(measurement.frame) for change in found.changes],
+        "sensor": measurement.sensor,
+        "registration": {"translation_m": (axes.T @ shift).tolist(), "rotation_rad": (axes.T @ turn).tolist()},
+        "identifiability": found.identifiability,
+        "gap": found.gap.to_dict() if found.gap else None,
+        "remaining": found.remaining,
+        "seconds": round(found.seconds, 2),
+    }
+
+
+def write(out: Path, found: Diagnosis, measurement: Measurement) -> Path:
+    """Write all files of a diagnosis into `out`, once all pictures are drawn; returns report.html.
+
+    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one.
+    """
+    pictures = _pictures(found)
+    page = _page(found, pictures)
+    write_json(out / "gap.json", to_dict(found, measurement))
+    write_text(out / "model_after.yaml", _yaml(found.model_after.model_dump(mode="json", exclude_defaults=False)))
+    points = measurement.frame.to_world(measurement.cloud.points[found.residuals.index])
+    for name, residual in (("before", found.before), ("after", found.after)):
+        extra: dict[str, Any] = {"residual_m": residual * found.residuals.depth_m, "held_out": found.held_out.astype(np.uint8)}
+        write_laz(out / f"{name}.laz", points, extra=extra)
+    for file, png in pictures.items():
+        with writing(out / file) as temporary:
+            temporary.write_bytes(png)
+    write_text(out / "report.html", page)
+    return out / "report.html"
+
+
+def summary(found: Diagnosis) -> str:
+    """The verdict in some lines of text."""
+    lines = [f"{found.verdict}: {in_a_sentence(found.verdict, found.effects, found.evidence.spread)}"]
+    if found.verdict == "insufficient_data":
+        lines += [f"  {found.remaining['note']}", f"  to measure: {REQUEST[0].lower()}{REQUEST[1:]}"]
+    for effect in found.effects:
+        alike = f"; cannot be told from {', '.join(effect.alike)}" if effect.alike else ""
+        lines.append(f"  {effect.name} ({values(effect)}){alike}")
+    if found.changes:
+        lines.append(f"  {len(found.changes)} regions where the scene itself moved were set aside")
+    if found.gap is not None:
+        factor, unit = found.gap.shown
+        scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
+        lines.append(f"  gap {scores}: {closing(found.gap, bool(found.effects))}")
+    return "\n".join(lines)
+
+
+def _pictures(found: Diagnosis) -> dict[str, bytes]:
+    pictures = {"maps.png": maps_figure(found)} if len(found.residuals) else {}
+    if steady(found).any():
+        pictures["profiles.png"] = profiles_figure(found)
+    if found.gap is not None:
+        pictures["gap.png"] = gap_figure(found.gap)
+    table = found.identifiability
+    if table["names"]:
+        cosines = np.abs(np.array(table["cosines"], dtype=np.float64))
+        pictures["identifiability.png"] = matrix_figure(table["names"], cosines, np.array(table["survival"], dtype=np.float64))
+    return pictures
+
+
+def _page(found: Diagnosis, pictures: dict[str, bytes]) -> str:
+    rows = where(found)
+    tried = sorted(found.tried, key=lambda item: -item.score)
+    best = tried[0].score if tried else 0.0
+    after = found.model_after.model_dump(mode="json")
+    return template("gap/report/report.html.jinja").render(
+        found=found,
+        title=title(found),
+        paragraph=paragraph(found, rows),
+        pictures=pictures,
+        where=rows,
+        tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
+        more=max(len(tried) - _MOST_TRIED, 0),
+        spread_tried=[(item, spread_outcome(found, item)) for item in found.spread_tried],
+        added=_yaml({"effects": [rounded(effect.entry) for effect in found.effects]}),
+        model=_yaml(after),
+        number=number,
+        decimal=decimal,
+        rounded=rounded,
+        p_value=p_value_in_words,
+        with_std=with_std,
+        with_unit=with_unit,
+        request=REQUEST,
+        total=sum(found.timings.values()) or 1.0,
+    )
+
+
+def _yaml(content: dict[str, Any]) -> str:
+    return yaml.safe_dump(content, sort_keys=False)

@@ -1,0 +1,152 @@
+"""The nominal pair of cameras in the wall frame: pixels to rays and back, disparities in its rectification, and the real pair."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.residuals.residuals import BoolArray
+from scene.backend import dr, mi
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from scene.upload import on_device, vectors_on_device
+from sensors.camera import Camera, CameraPair
+from sensors.device import rotated, vector
+from sensors.effects.base import Effect, Stage
+from sensors.rectify import Rectification, rectify
+from sensors.stereo import rectified_pixel
+
+_HIDDEN_SHARE = 2e-4
+"""A point is hidden where another surface stands before it by this share of its distance."""
+
+
+@dataclass(frozen=True)
+class StereoGeometry:
+    """Per point: left pixel (u, v) and row in the right image (px), disparity of the reference and as found (px), point and unit
+    normal of the reference (n, 3), wall frame, m, and distances to the middles of both images (px)."""
+
+    u: FloatArray
+    v: FloatArray
+    v_right: FloatArray
+    disparity: FloatArray
+    found: FloatArray
+    point: FloatArray
+    normal: FloatArray
+    radius: FloatArray
+    radius_right: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def part(self, rows: Any) -> StereoGeometry:
+        """The same of some of the points."""
+        return StereoGeometry(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})
+
+
+@dataclass(frozen=True)
+class NominalPair:
+    """The nominal pair in the wall frame, with its rectification."""
+
+    pair: CameraPair
+    geometry: Rectification
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> NominalPair:
+        """Raises InputError where a stereo measurement has no cameras."""
+        if measurement.cameras is None:
+            raise InputError("a stereo measurement needs `cameras`", where="measurement.yaml")
+        pair = measurement.cameras.in_wall_frame(measurement.frame)
+        return cls(pair, rectify(pair))
+
+    def disparity(self, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """(n,) disparity of pixels of the left and of the right image, px."""
+        first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
+        return _on_host(self.left_column(*first) - self.right_column(*second))[0]
+
+    def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
+        """(n,) rectified column of pixels of the left image."""
+        rect = self.geometry
+        return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
+
+    def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
+        """(n,) rectified column of pixels of the right image."""
+        rect = self.geometry
+        return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
+
+
+def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (u, v) of points (n, 3)."""
+    u, v = _on_host(*_pixel(camera, vectors_on_device(points)))
+    return u, v
+
+
+def rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
+    """(n, 3) directions of pixels with unit component along the camera's axis."""
+    return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
+
+
+def _pixel(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
+    local = rotated(camera.rotation.T, point - vector(camera.position))
+    u, v = camera.on_device().pixel(local.x / local.z, local.y / local.z)
+    return u, v
+
+
+def _ray(camera: Camera, u: mi.Float64, v: mi.Float64) -> mi.Array3f64:
+    return rotated(camera.rotation, mi.Array3f64(*camera.on_device().tangents(u, v), 1.0))
+
+
+def _on_host(*columns: mi.Float64) -> list[FloatArray]:
+    dr.eval(*columns)
+    return [np.array(column) for column in columns]
+
+
+def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> BoolArray:
+    """(n,) whether another surface stands before points (n, 3) of the scene, seen from a position; a point that is NaN is not."""
+    back = np.nan_to_num(points, nan=1e9) - position
+    length = np.linalg.norm(back, axis=1)
+    return np.asarray(scene.cast(position, back / length[:, None])[0] < length * (1 - _HIDDEN_SHARE))
+
+
+def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: StereoGeometry) -> list[FloatArray]:
+    """(n,) of each real pair: the disparity that it gives on each point's tangent plane, in the nominal rectified pair."""
+    u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
+    point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
+    column = nominal.left_column(u, v)
+    dr.eval(column)
+
+    def seen(pair: CameraPair) -> mi.Float64:
+        origin, ray = vector(pair.left.position), _ray(pair.left, u, v)
+        met = origin + dr.dot(point - origin, normal) / dr.dot(ray, normal) * ray
+        disparity = column - nominal.right_column(*_pixel(pair.right, met))
+        dr.eval(disparity)  # one kernel for all pairs, and no waiting for it
+        return disparity
+
+    return _on_host(*[seen(pair) for pair in real])
+
+
+def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
+    """The pair shifted by `vector` (m) or turned by it (rad, small) about `centre`, in the frame that it is given in."""
+    if not turned:
+        return pair.shifted("both", vector)
+    x, y, z = vector
+    turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sides = (
+        Camera(**{**camera.__dict__, "rotation": turn @ camera.rotation, "position": centre + turn @ (camera.position - centre)})
+        for camera in (pair.left, pair.right)
+    )
+    return CameraPair(*sides)
+
+
+def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: Measurement) -> CameraPair:
+    """The nominal pair with camera effects, wall frame."""
+    pair = measurement.cameras
+    assert pair is not None
+    for effect in effects:
+        pair = effect.apply(pair, KeyedRandom(0)) if effect.stage == Stage.CAMERA else pair
+    return pair.in_wall_frame(measurement.frame)

@@ -1,0 +1,115 @@
+"""The rigid-body nuisance: where the sensor really stood against the survey."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.robust import nmad
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.tls_residuals import tls_residuals
+from pipeline.registration.rigid import rotation_matrix
+from scene.mesh import FloatArray
+from sensors.camera import Camera, CameraPair
+
+_ROUNDS = 6
+_OUTLIER = 3.5
+_FEWEST = 100
+_FAR_M, _MOST_MOVES = 0.002, 3
+
+
+def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
+    """(n,) residuals after a robust registration, the pose (6,), and how many predicted sigmas their spread is (at least 1)."""
+    kept, scale = residuals.smooth.copy(), 1.0
+    value, pose = residuals.value, np.zeros(6)
+    for _ in range(_ROUNDS):
+        pose = pose_of(residuals, kept)
+        value = residuals.value - residuals.pose @ pose
+        z = np.abs(value / residuals.sigma)
+        scale = max(1.0, nmad(z[residuals.smooth], 0.0))
+        kept = residuals.smooth & (z < _OUTLIER * scale)
+        if kept.sum() < _FEWEST:
+            kept = residuals.smooth
+    return value, pose, scale
+
+
+def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
+    """(6,) shift (m) and turn (rad) by weighted least squares over some rows (a mask or indices)."""
+    sigma = residuals.sigma[rows]
+    return np.asarray(np.linalg.lstsq(residuals.pose[rows] / sigma[:, None], residuals.value[rows] / sigma, rcond=None)[0])
+
+
+def residuals_of(measurement: Measurement) -> Residuals:
+    """The raw residuals of either sensor; those of several epochs as if all had been taken from one place."""
+    found = tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
+    epochs = measurement.epochs[found.index]
+    numbers = np.unique(epochs)
+    if len(numbers) < 2:
+        return found
+    poses = np.stack([registered(found.part(epochs == number))[1] for number in numbers])
+    away = (poses - poses.mean(axis=0))[np.searchsorted(numbers, epochs)]
+    return replace(found, value=found.value - np.einsum("ni,ni->n", found.pose, away))
+
+
+def settled(
+    measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None
+) -> tuple[Measurement, Residuals, FloatArray]:
+    """The measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there.
+
+    trusted: rows of the measurement's points by which to register, all where None; found: its residuals, if known. A pose that
+    moves the rays by more than some millimetres on the wall is gone along with, a few times at the most, since slopes at the
+    first place no longer serve.
+    """
+    found = residuals_of(measurement) if found is None else found
+    total = np.zeros(6)
+    for _ in range(_MOST_MOVES):
+        pose = registered(_only(found, trusted))[1]
+        if not _is_far(pose, found):
+            break
+        measurement, total = moved(measurement, pose), total + pose
+        found = residuals_of(measurement)
+    return measurement, found, total
+
+
+def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
+    return residuals if trusted is None else replace(residuals, smooth=residuals.smooth & np.isin(residuals.index, trusted))
+
+
+def _is_far(pose: FloatArray, residuals: Residuals) -> bool:
+    turn, shift = (float(np.linalg.norm(residuals.pose[:, columns], axis=1).mean()) for columns in (slice(3, 6), slice(3)))
+    return float(np.linalg.norm(pose[:3]) + turn / shift * np.linalg.norm(pose[3:])) > _FAR_M
+
+
+def moved(measurement: Measurement, pose: FloatArray) -> Measurement:
+    """The measurement with its sensor shifted (m) and turned (rad) in the wall frame, and what it measured with it.
+
+    What the sensor recorded stays as it is. A pair of cameras turns about the left one.
+    """
+    turn = rotation_matrix(pose[3:])
+    centre = _centre(measurement)
+    points = (measurement.cloud.points - centre) @ turn.T + centre + pose[:3]
+    cloud = replace(measurement.cloud, points=points)
+    if measurement.station is not None:
+        position, rotation = measurement.station
+        return measurement.changed(cloud=cloud, station=(position + pose[:3], turn @ rotation))
+    assert measurement.cameras is not None
+    axes = measurement.frame.rotation
+    world, shift = axes.T @ turn @ axes, axes.T @ pose[:3]
+    left = measurement.cameras.left.position
+
+    def each(camera: Camera) -> Camera:
+        return replace(camera, rotation=world @ camera.rotation, position=left + world @ (camera.position - left) + shift)
+
+    cameras = CameraPair(each(measurement.cameras.left), each(measurement.cameras.right))
+    return measurement.changed(cloud=cloud, cameras=cameras)
+
+
+def _centre(measurement: Measurement) -> FloatArray:
+    if measurement.station is not None:
+        return measurement.station[0]
+    assert measurement.cameras is not None
+    return measurement.cameras.in_wall_frame(measurement.frame).left.position

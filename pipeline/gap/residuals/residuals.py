@@ -1,0 +1,125 @@
+"""The disagreement at the level of the raw observable, common to both sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.mesh import FloatArray
+from sensors.effects.base import Sensor
+from sensors.effects.matching_noise import MatchingNoise
+from sensors.model import StereoModel
+
+BoolArray = NDArray[np.bool_]
+OUTLIER = 5.0
+"""Predicted sigmas, times what residuals spread of them, beyond which a point has no say."""
+
+
+_GRID = (np.arange(24) + 0.5) / 24
+"""Distances within a square of side 1, along one side, over which a mean is taken."""
+
+
+@dataclass(frozen=True)
+class SharedNoise:
+    """Noise of disparities that neighbours share. effects: what makes it; px_per_m: pixels of the frame per metre of the wall."""
+
+    effects: tuple[MatchingNoise, ...] = ()
+    px_per_m: float = 1.0
+
+    @classmethod
+    def of(cls, model: StereoModel, px_per_m: float) -> SharedNoise:
+        """What a model predicts of it."""
+        return cls(tuple(effect for effect in model.matching_noise if effect.shared and not effect.is_null), px_per_m)
+
+    def of_means(self, side_m: float) -> float:
+        """Variance of the mean over a square of the wall, px2: the covariance averaged over all pairs of its places.
+
+        Along each side the distance h of two places, as a share of it, has the density 2 (1 - h).
+        """
+        weight = np.outer(1 - _GRID, 1 - _GRID).ravel()
+        lag = side_m * self.px_per_m * np.stack([each.ravel() for each in np.meshgrid(_GRID, _GRID)], axis=1)
+        covariance = (effect.total_variance - effect.semivariogram(lag) for effect in self.effects)
+        return float(sum((each @ weight / weight.sum() for each in covariance), 0.0))
+
+    def beside(self, effects: list[MatchingNoise]) -> SharedNoise:
+        """With further noise."""
+        return replace(self, effects=(*self.effects, *effects))
+
+
+NOT_SHARED = SharedNoise()
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Measured minus predicted observable of n points, with what it may depend on.
+
+    value, sigma: (n,), m of range (TLS) or px of disparity (stereo), sigma being what the model predicts; unit_m: (n,) metres of
+    range or depth per unit of the observable, without the sign that `depth_m` has; smooth: (n,) where the surface around the
+    point is smooth enough for a mean to make sense, and of stable ground; even: the same of any ground; pose: (n, 6) derivatives
+    by translation (m) and rotation (rad) of the sensor in the wall frame; at: (n, 2) wall frame x, y of the reference's point,
+    which unlike the measured one does not move with the noise, m; covariates: named (n,) arrays; index: (n,) rows of the
+    measurement's points; missing: of the pulses that were sent and should have met the wall, None where the pattern is not known;
+    shared_noise: predicted noise that neighbours share.
+    """
+
+    sensor: Sensor
+    value: FloatArray
+    sigma: FloatArray
+    unit_m: FloatArray
+    smooth: BoolArray
+    even: BoolArray
+    pose: FloatArray
+    at: FloatArray
+    covariates: dict[str, FloatArray]
+    index: NDArray[np.int64]
+    geometry: Any = None
+    notes: tuple[str, ...] = ()
+    missing: Missing | None = None
+    shared_noise: SharedNoise = NOT_SHARED
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @property
+    def depth_m(self) -> FloatArray:
+        """(n,) metres by which the surface lies deeper per unit of the observable: positive where rock is missing.
+
+        A range grows with the depth; a disparity, f B / Z, falls.
+        """
+        return self.unit_m if self.sensor == "tls" else -self.unit_m
+
+    def part(self, rows: Any) -> Residuals:
+        """The residuals of `rows` (a mask or indices)."""
+        return replace(
+            self,
+            value=self.value[rows],
+            sigma=self.sigma[rows],
+            unit_m=self.unit_m[rows],
+            smooth=self.smooth[rows],
+            even=self.even[rows],
+            pose=self.pose[rows],
+            at=self.at[rows],
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+            index=self.index[rows],
+            geometry=None if self.geometry is None else self.geometry.part(rows),
+        )
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Pulses of the pattern that should have met the wall. lost: (m,) whether no point stands in that direction."""
+
+    lost: BoolArray
+    covariates: dict[str, FloatArray] = field(default_factory=dict)
+    at: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+
+
+def plane_slopes(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
+    """(n,) change of the distance to a plane along a ray whose unit direction changes by `moved`, m per unit.
+
+    From t = (p - o).n / (u.n): dt = -t (du.n) / (u.n).
+    """
+    return -distance * np.einsum("ni,ni->n", moved, normal) / np.einsum("ni,ni->n", direction, normal)

@@ -1,0 +1,91 @@
+"""The laser scanner sent in given directions instead of a pattern, so that a measurement can be simulated ray by ray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.measurement import Measurement
+from scene.backend import dr, mi
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from scene.upload import on_device
+from sensors.effects.base import ShowsIn
+from sensors.footprint import Echo
+from sensors.model import TlsModel, TlsNoise
+from sensors.pulses import Pulses
+from sensors.tls import LaserScanner, Pattern, ScannerConfig
+
+_NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
+
+
+@dataclass(frozen=True)
+class DirectedScanner(LaserScanner):
+    """A scanner whose pulses leave in the directions of `geometry` (a TlsGeometry), one after another.
+
+    Recorded powers, where there are any, take the place of those that the albedo of the reference would give.
+    """
+
+    geometry: Any = None
+
+    def emit(self) -> Pulses:
+        angles, count = self.geometry, len(self.geometry.azimuth)
+        index = dr.arange(mi.UInt32, count)
+        zero = np.zeros(count)
+        line = zero if angles.line is None else np.maximum(angles.line, 0)
+        share = zero if angles.share is None else angles.share
+        azimuth, zenith = (on_device(mi.Float64, angle) for angle in (angles.azimuth, angles.zenith))
+        number = on_device(mi.UInt32, line)
+        return Pulses(
+            line=number,
+            share=on_device(mi.Float64, share),
+            line_key=index * 0,
+            pulse_key=index,
+            azimuth=azimuth,
+            zenith=zenith,
+            aim_azimuth=azimuth,
+            aim_zenith=zenith,
+        )
+
+    def _measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
+        power = self.geometry.power
+        recorded = echo if power is None else replace(echo, power=on_device(mi.Float32, np.maximum(power, 1e-9)))
+        return super()._measured(pulses, recorded, random)
+
+
+def _scanner(measurement: Measurement, model: TlsModel, geometry: Any) -> DirectedScanner:
+    assert measurement.station is not None
+    position, rotation = measurement.station
+    pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
+    config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
+    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry)
+
+
+def simulate_ranges(
+    measurement: Measurement, model: TlsModel, geometry: Any, random: KeyedRandom, scene: RayCaster | None = None
+) -> FloatArray:
+    """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
+    return _scanner(measurement, model, geometry).observe(scene or measurement.scene, random).depth.reshape(-1)
+
+
+def mean_model(model: TlsModel) -> TlsModel:
+    """The model's effects on the mean alone, without noise."""
+    kept = tuple(effect for effect in model.effects if effect.shows_in in (ShowsIn.MEAN, ShowsIn.EDGES))
+    return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
+
+
+def aimed(measurement: Measurement, geometry: Any) -> tuple[FloatArray, FloatArray]:
+    """(n,) azimuth and zenith in which the pulses leave on average, by the measurement's model, scanner frame, rad."""
+    assert isinstance(measurement.model, TlsModel)
+    scanner = _scanner(measurement, mean_model(measurement.model), geometry)
+    pulses = scanner._aimed(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
+    return np.array(pulses.aim_azimuth), np.array(pulses.aim_zenith)
+
+
+def simulated_ranges(measurement: Measurement, geometry: Any) -> FloatArray:
+    """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise."""
+    assert isinstance(measurement.model, TlsModel)
+    return simulate_ranges(measurement, mean_model(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

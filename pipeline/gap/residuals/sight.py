@@ -1,0 +1,168 @@
+"""Where each point lies as the sensor sees it, which points are neighbours there, and what solid angle each stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, cKDTree
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.residuals.nominal_pair import NominalPair
+from pipeline.gap.residuals.residuals import Residuals
+from scene.mesh import FloatArray
+
+NEIGHBOURS = 8
+"""The ring around a point of a raster."""
+_FARTHEST = 3.0
+"""Spacings beyond which two points are no neighbours, whatever lies between."""
+_SAMPLE, _NEAR, _ROUNDS = 2000, 48, 6
+_AROUND = 24
+"""Two rings: the neighbours among which the cells of a few points are found."""
+_LARGEST_CELL = 4.0
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How the sensor saw n points.
+
+    plane: (n, 2) direction as the sensor counts it, rad (azimuth, zenith) or px (column, row), in any units; epoch: (n,); origin:
+    (3,) of the rays, wall frame, m; ray: (n, 3) unit vectors, wall frame; reference_m: (n,) range on the reference along them;
+    disparity: (n,) of the reference less that of infinity, px, None where ranges are measured.
+    """
+
+    plane: FloatArray
+    epoch: NDArray[np.int64]
+    origin: FloatArray
+    ray: FloatArray
+    reference_m: FloatArray
+    disparity: FloatArray | None = None
+
+    @classmethod
+    def of(cls, measurement: Measurement, residuals: Residuals) -> Sight:
+        """Of the points of the residuals. A pair of cameras looks from the left one."""
+        geometry, epoch = residuals.geometry, measurement.epochs[residuals.index]
+        if measurement.station is not None:
+            plane, origin = np.stack([geometry.azimuth, geometry.zenith], axis=1), measurement.station[0]
+            towards, disparity = measurement.cloud.points[residuals.index] - origin, None
+        else:
+            assert measurement.cameras is not None
+            plane, origin = (
+                np.stack([geometry.u, geometry.v], axis=1),
+                measurement.cameras.in_wall_frame(measurement.frame).left.position,
+            )
+            towards, disparity = geometry.point - origin, geometry.disparity - NominalPair.of(measurement).geometry.offset
+        length = np.linalg.norm(towards, axis=1)
+        reference = geometry.range_m if disparity is None else length
+        return cls(plane, epoch, origin, towards / length[:, None], reference, disparity)
+
+    def part(self, rows: Any) -> Sight:
+        """Of some of the points."""
+        return replace(
+            self,
+            plane=self.plane[rows],
+            epoch=self.epoch[rows],
+            ray=self.ray[rows],
+            reference_m=self.reference_m[rows],
+            disparity=None if self.disparity is None else self.disparity[rows],
+        )
+
+    def range_with(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
+        """(m,) range of some points that depart from the reference by residuals (m,), m of range or px: R d / (d + residual)."""
+        if self.disparity is None:
+            return np.asarray(self.reference_m[rows] + residual)
+        return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
+
+    def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
+        """(m, 3) places on the rays of some points, wall frame, m."""
+        return np.asarray(self.origin + range_m[:, None] * self.ray[rows])
+
+    @cached_property
+    def even_plane(self) -> FloatArray:
+        """(n, 2) `plane` with neighbours as far off by the one axis as by the other, 1 from one to the next."""
+        plane = (self.plane - self.plane.min(axis=0)) / np.maximum(np.ptp(self.plane, axis=0), 1e-300)
+        rows = np.flatnonzero(self.epoch == self.epoch.min())
+        apart = _apart(plane[rows])
+        for _ in range(_ROUNDS):
+            if abs(np.log(apart[0] / apart[1])) < 0.02:
+                break
+            plane = plane / apart
+            apart = _apart(plane[rows])
+        return np.asarray(plane / apart)
+
+    @cached_property
+    def _trees(self) -> list[tuple[NDArray[np.int64], cKDTree]]:
+        """Of each epoch: its points and where they lie."""
+        groups = [np.flatnonzero(self.epoch == number) for number in np.unique(self.epoch)]
+        return [(rows, cKDTree(self.even_plane[rows])) for rows in groups]
+
+    def around(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pairs (k,), (k,) of some points and their nearest of the same epoch; and of the next epoch the one at their place."""
+        pairs = [np.empty((2, 0), dtype=np.int64)]
+        wanted = np.zeros(len(self.plane), dtype=bool)
+        wanted[rows] = True
+        for number, (group, tree) in enumerate(self._trees):
+            own = group[wanted[group]]
+            pairs.append(_found(own, group, *tree.query(self.even_plane[own], count + 1, distance_upper_bound=_FARTHEST)))
+            if number + 1 < len(self._trees):
+                following, other = self._trees[number + 1]
+                pairs.append(_found(own, following, *other.query(self.even_plane[own], [1], distance_upper_bound=1.0)))
+        first, second = np.concatenate(pairs, axis=1)
+        return first[first != second], second[first != second]
+
+    def median_around(self, z: FloatArray) -> FloatArray:
+        """(n,) median of each point and its ring of neighbours."""
+        found = np.empty(len(z))
+        for group, tree in self._trees:
+            near = tree.query(self.even_plane[group], min(NEIGHBOURS + 1, len(group)))[1]
+            found[group] = np.median(z[group][near], axis=1)
+        return found
+
+    def beside(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
+        """(n,) points within some spacings of any of `rows`, whatever their epoch."""
+        distance = cKDTree(self.even_plane[rows]).query(self.even_plane, distance_upper_bound=spacings)[0]
+        return np.asarray(np.isfinite(distance))
+
+    def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
+        """(m,) sr for which each of some points stands: a third of the Delaunay triangles of which it is a corner.
+
+        Points of one epoch share what is between them, lost returns included; triangles over a gap of several points count as
+        much as the largest usual one.
+        """
+        total = np.zeros(len(self.plane))
+        wanted = np.zeros(len(self.plane), dtype=bool)
+        wanted[rows] = True
+        for group, tree in self._trees:
+            own = group[wanted[group]]
+            if not len(own):
+                continue
+            near = np.unique(tree.query(self.even_plane[own], min(_AROUND, len(group)))[1])
+            chosen = group[near.ravel()]
+            corners = chosen[Delaunay(self.even_plane[chosen], qhull_options="Qbb QJ").simplices]
+            a, b, c = (self.ray[corners[:, each]] for each in range(3))
+            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            touching = wanted[corners].any(axis=1)
+            area = np.minimum(area, _LARGEST_CELL * np.median(area[touching]))
+            total += np.bincount(corners.ravel(), np.repeat(area / 3, 3), len(total))
+        return total[rows]
+
+
+def _apart(plane: FloatArray) -> FloatArray:
+    """(2,) how far off the nearest point is that lies rather along the one axis, and along the other, as a rule."""
+    some = plane[:: max(len(plane) // _SAMPLE, 1)]
+    rows = cKDTree(plane).query(some, min(_NEAR, len(plane)))[1]
+    offset = np.abs(plane[rows[:, 1:]] - some[:, None])
+    along = [np.where(offset[..., axis] >= offset[..., 1 - axis], offset[..., axis], np.inf).min(axis=1) for axis in (0, 1)]
+    found = np.median(along, axis=1)
+    return np.where(np.isfinite(found), np.maximum(found, 1e-12), offset.max())
+
+
+def _found(
+    own: NDArray[np.int64], group: NDArray[np.int64], distance: FloatArray, position: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """(2, k) pairs of points and those that a tree of `group` gave for them."""
+    hit = np.isfinite(distance)
+    return np.stack([np.repeat(own, hit.sum(axis=1)), group[position[hit]]])

@@ -1,0 +1,191 @@
+"""Disparity residuals of a reconstructed surface: measured and reference disparity of each pixel, nominally rectified."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.formats.measurement import Measurement
+from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing
+from pipeline.gap.residuals.nominal_pair import (
+    NominalPair,
+    StereoGeometry,
+    is_hidden,
+    moved_pair,
+    project,
+    rays,
+    real_pair,
+    seen_disparities,
+)
+from pipeline.gap.residuals.residuals import Residuals, SharedNoise
+from pipeline.registration.rigid import RigidTransform
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from sensors.camera import Camera, CameraPair
+from sensors.curve import surface_on_host
+from sensors.effects.camera_effect import CameraEffect
+from sensors.effects.disparity_empirical import DisparityEmpirical
+from sensors.effects.raster_effect import RasterEffect
+from sensors.model import StereoModel
+
+_PROBE_PX = 3.0
+_EDGE_PX = 1.0
+"""A surface that departs by more from its tangent plane within some pixels counts as an edge."""
+_LEAST_VARIANCE = 1e-8
+"""Of a disparity, px2: a model without noise divides by nothing."""
+_REGISTRATION_STEPS, _NUDGE = 3, 1e-4
+_ON_RAY = 0.1
+"""A registration counts as found where it leaves less than this share of the distance from the points to their rays."""
+
+
+def on_their_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Points (n, 3) moved as one rigid body so that they project into the pixels that they were matched at.
+
+    A reconstruction lies on the rays of its pixels until it is registered; the registration, which the points show thus to some
+    micrometres, is undone. Gauss-Newton on some thousand points; the points stay where that does not bring them nearer.
+    """
+    some = slice(None, None, max(len(points) // 4000, 1))
+    found, centre = RigidTransform.identity(), points.mean(axis=0)
+    for _ in range(_REGISTRATION_STEPS):
+        moved = found.apply(points[some])
+        miss = _miss(left, moved, u[some], v[some])
+        units = _NUDGE * np.eye(6)
+        nudges = [RigidTransform.about(centre, unit[3:], unit[:3]) for unit in units]
+        slopes = np.stack([(_miss(left, nudge.apply(moved), u[some], v[some]) - miss) / _NUDGE for nudge in nudges], axis=1)
+        change = np.asarray(np.linalg.lstsq(slopes, -miss, rcond=None)[0], dtype=np.float64)
+        step = RigidTransform.about(centre, change[3:], change[:3])
+        found = RigidTransform(step.rotation @ found.rotation, step.rotation @ found.translation + step.translation)
+    before, after = (np.sqrt(np.mean(_miss(left, each, u, v) ** 2)) for each in (points, found.apply(points)))
+    return found.apply(points) if after < _ON_RAY * before else points
+
+
+def _miss(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """(2 n,) projected minus given pixel, columns first."""
+    found = project(left, points)
+    return np.concatenate([found[0] - u, found[1] - v])
+
+
+def stereo_residuals(measurement: Measurement) -> Residuals:
+    """Disparity residuals with predicted spread and covariates; points whose pixel does not see the surface are left out."""
+    nominal, model = NominalPair.of(measurement), measurement.model
+    assert isinstance(model, StereoModel)
+    points, extra = measurement.cloud.points, measurement.cloud.extra
+    given = "pixel_x" in extra and "pixel_y" in extra
+    if given:
+        u, v = (np.asarray(extra[key], dtype=np.float64) for key in ("pixel_x", "pixel_y"))
+        points = on_their_rays(nominal.pair.left, points, u, v)
+    else:
+        u, v = project(nominal.pair.left, points)
+    measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
+    real = real_pair(nominal, model.effects, measurement)
+    geometry, curvature, depth = _reference(nominal, real, measurement.scene, u, v, measured)
+    hidden = is_hidden(measurement.scene, real.right.position, geometry.point)
+    hit = np.isfinite(geometry.disparity)
+    slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
+    covariates = _covariates(nominal, geometry, depth, curvature)
+    mean = _mean_error(model, geometry, measurement) + _empirical(model, covariates)
+    even = hit & ~hidden & (curvature < _EDGE_PX)
+    whole = Residuals(
+        sensor="stereo",
+        value=measured - geometry.disparity - mean,
+        sigma=np.full(len(u), np.sqrt(max(model.variance, _LEAST_VARIANCE))),
+        unit_m=1 / slope,
+        smooth=even & measurement.stable,
+        even=even,
+        pose=_pose(nominal, geometry),
+        at=geometry.point[:, :2],
+        covariates=covariates,
+        index=np.arange(len(u)),
+        geometry=geometry,
+        shared_noise=SharedNoise.of(model, float(nominal.geometry.f / np.nanmedian(depth))),
+        notes=(*measurement.notes, *_notes(given, u)),
+    )
+    return whole.part(hit)
+
+
+def _notes(given: bool, u: FloatArray) -> tuple[str, ...]:
+    """What cannot be looked into for want of a field. given: whether the pixels are recorded."""
+    absent = {
+        "no pixel_x, pixel_y: pixels were found by projecting the points": not given,
+        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tried": spacing(u) is None,
+        "no images: texture_noise was not tried": True,
+    }
+    return tuple(note for note, true in absent.items() if true)
+
+
+def _reference(
+    nominal: NominalPair, real: CameraPair, scene: RayCaster, u: FloatArray, v: FloatArray, measured: FloatArray
+) -> tuple[StereoGeometry, FloatArray, FloatArray]:
+    """What the pixels of the cameras as the model has them (`real`) see on the reference, its disparity in the nominal pair, the
+    departure from the tangent plane beside it (px), and the depth (m)."""
+    left = real.left
+    ray = rays(left, u, v)
+    distance, face = scene.cast(left.position, ray)
+    normal = scene.mesh.face_normals(np.maximum(face, 0))
+    point = left.position + distance[:, None] * ray
+    right = project(real.right, point)
+    disparity = nominal.disparity((u, v), right)
+    curvature = np.zeros(len(u))
+    for du, dv in ((_PROBE_PX, 0.0), (-_PROBE_PX, 0.0), (0.0, _PROBE_PX), (0.0, -_PROBE_PX)):
+        beside = rays(left, u + du, v + dv)
+        seen = scene.cast(left.position, beside)[0]
+        flat = np.einsum("ni,ni->n", point - left.position, normal) / np.einsum("ni,ni->n", beside, normal)
+        step = nominal.geometry.f * nominal.geometry.base_m * (1 / seen - 1 / flat)
+        curvature = np.maximum(curvature, np.nan_to_num(np.abs(step), nan=np.inf))
+    camera = real.right
+    geometry = StereoGeometry(
+        u=u,
+        v=v,
+        v_right=right[1],
+        disparity=disparity,
+        found=measured,
+        point=point,
+        normal=normal,
+        radius=np.hypot(u - left.width / 2, v - left.height / 2),
+        radius_right=np.hypot(right[0] - camera.width / 2, right[1] - camera.height / 2),
+    )
+    return geometry, curvature, distance
+
+
+def _pose(nominal: NominalPair, geometry: StereoGeometry) -> FloatArray:
+    """(n, 6) change of the disparity if both cameras stand shifted (m) and turned (rad) about the left one, wall frame."""
+    centre, step = nominal.pair.left.position, 1e-4
+    units = step * np.eye(3)
+    moved = [moved_pair(nominal.pair, centre, unit, turned=turned) for turned in (False, True) for unit in units]
+    base, *columns = seen_disparities(nominal, [nominal.pair, *moved], geometry)
+    return np.stack([(column - base) / step for column in columns], axis=1)
+
+
+def _mean_error(model: StereoModel, geometry: StereoGeometry, measurement: Measurement) -> FloatArray:
+    """(n,) what those of the model's effects that are not in the cameras add to the disparity, px."""
+    beside = [effect for effect in model.effects if not effect.empirical and not isinstance(effect, CameraEffect | RasterEffect)]
+    found = np.asarray(sum((effect.mean(geometry) for effect in beside), np.zeros(len(geometry))))
+    shapes = [effect for effect in model.effects if isinstance(effect, RasterEffect)]
+    raster = DisparityRaster.of(measurement, geometry) if shapes else None
+    return found if raster is None else found + raster.moved(shapes, geometry.disparity)
+
+
+def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatArray:
+    """(n,) what empirical terms of the model add to the disparity, px (see DisparityEmpirical)."""
+    total = np.zeros(len(covariates["depth"]))
+    for effect in model.effects:
+        if isinstance(effect, DisparityEmpirical):
+            x, y = (covariates[name] for name in (effect.covariate, effect.second or effect.covariate))
+            total += surface_on_host(x, y, effect.along, effect.across, effect.values_px)
+    return total
+
+
+def _covariates(
+    nominal: NominalPair, geometry: StereoGeometry, depth: FloatArray, curvature: FloatArray
+) -> dict[str, FloatArray]:
+    ray = geometry.point - nominal.pair.left.position
+    cosine = np.abs(np.einsum("ni,ni->n", ray, geometry.normal)) / np.linalg.norm(ray, axis=1)
+    return {
+        "depth": depth,
+        "image_x": geometry.u,
+        "image_y": geometry.v,
+        "radius": geometry.radius,
+        "disparity": geometry.disparity,
+        "disparity_fraction": geometry.found - np.floor(geometry.found),
+        "incidence": np.arccos(np.clip(cosine, 0, 1)),
+        "edge_step": np.minimum(curvature, 10.0),
+    }

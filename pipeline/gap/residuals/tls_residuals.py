@@ -1,0 +1,247 @@
+"""Range residuals of a laser scan: the measured directions are cast on the surface as known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurement import Measurement, ScanPattern
+from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, plane_slopes
+from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
+from scene.errors import InputError
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from sensors.effects.base import Stage
+from sensors.model import TlsModel
+from sensors.polar import polar, polar_axes
+from sensors.pulses import PulseGeometry
+
+_PROBE_RAD = 6e-4
+"""Angle to the neighbouring rays that tell edges: about the width of a beam."""
+_EDGE_SIGMAS = 3.0
+_LARGEST_SLOPE = 4.0
+"""Metres of range per metre across the ray beyond which a point counts as grazing."""
+_SHORTEST_STEP_RAD = 1e-6
+
+
+@dataclass(frozen=True)
+class Directions:
+    """What emits pulses: recorded angles (rad), scan line, share of the scan's duration and power, as TlsGeometry has them."""
+
+    azimuth: FloatArray
+    zenith: FloatArray
+    line: FloatArray | None
+    share: FloatArray | None
+    power: FloatArray | None
+
+
+@dataclass(frozen=True)
+class TlsGeometry(PulseGeometry):
+    """Per point what the equations look at, where the beam goes on average by the model, and the measured range (m)."""
+
+    measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def part(self, rows: Any) -> TlsGeometry:
+        """The same of some of the points."""
+        values: dict[str, Any] = {column.name: getattr(self, column.name) for column in fields(self)}
+        return replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
+
+
+def tls_residuals(measurement: Measurement) -> Residuals:
+    """Range residuals with their predicted spread and covariates; points whose ray misses the surface are left out."""
+    position, rotation = _station(measurement)
+    model = measurement.model
+    assert isinstance(model, TlsModel)
+    azimuth, zenith, measured = _recorded(measurement)
+    line, share = measurement.order or _order(measurement, azimuth)
+    intensity = measurement.cloud.intensity
+    real = azimuth, zenith
+    if any(effect.stage == Stage.AIM for effect in model.effects):
+        real = aimed(measurement, Directions(azimuth, zenith, line, share, intensity))
+    axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
+    distance, normal, curvature = _surface(measurement.scene, position, axes)
+    geometry = TlsGeometry(
+        azimuth=azimuth,
+        zenith=zenith,
+        range_m=distance,
+        measured_m=measured,
+        by_azimuth=plane_slopes(normal, axes[0], axes[1], distance) * np.sin(zenith),
+        by_zenith=plane_slopes(normal, axes[0], axes[2], distance),
+        cos_incidence=np.abs(np.einsum("ni,ni->n", axes[0], normal)),
+        line=line,
+        share=share,
+        power=intensity,
+    )
+    predicted = simulated_ranges(measurement, geometry) if model.effects else distance
+    sigma = np.sqrt(model.variance(geometry))
+    slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
+    hit = np.isfinite(predicted) & np.isfinite(distance)
+    flat = (curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
+    whole = Residuals(
+        sensor="tls",
+        value=measured - predicted,
+        sigma=sigma,
+        unit_m=np.ones_like(measured),
+        smooth=hit & flat & measurement.stable,
+        even=hit & flat,
+        pose=_pose(axes[0], normal, distance),
+        at=(position + distance[:, None] * axes[0])[:, :2],
+        covariates=_covariates(geometry, curvature),
+        index=np.arange(len(measured)),
+        geometry=geometry,
+        notes=_notes(measurement),
+    )
+    return whole.part(hit)
+
+
+def with_order(measurement: Measurement) -> Measurement:
+    """With scan lines and times of all points, so that a part of them keeps them."""
+    return measurement.changed(order=_order(measurement, _recorded(measurement)[0]))
+
+
+def log_over_median(power: FloatArray) -> FloatArray:
+    """(n,) ln of the received power over its median."""
+    positive = np.maximum(power, 1e-12)
+    return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
+
+
+def _recorded(measurement: Measurement) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(n,) azimuth, without jumps, and zenith (rad), and range (m)."""
+    position, rotation = _station(measurement)
+    local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
+    measured, azimuth, zenith = polar(local)
+    middle = np.angle(np.mean(np.exp(1j * azimuth)))  # whichever side of pi the points lie on
+    return middle + np.angle(np.exp(1j * (azimuth - middle))), zenith, measured
+
+
+def _station(measurement: Measurement) -> tuple[FloatArray, FloatArray]:
+    if measurement.station is None:
+        raise InputError("a TLS measurement needs `scanner`", where="measurement.yaml")
+    return measurement.station
+
+
+def _surface(scene: RayCaster, position: FloatArray, axes: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Range (n,), unit normal (n, 3), and the largest departure from the plane that was hit within a beam's width (n,), m."""
+    ray = axes[0]
+    distance, face = scene.cast(position, ray)
+    normal = scene.mesh.face_normals(np.maximum(face, 0))
+    curvature = np.zeros(len(ray))
+    for axis in axes[1:]:
+        flat = plane_slopes(normal, ray, axis, distance)
+        for step in (_PROBE_RAD, -_PROBE_RAD):
+            beside = scene.cast(position, ray + step * axis)[0]
+            curvature = np.maximum(curvature, np.nan_to_num(np.abs(beside - distance - step * flat), nan=np.inf))
+    return distance, normal, curvature
+
+
+def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArray:
+    """(n, 6) change of measured minus predicted range if the scanner stands shifted (m) and turned (rad) against the survey.
+
+    The true ray starts at o + t with direction u + w x u: dR = -n.t / (n.u) - R n.(w x u) / (n.u).
+    """
+    scale = -1 / np.einsum("ni,ni->n", ray, normal)[:, None]
+    return np.concatenate([normal * scale, distance[:, None] * np.cross(ray, normal) * scale], axis=1)
+
+
+def _order(measurement: Measurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
+    """Scan line (from the pattern, or counted in steps told by the gaps of the azimuths) and share of the duration."""
+    line = _lines(measurement.pattern, azimuth)
+    time = measurement.cloud.gps_time
+    if time is not None and np.ptp(time) > 0:
+        return line, _shares(time, measurement.epochs)
+    return line, None if line is None or line.max() == 0 else line / line.max()
+
+
+def _shares(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArray:
+    """(n,) share of its epoch's duration."""
+    first, last = np.full(epochs.max() + 1, np.inf), np.full(epochs.max() + 1, -np.inf)
+    np.minimum.at(first, epochs, time)
+    np.maximum.at(last, epochs, time)
+    return np.asarray((time - first[epochs]) / np.maximum(last - first, 1e-300)[epochs])
+
+
+def _lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | None:
+    if pattern is not None:
+        start, _, step = pattern.azimuth_rad
+        turn = 2 * np.pi * np.round((azimuth.mean() - start - (pattern.azimuth_rad[1] - start) / 2) / (2 * np.pi))
+        return np.asarray(np.rint((azimuth - turn - start) / step), dtype=np.float64)
+    gaps = np.diff(np.sort(azimuth))
+    wide = gaps[gaps > _SHORTEST_STEP_RAD]
+    if len(wide) < 10 or len(wide) > 0.2 * len(azimuth):
+        return None  # the azimuths are no raster
+    return np.asarray(np.rint((azimuth - azimuth.min()) / np.median(wide)), dtype=np.float64)
+
+
+def _covariates(geometry: TlsGeometry, curvature: FloatArray) -> dict[str, FloatArray]:
+    found = {
+        "range": geometry.range_m,
+        "azimuth": geometry.azimuth,
+        "zenith": geometry.zenith,
+        "incidence": np.arccos(np.clip(geometry.cos_incidence, 0, 1)),
+        "edge_step": np.minimum(curvature, 10.0),
+    }
+    optional = {
+        "intensity": None if geometry.power is None else log_over_median(geometry.power),
+        "line": geometry.line,
+        "time": geometry.share,
+    }
+    return found | {name: values for name, values in optional.items() if values is not None}
+
+
+def _notes(measurement: Measurement) -> tuple[str, ...]:
+    """What cannot be looked into for want of a field."""
+    cloud = measurement.cloud
+    absent = {
+        "no intensity: range_intensity_bias and range_noise_intensity were not tried": cloud.intensity is None,
+        "no gps_time: the share of the scan is taken from the scan lines": cloud.gps_time is None,
+        "no pattern: missing returns (detection_limit, precipitation) could not be counted": measurement.pattern is None,
+    }
+    return (*measurement.notes, *(note for note, true in absent.items() if true))
+
+
+def missing_returns(measurement: Measurement, residuals: Residuals) -> Missing | None:
+    """Every pulse of the pattern that should meet the wall, and whether it came back, epoch after epoch; None without a pattern.
+
+    residuals: of all points of the measurement.
+    """
+    pattern = measurement.pattern
+    if pattern is None:
+        return None
+    position, rotation = _station(measurement)
+    sweeps = [_sweep(values) for values in (pattern.azimuth_rad, pattern.zenith_rad)]
+    azimuth, zenith = (grid.ravel() for grid in np.meshgrid(*sweeps, indexing="ij"))
+    axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
+    distance, normal, curvature = _surface(measurement.scene, position, axes)
+    cosine = np.abs(np.einsum("ni,ni->n", axes[0], normal))
+    usable = np.isfinite(distance) & (curvature < 0.3)
+    covariates = {
+        "range": distance,
+        "incidence": np.arccos(np.clip(cosine, 0, 1)),
+        "log_power": np.log(np.maximum(cosine, 1e-6) * (100.0 / distance) ** 2),
+        "azimuth": azimuth,
+        "zenith": zenith,
+    }
+    at = (position + distance[:, None] * axes[0])[:, :2]
+    epochs = measurement.epochs[residuals.index]
+    seen = [_seen(pattern, sweeps, residuals.geometry.part(epochs == number))[usable] for number in np.unique(epochs)]
+    chosen = {name: np.tile(values[usable], len(seen)) for name, values in covariates.items()}
+    return Missing(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
+
+
+def _seen(pattern: ScanPattern, sweeps: list[FloatArray], geometry: TlsGeometry) -> BoolArray:
+    """(m,) pulses of a pattern in whose direction a point stands."""
+    turn = 2 * np.pi * np.round((geometry.azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
+    columns = [np.rint((geometry.azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2])]
+    columns.append(np.rint((geometry.zenith - sweeps[1][0]) / pattern.zenith_rad[2]))
+    line, pulse = (np.clip(column, 0, len(sweep) - 1).astype(int) for column, sweep in zip(columns, sweeps, strict=True))
+    seen = np.zeros((len(sweeps[0]), len(sweeps[1])), dtype=bool)
+    seen[line, pulse] = True
+    return seen.ravel()
+
+
+def _sweep(values: tuple[float, float, float]) -> FloatArray:
+    start, stop, step = values
+    return np.asarray(start + step * np.arange(int(np.floor((stop - start) / step + 1e-6)) + 1), dtype=np.float64)

@@ -1,0 +1,195 @@
+"""What a survey could tell apart, before any residual is looked at.
+
+Each effect's signature S (n, k) is that of the diagnosis; pose columns J, one set per station, are projected out of it in the
+metric of the predicted noise:
+
+    survival  |S_perp| / |S|, over all phases S_perp = S - J (J^T W J)^-1 J^T W S
+    cosine    largest canonical correlation of two effects' S_perp, over the variants of one of them (which camera)
+    seen from the parameter's value at which S/N = 5: 5 sqrt(C), C the covariance of its estimate beside the pose
+    named from that at which S/N times the sine of the angle to the nearest other signature is 8
+
+C counts all points of the survey, and an error of the reference that is correlated over metres (Matern 3/2), which many points do
+not average away. Of effects with an amplitude and a phase the amplitude is that of the phase which shows least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.survey.known_points import KnownPoints, known_points
+from pipeline.gap.survey.planned import Survey, View
+from pipeline.gap.survey.spread_identifiability import OtherEffect, others
+from pipeline.gap.survey.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE, SurveyDesign, families_of, label, signatures
+from scene.mesh import FloatArray
+
+NAMED_AT = 8.0
+ALIKE = 0.9
+"""Signatures whose cosine is at least this count as alike."""
+REFERENCE_ERRORS_M = {"tls": 0.001, "stereo": 0.005}
+
+
+@dataclass(frozen=True)
+class Extension:
+    """A survey with one more measurement. cosines: (m, m) of the same effects as those of the survey as planned."""
+
+    name: str
+    cosines: FloatArray
+    seen_from: tuple[float, ...]
+
+    @property
+    def named_from(self) -> tuple[float, ...]:
+        """(m,) value of each effect's parameter from which it is told from all others."""
+        return _named_from(self.cosines, self.seen_from)
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a survey could tell. names: (m,) with the sensor's prefix; survival: (m,); cosines: (m, m), absolute values;
+    parameters: name of each effect's main one; seen_from: its value at S/N 5 with an error of the reference, seen_from_noise:
+    without; shown: what was searched or chosen for the row (a period, a camera); extensions: surveys with more in them."""
+
+    sensor: str
+    names: tuple[str, ...]
+    survival: FloatArray
+    cosines: FloatArray
+    parameters: tuple[str, ...]
+    seen_from: tuple[float, ...]
+    seen_from_noise: tuple[float, ...]
+    shown: tuple[str, ...]
+    extensions: tuple[Extension, ...]
+    points: int
+    reference_error_m: float
+    others: tuple[OtherEffect, ...] = ()
+
+    @property
+    def named_from(self) -> tuple[float, ...]:
+        """(m,) value of each effect's parameter from which it is told from all others."""
+        return _named_from(self.cosines, self.seen_from)
+
+    def best_extension(self, row: int) -> Extension:
+        """The further measurement with which an effect is named from the smallest value on."""
+        return min(self.extensions, key=lambda extension: extension.named_from[row])
+
+    def alike(self, row: int) -> list[int]:
+        """Effects whose signatures are alike that of `row`, the most alike first."""
+        order = np.argsort(-self.cosines[row])
+        return [int(other) for other in order if other != row and self.cosines[row, other] >= ALIKE]
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Pairs that are alike as planned, the most alike first."""
+        found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= ALIKE]
+        return sorted(found, key=lambda pair: -self.cosines[pair])
+
+    def to_dict(self) -> dict[str, Any]:
+        """As identifiability.json holds it."""
+        return {
+            "sensor": self.sensor,
+            "points": self.points,
+            "reference_error": {"sigma_m": self.reference_error_m, "length_m": REFERENCE_LENGTH_M},
+            "names": list(self.names),
+            "survival": self.survival.tolist(),
+            "cosines": self.cosines.tolist(),
+            "effects": [self._row(row) for row in range(len(self.names))],
+            "alike": [
+                {
+                    "names": [self.names[a], self.names[b]],
+                    "cosine": float(self.cosines[a, b]),
+                    "with": {extension.name: float(extension.cosines[a, b]) for extension in self.extensions},
+                    "split_by": [e.name for e in self.extensions if e.cosines[a, b] < ALIKE],
+                }
+                for a, b in self.pairs()
+            ],
+            "spread_and_losses": [other.to_dict() for other in self.others],
+        }
+
+    def _row(self, row: int) -> dict[str, Any]:
+        return {
+            "name": self.names[row],
+            "parameter": self.parameters[row],
+            "shown": self.shown[row],
+            "seen_from": _finite(self.seen_from[row]),
+            "seen_from_by_noise_alone": _finite(self.seen_from_noise[row]),
+            "named_from": _finite(self.named_from[row]),
+            "named_from_with": {extension.name: _finite(extension.named_from[row]) for extension in self.extensions},
+        }
+
+
+def _shown(candidate: Candidate) -> str:
+    """What was chosen for the row: a camera, a period."""
+    values = dict(candidate.fixed) | ({} if candidate.wave is None else {candidate.wave.key: candidate.period})
+    return ", ".join(f"{key} {value if isinstance(value, str) else f'{value:.3g}'}" for key, value in values.items())
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _named_from(cosines: FloatArray, seen_from: tuple[float, ...]) -> tuple[float, ...]:
+    nearest = (cosines - np.eye(len(cosines))).max(axis=1)
+    sine = np.sqrt(np.maximum(1 - nearest**2, 1e-300))
+    return tuple(NAMED_AT / SIGNAL_TO_NOISE * value / float(s) for value, s in zip(seen_from, sine, strict=True))
+
+
+def identifiability(survey: Survey, reference_error_m: float | None = None) -> Identifiability:
+    """Analyse a survey, and what one more measurement would add to it.
+
+    reference_error_m: standard deviation of the reference's correlated error (none: 1 mm for a laser scanner, 5 mm for a pair).
+    """
+    error = REFERENCE_ERRORS_M[survey.sensor] if reference_error_m is None else reference_error_m
+    families = families_of(signatures(survey.views[0]))
+    plain = SurveyDesign.of(survey.views, families)
+    seen, noise = (plain.seen_from(sigma) for sigma in (error, 0.0))
+    extensions = []
+    for name, views, points in _extended(survey):
+        design = SurveyDesign.of(views, families, points)
+        extensions.append(Extension(name, design.cosines(), design.seen_from(error)))
+    shown = [variants[0] for variants in families.values()]
+    return Identifiability(
+        sensor=survey.sensor,
+        names=tuple(f"{survey.sensor}.{name}" for name in families),
+        survival=plain.survival(),
+        cosines=plain.cosines(),
+        parameters=tuple(label(candidate) for candidate in shown),
+        seen_from=seen,
+        seen_from_noise=noise,
+        shown=tuple(_shown(candidate) for candidate in shown),
+        extensions=tuple(extensions),
+        points=sum(view.whole for view in survey.views),
+        reference_error_m=error,
+        others=others(survey),
+    )
+
+
+def table(found: Identifiability) -> str:
+    """Name, share that survives the pose fit, value seen, and the signature that is most alike."""
+    cosines = found.cosines - np.eye(len(found.names))
+    lines = [f"{'effect':<32}{'survives pose':>14}  {'seen from (S/N 5)':<32}most alike (cosine)"]
+    for row, (name, share) in enumerate(zip(found.names, found.survival, strict=True)):
+        other = int(np.argmax(cosines[row]))
+        value = f"{found.parameters[row]} {found.seen_from[row]:.2g}"
+        lines.append(f"{name:<32}{share:>14.1%}  {value:<32}{found.names[other]} ({cosines[row, other]:.2f})")
+    return "\n".join(lines)
+
+
+def _extended(survey: Survey) -> list[tuple[str, tuple[View, ...], KnownPoints | None]]:
+    """The survey with one more measurement each: its name, all views, known points."""
+    number = max(view.station for view in survey.views) + 1
+    first = survey.views[0]
+    near, aside = survey.moved(0.5, 0.0, number), survey.moved(1.0, np.radians(40.0), number)
+    points = known_points(first)
+    what = "station" if survey.sensor == "tls" else "pair of exposures"
+    found: list[tuple[str, tuple[View, ...], KnownPoints | None]] = [
+        (f"a second {what} at half the range", (*survey.views, near), None),
+        (f"a second {what} at the same range, 40 degrees aside", (*survey.views, aside), None),
+    ]
+    if survey.sensor == "tls":
+        found.append(("the scan repeated in the second face", (*survey.views, survey.second_face()), None))
+    else:
+        found.append(
+            ("the pair repeated, its cameras rolled by 45 degrees either way", (*survey.views, survey.rolled(number)), None)
+        )
+    return [*found, (points.title, survey.views, points)]

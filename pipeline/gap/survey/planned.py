@@ -1,0 +1,213 @@
+"""A survey before there are data: where its rays would meet the wall, for the analysis of what it could tell apart.
+
+The sensor's own code observes the wall without noise, on a thinned grid; how many points the whole survey has is kept beside it.
+Further stations, a second face, another pair of exposures and known points are added to a survey in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.config.simulation import SensorName, SimulationConfig
+from pipeline.formats.measurement import Measurement
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.tls_residuals import tls_residuals
+from pipeline.run.site import prepare_site
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from sensors.camera import Camera, CameraPair
+from sensors.model import StereoModel, TlsModel, TlsNoise
+from sensors.stereo import REDUCTION, Quality, StereoPair
+from sensors.tls import LaserScanner, ScannerConfig
+
+_MOST_PULSES = 30_000
+_FEWEST_POINTS = 300
+_ALBEDO_SPREAD = 0.3
+"""Standard deviation of ln(albedo) from point to point, where the wall has no albedo of its own."""
+_QUIET_TLS = TlsModel(noise=TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0))
+_QUIET_STEREO = StereoModel(noise={"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0})
+Pose = tuple[FloatArray, FloatArray]
+"""Position (3,) m and rotation (3, 3) scanner to wall frame."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What one station or one pair sees. residuals: of a thinned grid, values without meaning; whole: points of the real grid;
+    station: number of its pose; measurement: with its pose or its cameras."""
+
+    residuals: Residuals
+    whole: int
+    station: int
+    measurement: Measurement
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(n,) predicted spread that gives the thinned points the weight of all."""
+        return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.whole, 1))
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Views of one wall by one sensor. further(view, number): a view added to it, from another place."""
+
+    sensor: SensorName
+    views: tuple[View, ...]
+    centre: FloatArray
+    observe: Callable[[Measurement, int], View]
+
+    def moved(self, scale: float, turn_rad: float, number: int) -> View:
+        """The first view from a place that is brought nearer to the wall's centre by `scale` and turned about the vertical."""
+        base = self.views[0].measurement
+        axis = base.frame.rotation[:, 2]  # the world's vertical in the wall frame
+        turn = _about(axis, turn_rad)
+        if base.station is not None:
+            position = self.centre + scale * turn @ (base.station[0] - self.centre)
+            return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
+        assert base.cameras is not None
+        world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
+
+        def place(camera: Camera) -> Camera:
+            position = middle + scale * world @ (camera.position - middle)
+            return replace(camera, position=position, rotation=world @ camera.rotation)
+
+        pair = CameraPair(place(base.cameras.left), place(base.cameras.right))
+        return self.observe(base.changed(cameras=pair), number)
+
+    def rolled(self, number: int) -> View:
+        """The first pair with its cameras turned about their axes by 45 degrees, either way."""
+        base = self.views[0].measurement
+        assert base.cameras is not None
+        pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
+        return self.observe(base.changed(cameras=pair), number)
+
+    def second_face(self) -> View:
+        """The first station's scan in the other face: azimuth turned by pi, the zenith angle 2 pi less what it was."""
+        first = self.views[0]
+        g = first.residuals.geometry
+        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
+        return replace(first, residuals=replace(first.residuals, geometry=turned))
+
+
+def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
+    """The survey that a simulation config describes. Raises InputError where the sensor sees next to nothing of the wall."""
+    site = prepare_site(config, sensor, KeyedRandom(config.seed))
+    nothing = PointCloud(np.empty((0, 3)))
+    base = Measurement(sensor, nothing, site.mesh, site.frame, config.tls_model())
+    if sensor == "stereo":
+        base = replace(base, model=config.stereo_model(), cameras=_nominal(site.sensor))
+        observe = _pair_observer(config.depth_map)
+        views: tuple[View, ...] = (observe(base, 0),)
+    else:
+        observe = _scan_observer(config.scanner)
+        scanners = [site.sensor, *site.further_stations]
+        poses = [(scanner.position, scanner.rotation) for scanner in scanners if isinstance(scanner, LaserScanner)]
+        views = tuple(observe(base.changed(station=pose), number) for number, pose in enumerate(poses))
+    return Survey(sensor, views, site.mesh.bounds.mean(axis=0), observe)
+
+
+def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
+    """The survey of a measurement: its own points, of which only the places count, not what they measured. most: points of the
+    thinned grid."""
+    found = tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
+    rows = np.flatnonzero(found.smooth)
+    some = rows[:: max(len(rows) // most, 1)]
+    view = View(found.part(some), len(rows), 0, measurement)
+    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(len(rows), 1)))
+    if measurement.station is None:
+        return Survey(measurement.sensor, (view,), measurement.reference.bounds.mean(axis=0), _pair_observer("medium"))
+    reach = float(np.median(found.geometry.range_m)) if measurement.sensor == "tls" else 1.0
+    steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than a scan where the wall is near
+    scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
+    return Survey(measurement.sensor, (view,), measurement.reference.bounds.mean(axis=0), _scan_observer(scanner))
+
+
+def _nominal(sensor: object) -> CameraPair:
+    pair = getattr(sensor, "pair", sensor)
+    assert isinstance(pair, StereoPair)
+    return pair.cameras
+
+
+def _scan_observer(scanner: ScannerConfig) -> Callable[[Measurement, int], View]:
+    """Views of a laser scanner with the pose of the measurement, aimed at the whole wall unless the config has a window."""
+
+    def observe(base: Measurement, number: int) -> View:
+        assert base.station is not None
+        world = base.frame.to_world(base.station[0][None])[0], base.frame.rotation.T @ base.station[1]
+        instrument = LaserScanner.aimed(world, base.frame, base.reference.vertices, scanner, _QUIET_TLS)
+        pattern = instrument.pattern
+        stride = max(int(np.sqrt(pattern.lines * pattern.pulses / _MOST_PULSES)), 1)
+        thinned = replace(
+            pattern,
+            azimuth_step=stride * pattern.azimuth_step,
+            zenith_step=stride * pattern.zenith_step,
+            lines=max(pattern.lines // stride, 1),
+            pulses=max(pattern.pulses // stride, 1),
+        )
+        seen = replace(instrument, pattern=thinned).observe(base.scene, KeyedRandom(0, ("gap", "planned")))
+        valid = seen.valid.ravel()
+        power = (
+            None
+            if seen.intensity is None
+            else _with_albedo(np.asarray(seen.intensity.ravel()[valid], dtype=np.float64), base.scene)
+        )
+        cloud = PointCloud(seen.points.reshape(-1, 3)[valid], power, np.flatnonzero(valid).astype(float))
+        measurement = base.changed(cloud=cloud)
+        found = tls_residuals(measurement)
+        lines = found.geometry.line
+        geometry = found.geometry if lines is None else replace(found.geometry, line=stride * lines)
+        return _view(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
+
+    return observe
+
+
+def _with_albedo(power: FloatArray, scene: RayCaster) -> FloatArray:
+    if scene.mesh.vertex_albedo is not None:
+        return power
+    random = KeyedRandom(0, ("gap", "albedo")).generator()
+    return np.asarray(power * np.exp(_ALBEDO_SPREAD * random.standard_normal(len(power))), dtype=np.float64)
+
+
+def _pair_observer(quality: Quality) -> Callable[[Measurement, int], View]:
+    """Views of a pair of cameras, on its coarsest depth map."""
+
+    def observe(base: Measurement, number: int) -> View:
+        assert base.cameras is not None
+        pair = StereoPair(base.cameras, base.frame, _QUIET_STEREO, "low")
+        points = pair.observe(base.scene, KeyedRandom(0, ("gap", "planned"))).points
+        step = REDUCTION["low"]
+        stride = max(int(np.sqrt(points.shape[0] * points.shape[1] / _MOST_PULSES)), 1)
+        rows, columns = np.mgrid[0 : points.shape[0] : stride, 0 : points.shape[1] : stride]
+        some = points[rows, columns].reshape(-1, 3)
+        valid = np.isfinite(some).all(axis=1)
+        pixels = {"pixel_x": (columns.ravel() + 0.5) * step, "pixel_y": (rows.ravel() + 0.5) * step}
+        cloud = PointCloud(some[valid], extra={name: values[valid] for name, values in pixels.items()})
+        measurement = base.changed(cloud=cloud)
+        whole = int(valid.sum() * stride**2 * (step / REDUCTION[quality]) ** 2)
+        return _view(stereo_residuals(measurement), whole, number, measurement)
+
+    return observe
+
+
+def _view(found: Residuals, whole: int, number: int, measurement: Measurement) -> View:
+    smooth = np.flatnonzero(found.smooth)
+    if len(smooth) < _FEWEST_POINTS:
+        raise InputError(
+            f"{len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
+            where="station" if found.sensor == "tls" else "cameras",
+            remedy="aim at the wall, or scan in finer steps",
+        )
+    return View(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
+
+
+def _about(axis: FloatArray, angle: float) -> FloatArray:
+    """(3, 3) turn about a unit vector (Rodrigues)."""
+    x, y, z = axis
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew)

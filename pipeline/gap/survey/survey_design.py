@@ -1,0 +1,180 @@
+"""Signatures of a survey's effects as one design, with the pose projected out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.signatures import mean_candidates
+from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.survey.known_points import KnownPoints
+from pipeline.gap.survey.planned import View
+from scene.mesh import FloatArray
+
+SIGNAL_TO_NOISE = 5.0
+REFERENCE_LENGTH_M = 3.0
+_NULL = 1e-9
+
+
+def signatures(view: View) -> list[Candidate]:
+    """Every effect of the catalogue on the mean, with its variants."""
+    return mean_candidates(view.residuals, view.measurement)
+
+
+def families_of(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
+    """By effect: the variant that is shown first, then those that could take its place. Of searched waves the middle one."""
+    groups: dict[str, list[Candidate]] = {}
+    for candidate in candidates:
+        groups.setdefault(candidate.name, []).append(candidate)
+    families = {}
+    for name, variants in groups.items():
+        waves = [each for each in variants if each.wave is not None]
+        if waves:
+            sides = list(dict.fromkeys(each.fixed.get("camera") for each in waves))
+            first = [each for each in waves if each.fixed.get("camera") == sides[0]]
+            families[name] = [first[len(first) // 2]]
+        elif "camera" in variants[0].fixed:
+            least = min(len(each.names) for each in variants)
+            single = [each for each in variants if len(each.names) == least]
+            families[name] = [each for each in single if each.names == single[0].names]
+        else:
+            families[name] = [variants[0]]
+    return families
+
+
+def label(candidate: Candidate) -> str:
+    """The parameter that `seen_from` speaks of; of several of one kind all names."""
+    hidden = {"phase_rad", "" if candidate.wave is None else candidate.wave.key}
+    return ", ".join(name for name in candidate.names if name not in hidden)
+
+
+def _scales(candidate: Candidate) -> tuple[float, ...]:
+    """The parameter's value per unit of each coefficient."""
+    units = np.eye(candidate.columns.shape[1])
+    return tuple(
+        max(abs(v) for key, v in candidate.parameters(unit).items() if key in label(candidate).split(", ")) for unit in units
+    )
+
+
+@dataclass(frozen=True)
+class SurveyDesign:
+    """Whitened columns of all views, without the pose. left, whole: (n, k) after and before the pose fit, white metric; spans:
+    columns of each family's variants; cells of the wall and the weights there; the known points are the last rows."""
+
+    left: FloatArray
+    whole: FloatArray
+    pose: FloatArray
+    spans: list[list[slice]]
+    scales: list[tuple[float, ...]]
+    cells: Cells
+    sigma: FloatArray
+    unit_m: float
+    wall: int
+
+    @classmethod
+    def of(cls, views: tuple[View, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None) -> SurveyDesign:
+        wanted = [variant for variants in families.values() for variant in variants]
+        columns = np.concatenate([signature_columns(view, wanted) for view in views])
+        sigma = np.concatenate([view.sigma for view in views])
+        stations = sorted({view.station for view in views})
+        pose = np.concatenate(
+            [np.kron(np.eye(len(stations))[stations.index(view.station)], view.residuals.pose) for view in views]
+        )
+        wall = len(columns)
+        if points is not None:
+            more = np.zeros((len(points.sigma), pose.shape[1]))
+            more[:, :6] = points.pose
+            columns, pose = np.concatenate([columns, points.columns(wanted)]), np.concatenate([pose, more])
+            sigma = np.concatenate([sigma, points.sigma])
+        whole, base = columns / sigma[:, None], np.linalg.qr(pose / sigma[:, None])[0]
+        left = whole - base @ (base.T @ whole)
+        spans: list[list[slice]] = []
+        start = 0
+        for variants in families.values():
+            spans.append([])
+            for variant in variants:
+                stop = start + variant.columns.shape[1]
+                spans[-1].append(slice(start, stop))
+                start = stop
+        at = np.concatenate([view.residuals.at for view in views])
+        unit = float(np.median(np.concatenate([view.residuals.unit_m for view in views])))
+        scales = [_scales(variants[0]) for variants in families.values()]
+        return cls(left, whole, base, spans, scales, Cells.over(at), sigma, unit, wall)
+
+    def survival(self) -> FloatArray:
+        """(m,) share of each first variant that survives the pose fit, root mean square over its columns."""
+        sizes = [(float(np.linalg.norm(self.left[:, v[0]])), float(np.linalg.norm(self.whole[:, v[0]]))) for v in self.spans]
+        return np.array([left / max(whole, 1e-300) for left, whole in sizes])
+
+    def cosines(self) -> FloatArray:
+        """(m, m) largest canonical correlation of a family's first variant with any variant of another, made symmetric."""
+        bases = [[self._basis(span) for span in variants] for variants in self.spans]
+        count = len(bases)
+        found = np.eye(count)
+        for a in range(count):
+            for b in range(count):
+                if a != b:
+                    each = [np.linalg.norm(bases[a][0].T @ other, 2) for other in bases[b]]
+                    found[a, b] = min(max(map(float, each)), 1.0)
+        return np.maximum(found, found.T)
+
+    def _basis(self, span: slice) -> FloatArray:
+        """Orthonormal basis of what the pose fit leaves of some columns; no columns where it leaves nothing."""
+        columns, whole = self.left[:, span], np.linalg.norm(self.whole[:, span], axis=0)
+        kept = columns[:, np.linalg.norm(columns, axis=0) > _NULL * whole]
+        return np.asarray(np.linalg.qr(kept)[0]) if kept.shape[1] else np.zeros((len(columns), 1))
+
+    def seen_from(self, reference_error_m: float) -> tuple[float, ...]:
+        """Parameter of each family's first variant at S/N 5; infinity where the pose fit leaves nothing."""
+        first = [list(range(variants[0].start, variants[0].stop)) for variants in self.spans]
+        chosen = [column for group in first for column in group]
+        design = np.concatenate([self.pose, self.left[:, chosen]], axis=1)
+        information = self._information(design, reference_error_m / self.unit_m)
+        count, places = self.pose.shape[1], {column: number for number, column in enumerate(chosen)}
+        nuisance = information[:count, :count]
+        found = []
+        for group, scales in zip(first, self.scales, strict=True):
+            rows = [count + places[column] for column in group]
+            cross = information[np.ix_(range(count), rows)]
+            own = information[np.ix_(rows, rows)] - cross.T @ np.linalg.solve(nuisance, cross)
+            least = float(np.linalg.eigvalsh(own / np.outer(scales, scales))[0])
+            whole = float(np.max(np.sum((self.whole[:, group] / np.array(scales)) ** 2, axis=0)))
+            found.append(SIGNAL_TO_NOISE / np.sqrt(least) if least > _NULL**2 * whole else np.inf)
+        return tuple(found)
+
+    def _information(self, design: FloatArray, error: float) -> FloatArray:
+        """(k, k) of whitened columns where the cells' means share an error of the reference of standard deviation `error`."""
+        wall, known = design[: self.wall], design[self.wall :]
+        total = wall.T @ wall + known.T @ known
+        if error <= 0:
+            return np.asarray(total)
+        inside = self.cells.cell >= 0
+        cell, root = self.cells.cell[inside], 1 / self.sigma[: self.wall][inside]
+        weight = np.bincount(cell, root**2, len(self.cells))
+        sums = np.stack([np.bincount(cell, root * column, len(self.cells)) for column in wall[inside].T], axis=1)
+        reach = np.sqrt(3.0) * cdist(self.cells.centre, self.cells.centre) / REFERENCE_LENGTH_M
+        kernel = error**2 * (1 + reach) * np.exp(-reach)
+        means = sums / weight[:, None]
+        taken = means.T @ sums  # what the means have in the white metric
+        left = means.T @ cho_solve(cho_factor(kernel + np.diag(1 / weight)), means)
+        return np.asarray(total - taken + left)
+
+
+def signature_columns(view: View, wanted: list[Candidate]) -> FloatArray:
+    """(n, k) columns of the wanted variants in a view; searched periods are those of the variant, not of the view's own grid."""
+    own = {_key(each): each for each in signatures(view)}
+    parts = []
+    for variant in wanted:
+        found = own[_key(variant)]
+        parts.append(found.columns if found.wave is None else found.wave.columns(variant.period))
+    return np.concatenate(parts, axis=1)
+
+
+def _key(candidate: Candidate) -> tuple[Any, ...]:
+    fixed = {key: value for key, value in candidate.fixed.items() if candidate.wave is None or key != candidate.wave.key}
+    return candidate.name, candidate.names, tuple(sorted(fixed.items(), key=str))

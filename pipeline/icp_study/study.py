@@ -1,0 +1,386 @@
+"""Which settings of ICP suit a run: the two sensitivity studies of the thesis (3.6), with the true transform beside the RMS.
+
+The true transform of an epoch is known in a simulation. T(s) is the rigid motion that brings what a sensor measured, s, onto the
+wall as it really was then, by point-to-plane fit over all points; the epoch has to be moved by T(reference)^-1 T(epoch) to lie on
+the reference. An epoch is first put off by a known motion D of `offset_m`, as epochs come that nobody has aligned, so that the
+transform to be found is M = T(reference)^-1 T(epoch) D^-1. What a found transform F does wrong is F M^-1: at each point x of the
+reference an error F M^-1 x - x, whose part along the surface's normal is what a difference map shows.
+
+RMS of the inliers alone cannot choose the outlier threshold: it grows with the threshold whatever the pose. The error can.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy import stats
+
+from pipeline.config.simulation import SensorName, SimulationConfig, load_config
+from pipeline.formats.ply import read_ply
+from pipeline.registration.closest_points import ReferenceSurface
+from pipeline.registration.register import IcpConfig, fit, register_to
+from pipeline.registration.rigid import RigidTransform
+from pipeline.report.progress import Progress
+from pipeline.run.epoch import observe_epoch, observe_reference
+from pipeline.run.products import epoch_folder
+from pipeline.run.simulation import RUN_FILE
+from pipeline.run.site import prepare_site
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray, TriangleMesh, area_normals
+
+Parameter = Literal["subsample_ratio", "outlier_distance_threshold"]
+RATIOS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
+"""Shares of the points that are left out."""
+_THRESHOLDS = np.geomspace(0.5, 12.0, 13)
+"""Outlier thresholds, in NMADs of the residuals at the true pose."""
+_SAMPLE, _FIT_SAMPLE = 20_000, 200_000
+"""Points for the error and for the RMS."""
+_TOLERANCE, _LEAST_TOLERANCE_M = 1.1, 1e-4
+"""A setting is as good as the best where its error is at most 10 % or 0.1 mm larger."""
+_TO_TRUTH = IcpConfig(outlier_distance_threshold=0.2, threshold=0.0, delta_threshold=1e-7, max_iteration=60)
+
+
+@dataclass(frozen=True)
+class StudyEpoch:
+    """An epoch to be registered. points: (n, 3), wall frame, m, put off by the offset; true: what brings them to the reference;
+    applied: what the run applied, for points that were not put off; true_applied: what it should have."""
+
+    number: int
+    points: FloatArray
+    true: RigidTransform
+    applied: RigidTransform | None
+    true_applied: RigidTransform
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """What a transform does wrong over the reference's points: RMS along the normals and in all, m; at their middle, translation
+    (3,), m, and rotation vector (3,), rad."""
+
+    normal_m: float
+    displacement_m: float
+    translation_m: tuple[float, ...]
+    rotation_rad: tuple[float, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class StudyRow:
+    """One registration.
+
+    gradual: whether the outlier threshold came down to its value over the iterations, as the config says, or held from the first;
+    rms_m, inlier_share: residuals of all points, not only the subset, within the threshold; the error's fields as in PoseError;
+    None where ICP found too few pairs.
+    """
+
+    parameter: Parameter
+    value: float
+    gradual: bool
+    epoch: int
+    repeat: int
+    rms_m: float | None
+    normal_error_m: float | None
+    displacement_m: float | None
+    inlier_share: float | None
+    iterations: int | None
+    seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON and CSV hold it."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """A setting, the range of values that are as good, and the error that they leave, m."""
+
+    parameter: Parameter
+    value: float
+    good: tuple[float, float]
+    normal_error_m: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class IcpStudy:
+    """The rows, what they recommend, and how far each run's own transform is from the true one (None without ICP).
+
+    sigma_m: NMAD of the residuals along the normals at the true pose; offset_m: by which epochs were put off.
+    """
+
+    sensor: str
+    config: IcpConfig
+    offset_m: float
+    sigma_m: float
+    rows: list[StudyRow]
+    recommended: list[Recommendation]
+    applied: dict[int, PoseError | None]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {
+            "schema": 1,
+            "sensor": self.sensor,
+            "icp": self.config.model_dump(mode="json"),
+            "offset_m": self.offset_m,
+            "sigma_m": self.sigma_m,
+            "recommended": [each.to_dict() for each in self.recommended],
+            "applied": [{"epoch": k, **({} if e is None else e.to_dict())} for k, e in self.applied.items()],
+            "rows": [row.to_dict() for row in self.rows],
+        }
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What a sensor measured of an epoch and the wall as it really was, wall frame; applied: the run's transform, if any."""
+
+    number: int
+    measured: TriangleMesh
+    truth: TriangleMesh
+    applied: RigidTransform | None = None
+
+
+def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, list[Surfaces]]:
+    """Config, sensor, reference and the first `epochs` epochs of a run. Raises InputError where it has no record of so many."""
+    path = folder / RUN_FILE
+    if not path.is_file():
+        raise InputError(f"holds no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
+    try:
+        run = json.loads(path.read_text(encoding="utf-8"))
+        sensor, records = run["sensor"], [(record["epoch"], _applied(record)) for record in run.get("epochs", [])]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        problem = f"is not the record of a run ({' '.join(repr(error).split())})"
+        raise InputError(problem, where=str(path), remedy="run it again with simulate") from None
+    if len(records) < 2:
+        raise InputError("has no epoch after the reference", where=str(folder), remedy="finish it with simulate --resume")
+    if epochs >= len(records):
+        has = f"1 to {len(records) - 1}, as many epochs as {folder} has"
+        raise InputError(f"got {epochs}", where="--epochs", allowed=has)
+    config = load_config(path, [], None, None)
+    found = []
+    for number, applied in records[: epochs + 1]:
+        epoch = epoch_folder(folder, number)
+        found.append(Surfaces(number, read_ply(epoch / "surface.ply"), read_ply(epoch / "truth.ply"), applied))
+    return config, sensor, found
+
+
+def _applied(record: dict[str, Any]) -> RigidTransform | None:
+    """The transform of an epoch's record in run.json, None without ICP."""
+    registered = record.get("registration")
+    if not registered:
+        return None
+    return RigidTransform(np.array(registered["rotation"], float), np.array(registered["translation_m"], float))
+
+
+def simulated_surfaces(config: SimulationConfig, sensor: SensorName, epochs: int, progress: Progress) -> list[Surfaces]:
+    """Observe the reference and so many epochs of a config, as `simulate` does; nothing is written."""
+    random = KeyedRandom(config.seed)
+    with progress.stage("wall"):
+        site = prepare_site(config, sensor, random)
+    reference = observe_reference(config, site, random, progress)
+    found = [Surfaces(0, reference.surface, reference.caster.mesh)]
+    for number in range(1, epochs + 1):
+        epoch = observe_epoch(config, site, reference, number, random, progress)
+        applied = None if epoch.registration is None else epoch.registration.transform
+        found.append(Surfaces(number, epoch.surface, epoch.carved.mesh, applied))
+    return found
+
+
+def study(
+    sensor: str,
+    surfaces: Sequence[Surfaces],
+    config: IcpConfig,
+    random: KeyedRandom,
+    *,
+    offset_m: float = 0.03,
+    repeats: int = 3,
+    progress: Progress | None = None,
+) -> IcpStudy:
+    """Register every epoch to the reference (the first of `surfaces`) with each setting, and say which is best.
+
+    config: all other parameters; repeats: draws of the subset for each ratio; offset_m: how far epochs are put off, 0 for not.
+    """
+    progress = progress or Progress()
+    progress.plan({"truth": 2.0, "subsample ratio": float(len(RATIOS) * repeats), "outlier threshold": 2.0 * len(_THRESHOLDS)})
+    with progress.stage("truth"):
+        reference = surfaces[0].measured
+        normals = reference.vertex_normals()
+        target = ReferenceSurface.build(reference.vertices, normals)
+        to_truth = true_pose(surfaces[0], random)
+        epochs = [_put_off(each, to_truth, offset_m, random.child("study", each.number)) for each in surfaces[1:]]
+        sigma = _residual_nmad(target, epochs[0])
+    judge = _Judge(target, reference.vertices, normals, config)
+    with progress.stage("subsample ratio"):
+        cases = [(ratio, epoch, repeat) for epoch in epochs for ratio in RATIOS for repeat in range(repeats if ratio else 1)]
+        rows = [_ratio_row(judge, ratio, epoch, repeat, random) for ratio, epoch, repeat in _counted(cases, progress)]
+    with progress.stage("outlier threshold"):
+        held = [
+            (float(factor * sigma), epoch, gradual) for epoch in epochs for factor in _THRESHOLDS for gradual in (True, False)
+        ]
+        rows += [
+            _threshold_row(judge, threshold, epoch, gradual, random) for threshold, epoch, gradual in _counted(held, progress)
+        ]
+    applied = {each.number: None if each.applied is None else judge.error(each.applied, each.true_applied) for each in epochs}
+    found = [best for name in ("subsample_ratio", "outlier_distance_threshold") if (best := recommended(rows, name)) is not None]
+    return IcpStudy(sensor, config, offset_m, sigma, rows, found, applied)
+
+
+def true_pose(surface: Surfaces, random: KeyedRandom) -> RigidTransform:
+    """The rigid motion that brings what was measured onto the wall as it was: point to plane, all points, to the true triangles'
+    vertices and centroids."""
+    truth = surface.truth
+    corners = truth.corners()
+    across = area_normals(corners)
+    flat = np.linalg.norm(across, axis=1) > 0
+    points = np.concatenate([truth.vertices, corners[flat].mean(axis=1)])
+    normals = np.concatenate([truth.vertex_normals(), across[flat]])
+    known = np.isfinite(normals).all(axis=1)
+    target = ReferenceSurface.build(points[known], normals[known])
+    return register_to(target, surface.measured.vertices, _TO_TRUTH, random.child("truth", surface.number)).transform
+
+
+def composed(second: RigidTransform, first: RigidTransform) -> RigidTransform:
+    """First one, then the other."""
+    return RigidTransform(second.rotation @ first.rotation, second.rotation @ first.translation + second.translation)
+
+
+def recommended(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
+    """The setting to take, by the largest error over epochs and repeats; None where registrations failed at every value.
+
+    Of the subsample ratios the largest up to which all are as good as taking all points: the fewest points. Of the outlier
+    thresholds, with the gradual start, the one in the middle (of the logarithms) of the good range about the best.
+    """
+    chosen = [row for row in rows if row.parameter == parameter and row.gradual]
+    values = sorted({row.value for row in chosen})
+    errors = {value: _worst_error([row for row in chosen if row.value == value]) for value in values}
+    if parameter == "subsample_ratio":
+        best = values[0] if values else None
+    else:
+        best = min(values, key=lambda value: errors[value], default=None)
+    if best is None or not np.isfinite(errors[best]):
+        return None
+    limit = max(_TOLERANCE * errors[best], errors[best] + _LEAST_TOLERANCE_M)
+    first = last = values.index(best)
+    while first > 0 and errors[values[first - 1]] <= limit:
+        first -= 1
+    while last + 1 < len(values) and errors[values[last + 1]] <= limit:
+        last += 1
+    good = values[first : last + 1]
+    value = good[-1] if parameter == "subsample_ratio" else good[len(good) // 2]
+    return Recommendation(parameter, value, (good[0], good[-1]), errors[value])
+
+
+class _Judge:
+    """Runs registrations to one reference and measures what they do wrong."""
+
+    def __init__(self, target: ReferenceSurface, points: FloatArray, normals: FloatArray, config: IcpConfig) -> None:
+        self.target, self.config = target, config
+        step = max(len(points) // _SAMPLE, 1)
+        self.points, self.normals, self.middle = points[::step], normals[::step], points.mean(axis=0)
+
+    def error(self, found: RigidTransform, true: RigidTransform) -> PoseError:
+        wrong = composed(found, true.inverse())
+        moved = wrong.apply(self.points) - self.points
+        along = np.einsum("ni,ni->n", moved, self.normals)
+        shift = wrong.apply(self.middle) - self.middle
+        return PoseError(
+            float(np.sqrt(np.mean(along**2))),
+            float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
+            tuple(shift.tolist()),
+            tuple(wrong.rotation_vector.tolist()),
+        )
+
+    def row(
+        self,
+        parameter: Parameter,
+        value: float,
+        config: IcpConfig,
+        epoch: StudyEpoch,
+        random: KeyedRandom,
+        *,
+        gradual: bool,
+        repeat: int,
+    ) -> StudyRow:
+        began = time.perf_counter()
+        try:
+            found = register_to(self.target, epoch.points, config, random)
+        except InputError:  # fewer than six pairs, or points: this setting does not work here
+            return StudyRow(
+                parameter, value, gradual, epoch.number, repeat, None, None, None, None, None, time.perf_counter() - began
+            )
+        error = self.error(found.transform, epoch.true)
+        step = max(len(epoch.points) // _FIT_SAMPLE, 1)
+        fitted = fit(self.target, found.apply(epoch.points[::step]), config)
+        return StudyRow(
+            parameter,
+            value,
+            gradual,
+            epoch.number,
+            repeat,
+            fitted.rms_m,
+            error.normal_m,
+            error.displacement_m,
+            fitted.inliers / fitted.points,
+            found.iterations,
+            time.perf_counter() - began,
+        )
+
+
+def _ratio_row(judge: _Judge, ratio: float, epoch: StudyEpoch, repeat: int, random: KeyedRandom) -> StudyRow:
+    config = judge.config.model_copy(update={"subsample_points": ratio > 0, "subsample_ratio": ratio})
+    keyed = random.child("ratio", epoch.number, repeat)
+    return judge.row("subsample_ratio", ratio, config, epoch, keyed, gradual=True, repeat=repeat)
+
+
+def _threshold_row(judge: _Judge, threshold: float, epoch: StudyEpoch, gradual: bool, random: KeyedRandom) -> StudyRow:
+    changed: dict[str, Any] = {"outlier_distance_threshold": threshold, "remove_outlier": True}
+    config = judge.config.model_copy(update=changed if gradual else changed | {"outlier_threshold_decay_iteration": 1})
+    keyed = random.child("threshold", epoch.number)
+    return judge.row("outlier_distance_threshold", threshold, config, epoch, keyed, gradual=gradual, repeat=0)
+
+
+def _put_off(surface: Surfaces, reference_to_truth: RigidTransform, offset_m: float, random: KeyedRandom) -> StudyEpoch:
+    """The epoch moved by a random rigid motion: a shift of `offset_m`, and a turn that moves the cloud's edge by as much."""
+    points = surface.measured.vertices
+    true = composed(reference_to_truth.inverse(), true_pose(surface, random))
+    shift, axis = (direction / np.linalg.norm(direction) for direction in random.generator().standard_normal((2, 3)))
+    centre = points.mean(axis=0)
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    put_off = RigidTransform.about(centre, axis * offset_m / radius, shift * offset_m)
+    moved = put_off.apply(points) if offset_m else points
+    return StudyEpoch(surface.number, moved, composed(true, put_off.inverse()) if offset_m else true, surface.applied, true)
+
+
+def _residual_nmad(target: ReferenceSurface, epoch: StudyEpoch) -> float:
+    """NMAD of the residuals along the normals at the true pose, m."""
+    step = max(len(epoch.points) // _SAMPLE, 1)
+    local = epoch.true.apply(epoch.points[::step]) - target.origin
+    _, nearest = target.tree.query(local)
+    normals = target.normals if target.normals is not None else np.zeros_like(target.points)
+    along = np.einsum("ni,ni->n", local - target.points[nearest], normals[nearest])
+    return float(stats.median_abs_deviation(along, scale="normal"))
+
+
+def _worst_error(rows: Sequence[StudyRow]) -> float:
+    """Largest error along the normals, m; a registration that failed counts as infinite."""
+    return max(np.inf if row.normal_error_m is None else row.normal_error_m for row in rows)
+
+
+def _counted(cases: Sequence[Any], progress: Progress) -> Iterable[Any]:
+    for number, case in enumerate(cases):
+        progress.advance(number / len(cases))
+        yield case

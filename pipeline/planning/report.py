@@ -1,0 +1,142 @@
+"""A plan's report and its summary in words: what a set-up promises, with a picture of every map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pipeline.formats.atomic import write_text
+from pipeline.planning.maps import Plan, PlanMap
+from pipeline.report.figures import CurvePanel, curves_figure, map_figure
+from pipeline.report.page import percent, template
+
+_NOTHING = "\N{EN DASH}"
+_FIGURES: dict[str, tuple[str, str, float]] = {
+    "seen": ("Wall seen", "%", 100.0),
+    "seen_by_several": ("Wall seen from several stations", "%", 100.0),
+    "seen_by_both": ("Wall seen by both cameras", "%", 100.0),
+    "seen_by_one": ("Wall seen by one camera", "%", 100.0),
+    "seen_by_none": ("Wall seen by no camera", "%", 100.0),
+    "hidden": ("Wall hidden from the scanner", "%", 100.0),
+    "beyond_window_or_reach": ("Wall beyond window, reach or detection limit", "%", 100.0),
+    "overlap": ("Overlap: wall in both frames over wall in either", "%", 100.0),
+    "base_m": ("Base", "m", 1.0),
+    "disparity_sigma_px": ("Standard deviation of the disparity", "px", 1.0),
+    "normal_case_sigma_z_m": ("Standard deviation in depth, by Z\N{SUPERSCRIPT TWO}/(cB)", "mm", 1e3),
+    "pulses": ("Pulses", "million", 1e-6),
+    "seconds_to_scan": ("Time to scan", "s", 1.0),
+}
+"""Title, unit and factor of each of a plan's single figures."""
+
+
+@dataclass(frozen=True)
+class _Row:
+    title: str
+    unit: str
+    values: list[str]
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """grey: what the places without a value are."""
+
+    title: str
+    png: bytes
+    grey: str
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What the page shows of one sensor."""
+
+    instrument: str
+    answer: str
+    figures: list[tuple[str, str]]
+    rows: list[_Row]
+    ignored: str
+    curves: bytes | None
+    pictures: list[_Picture]
+
+
+def summary(plan: Plan) -> str:
+    """The figures of a plan as aligned lines of text."""
+    lines = [f"{plan.instrument}, wall {plan.wall}", f"  {answer(plan)}"]
+    lines += [f"  {title:<52}{value:>12}" for title, value in _figures(plan)]
+    lines.append(f"  {'map':<52}{'middle':>12}{'median':>10}{'5 %':>10}{'95 %':>10}")
+    lines += [f"  {row.title:<52}" + "{:>12}{:>10}{:>10}{:>10}".format(*row.values) + f"  {row.unit}" for row in _rows(plan)]
+    return "\n".join(lines + ([f"  not counted: {', '.join(plan.ignored)}"] if plan.ignored else []))
+
+
+def answer(plan: Plan) -> str:
+    """The sentence that planners ask for: the smallest block that is seen."""
+    share = percent(plan.config.probability, 0)
+    middle = next(found for found in plan.maps if found.name == "smallest_block_m").summary(plan.middle())["middle"]
+    name = plan.instrument
+    if middle is None:
+        return f"{name}: in the middle of the wall no block is seen in {share} of cases."
+    return f"{name}: the smallest block seen in {share} of cases in the middle of the wall has sides of {100 * middle:.1f} cm."
+
+
+def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any]) -> None:
+    """Write report.html, whole or not at all; equal arguments give equal bytes."""
+    page = template("planning/report.html.jinja").render(
+        title=f"{plans[0].wall.replace('_', ' ').capitalize()}: a plan",
+        parts=[_part(plan) for plan in plans],
+        depth_ratio=plans[0].config.depth_ratio,
+        config=yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True),
+    )
+    write_text(path, page)
+
+
+def _part(plan: Plan) -> _Part:
+    return _Part(
+        instrument=plan.instrument,
+        answer=answer(plan),
+        figures=_figures(plan),
+        rows=_rows(plan),
+        ignored=", ".join(plan.ignored),
+        curves=_curves(plan),
+        pictures=[_picture(plan, found) for found in plan.maps],
+    )
+
+
+def _figures(plan: Plan) -> list[tuple[str, str]]:
+    entries = ((*_FIGURES[name], value) for name, value in plan.figures.items())
+    return [(title, f"{value * factor:.3g} {unit}") for title, unit, factor, value in entries]
+
+
+def _rows(plan: Plan) -> list[_Row]:
+    middle = plan.middle()
+    return [_Row(found.title, found.unit, _values(found, found.summary(middle))) for found in plan.maps]
+
+
+def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:
+    return [_NOTHING if value is None else f"{value * found.factor:.4g}" for value in figures.values()]
+
+
+def _picture(plan: Plan, found: PlanMap) -> _Picture:
+    unit = found.unit or "ratio"
+    png = map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, unit, found.title)
+    none = found.name == "smallest_block_m"
+    return _Picture(found.title, png, "not seen, or no block is, however large" if none else "not seen")
+
+
+def _curves(plan: Plan) -> bytes | None:
+    """The figure of the detection probability's curves; None for several stations together, which have no one range."""
+    if not plan.curves:
+        return None
+    panels = [
+        CurvePanel(
+            curve.label,
+            curve.x,
+            curve.at,
+            {f"block of {size:g} m": values for size, values in curve.probability.items()},
+            logarithmic="incidence" not in curve.label,
+        )
+        for curve in plan.curves
+    ]
+    return curves_figure(panels, "detection probability, %")

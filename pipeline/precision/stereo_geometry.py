@@ -1,0 +1,199 @@
+"""What a stereo set-up promises at places on the wall: GSD, base to distance, convergence, precision of the intersection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.precision.detectability import Sampling, lattice
+from pipeline.precision.surface import BoolArray, Places, slide, turned
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.camera import Camera, CameraPair
+from sensors.effects.base import Stage, apply_stage
+from sensors.effects.matching_noise import NodeNoise
+from sensors.model import OrientationNoise, Spread, StereoModel
+from sensors.rectify import Rectification, rectify
+from sensors.stereo import REDUCTION, StereoPair
+
+
+@dataclass(frozen=True)
+class StereoGeometry:
+    """A pair's figures at n places; (n,) each, as if nothing stood in between.
+
+    distance_m: from the middle of the base; gsd_m: side of the square that has the area which a frame pixel of the left image
+    covers on the surface; cell_m: the same of a cell of the depth map; base_to_distance; convergence_rad: angle between the two
+    rays; incidence_rad: of the more oblique ray; covariance: (n, 3, 3) by matching and image noise, wall frame, m2;
+    orientation_covariance: (n, 3, 3) by the noise of the orientation, common to the whole observation and largely taken up by
+    the registration; normal_sigma_m: along the surface's normal; in_left, in_right: within the frame.
+    """
+
+    distance_m: FloatArray
+    gsd_m: FloatArray
+    cell_m: FloatArray
+    base_to_distance: FloatArray
+    convergence_rad: FloatArray
+    incidence_rad: FloatArray
+    covariance: FloatArray
+    orientation_covariance: FloatArray
+    normal_sigma_m: FloatArray
+    in_left: BoolArray
+    in_right: BoolArray
+    sampling: Sampling
+
+
+@dataclass(frozen=True)
+class DisparityNoise:
+    """Standard deviations, px: white, from cell to cell; smooth, averaged over places, with nodes `step` px apart."""
+
+    white: float
+    smooth: float
+    step: float
+
+    @classmethod
+    def of(cls, model: StereoModel) -> DisparityNoise:
+        """The sources in quadrature; the coarsest step of several that neighbours share."""
+        noise = [effect for effect in model.matching_noise if not effect.is_null]
+        white, smooth = (sum(each.total_variance for each in noise if each.shared == shared) for shared in (False, True))
+        step = max((each.step_px for each in noise if isinstance(each, NodeNoise)), default=np.inf)
+        return cls(float(np.sqrt(white)), float(np.sqrt(smooth)), step)
+
+
+def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.0) -> StereoGeometry:
+    """The figures of `pair` at `places` (wall frame).
+
+    image_sigma_px: noise of each coordinate of measured image points, on top of the sensor model's matching noise.
+    """
+    nominal = pair.cameras.in_wall_frame(pair.frame)
+    noise = DisparityNoise.of(pair.model)
+    along = _intersection(nominal, places.points)
+    matching = np.einsum("ni,nj->nij", along.by_disparity, along.by_disparity) * (noise.white**2 + noise.smooth**2)
+    covariance = matching + image_sigma_px**2 * along.by_image_noise()
+    normal_by_disparity = np.abs(np.einsum("ni,ni->n", along.by_disparity, places.normals))
+    normal_variance = np.einsum("ni,nij,nj->n", places.normals, covariance, places.normals)
+    smooth = normal_by_disparity * noise.smooth
+    by_u, by_v = _pixel_steps(nominal.left, places)
+    gsd, cell = np.sqrt(np.linalg.norm(np.cross(by_u, by_v), axis=1)), REDUCTION[pair.quality]
+    sights = [places.points - camera.position for camera in (nominal.left, nominal.right)]
+    steps = lattice(by_u * cell, by_v * cell, places.normals, sights)
+    middle = (nominal.left.position + nominal.right.position) / 2
+    distance = np.linalg.norm(places.points - middle, axis=1)
+    return StereoGeometry(
+        distance_m=distance,
+        gsd_m=gsd,
+        cell_m=gsd * cell,
+        base_to_distance=nominal.base_m / distance,
+        convergence_rad=_angle(*sights),
+        incidence_rad=np.maximum(*(_angle(-sight, places.normals) for sight in sights)),
+        covariance=covariance,
+        orientation_covariance=orientation_covariance(pair, places.points),
+        normal_sigma_m=np.sqrt(normal_variance),
+        in_left=_in_frame(nominal.left, places.points),
+        in_right=_in_frame(nominal.right, places.points),
+        sampling=Sampling(
+            **steps,
+            white=np.sqrt(np.maximum(normal_variance - smooth**2, 0.0)),
+            smooth=smooth,
+            grain_a=steps["step_a"] / cell * noise.step,
+            grain_b=steps["step_b"] / cell * noise.step,
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _Derivatives:
+    """dP by the rectified disparity d = u_l - u_r, by u_l at fixed disparity, and by the row v; (n, 3) each, wall frame, m/px."""
+
+    by_disparity: FloatArray
+    by_u: FloatArray
+    by_v: FloatArray
+
+    def by_image_noise(self) -> FloatArray:
+        """(n, 3, 3) covariance of the least-squares intersection, m2/px2, for noise of 1 px in each of u_l, v_l, u_r, v_r.
+
+        In the rectified pair both rows are the same unknown, so that their mean counts: its variance is a half.
+        """
+        left = self.by_u + self.by_disparity
+        terms = ((1.0, left), (1.0, self.by_disparity), (0.5, self.by_v))
+        return np.sum([weight * np.einsum("ni,nj->nij", vector, vector) for weight, vector in terms], axis=0)
+
+
+def _intersection(nominal: CameraPair, points: FloatArray) -> _Derivatives:
+    """Derivatives of the forward intersection in the rectified pair.
+
+    z = f B / d, x = u z / f, y = v z / f, so dP/dd = -(x, y, z) z / (f B), whose z part is Kraus' Z^2 / (c B) of the normal case,
+    dP/du = (z/f, 0, 0) and dP/dv = (0, z/f, 0).
+    """
+    geometry = rectify(nominal)
+    to_wall = nominal.left.rotation @ geometry.left.T
+    local = turned(to_wall.T, points - nominal.left.position)
+    z = local[:, 2:]
+    by_disparity = -local * z / (geometry.f * geometry.base_m)
+    return _Derivatives(turned(to_wall, by_disparity), z / geometry.f * to_wall[:, 0], z / geometry.f * to_wall[:, 1])
+
+
+def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
+    """(n, 3, 3) covariance of recorded points by the noise of both cameras' orientation, wall frame, m2, to first order.
+
+    Each of the 2 x 16 parameters is moved by its standard deviation alone: the real cameras see the point there, the nominal ones
+    intersect.
+    """
+    covariance = np.zeros((len(points), 3, 3))
+    noise, nominal = pair.model.noise.orientation, pair.cameras.in_wall_frame(pair.frame)
+    geometry = rectify(nominal)
+    for side in ("left", "right"):
+        for name in type(noise).model_fields:
+            sigma = getattr(noise, name).sigma
+            if sigma > 0:
+                moved = OrientationNoise(**{name: Spread(mean=sigma)}).draw(side, KeyedRandom(0))
+                real = apply_stage(moved, Stage.CAMERA, pair.cameras, KeyedRandom(0)).in_wall_frame(pair.frame)
+                error = _recorded(nominal, geometry, real, points) - points
+                covariance += np.einsum("ni,nj->nij", error, error)
+    return covariance
+
+
+def _recorded(nominal: CameraPair, geometry: Rectification, real: CameraPair, points: FloatArray) -> FloatArray:
+    """(n, 3) where the nominal calibration puts points that the real cameras see, wall frame, m."""
+    left = _rectified_tangents(nominal.left, geometry.left, *_project(real.left, points))
+    right = _rectified_tangents(nominal.right, geometry.right, *_project(real.right, points))
+    z = geometry.base_m / (left[0] - right[0])
+    local = np.stack([left[0] * z, left[1] * z, z], axis=1)
+    return turned(nominal.left.rotation @ geometry.left.T, local) + nominal.left.position
+
+
+def _rectified_tangents(camera: Camera, rotation: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    x, y = camera.tangents(u, v)
+    ray = turned(rotation, np.stack([x, y, np.ones_like(x)], axis=1))
+    return ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
+
+
+def _project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (u, v) of (n, 3) points."""
+    local = turned(camera.rotation.T, points - camera.position)
+    return camera.pixel(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
+
+
+def _in_frame(camera: Camera, points: FloatArray) -> BoolArray:
+    """(n,) whether points lie in front of the camera and on its frame."""
+    depth = np.einsum("ni,i->n", points - camera.position, camera.rotation[:, 2])
+    with np.errstate(all="ignore"):
+        u, v = _project(camera, points)
+        return (depth > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+
+
+def _pixel_steps(camera: Camera, places: Places) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) each, m: how far one frame pixel to the right, and one down, lie on the surface (central differences)."""
+    local = turned(camera.rotation.T, places.points - camera.position)
+    u, v = _project(camera, places.points)
+    steps = []
+    for du, dv in ((0.5, 0.0), (0.0, 0.5)):
+        (x_0, y_0), (x_1, y_1) = camera.tangents(u - du, v - dv), camera.tangents(u + du, v + dv)
+        turn = np.stack([x_1 - x_0, y_1 - y_0, np.zeros_like(u)], axis=1) * local[:, 2:]
+        steps.append(slide(places.points - camera.position, turned(camera.rotation, turn), places.normals))
+    return steps[0], steps[1]
+
+
+def _angle(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(n,) angle between vectors (n, 3) each, rad."""
+    return np.arctan2(np.linalg.norm(np.cross(first, second), axis=1), np.einsum("ni,ni->n", first, second))

@@ -1,0 +1,152 @@
+"""Pairs of points with the nearest of a reference, summed up fast and repeatably.
+
+Points are visited in an order in which neighbours in memory are neighbours in space, and sums are taken over blocks of fixed size
+in a fixed order, so that the result has the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.registration.rigid import RigidTransform
+from scene.errors import InputError
+from scene.mesh import FloatArray
+
+LEAST_POINTS = 6
+"""Of a cloud that is registered: one per unknown."""
+_SEES = "check that the sensor sees the wall: its place, its direction, its range, for cameras their overlap"
+_BLOCK = 2**14
+"""Points per block of the sums: its arrays fit a core's cache."""
+ON_A_LINE = 1e-12
+"""Share of the largest variance below which the second one makes a cloud a line."""
+_SCATTERED = 0.05
+"""Share of a cloud's extent that neighbours in memory may be apart before it is worth sorting."""
+
+Map = Callable[[Callable[[FloatArray], FloatArray], Iterable[FloatArray]], Iterable[FloatArray]]
+
+
+@dataclass(frozen=True)
+class ReferenceSurface:
+    """Points of the reference, (m, 3) about `origin` (3,), m, their unit normals (m, 3) or None, and their search tree."""
+
+    origin: FloatArray
+    points: FloatArray
+    normals: FloatArray | None
+    tree: Any
+
+    @classmethod
+    def build(cls, points: FloatArray, normals: FloatArray | None = None) -> ReferenceSurface:
+        """Index a reference once for any number of registrations.
+
+        points: (m, 3), m; normals: (m, 3) of any length, sign irrelevant, or None. Raises InputError where there are fewer than
+        six points, values that are not finite, normals of length zero, or points on one line.
+        """
+        from scipy.spatial import cKDTree
+
+        points = checked_cloud(points, "reference points")
+        unit = None if normals is None else _unit(normals, len(points))
+        order = scan_order(points)
+        origin = points.mean(axis=0)
+        local = points[order] - origin
+        tree = cKDTree(local, leafsize=16, balanced_tree=False)
+        return cls(origin, local, None if unit is None else unit[order], tree)
+
+    def moments(
+        self, blocks: list[FloatArray], pose: RigidTransform, gate: float, normals: FloatArray | None, map_blocks: Map
+    ) -> FloatArray:
+        """The sum of u u^T over all pairs of a point p and its nearest reference point q that are nearer than `gate`, m.
+
+        u is one pair's column, g the pose's translation:
+        with normals n:  ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8);
+        without:         (p - g, q - p, 1), so that it is (7, 7). The last element is the number of pairs.
+        blocks: (k, 3) each, m; pose: moves them to coordinates about `origin`; map_blocks: `map`, or an executor's.
+        """
+
+        def block_moments(block: FloatArray) -> FloatArray:
+            moved = pose.apply(block)
+            distance, nearest = self.tree.query(moved, distance_upper_bound=gate)
+            near = np.isfinite(distance)
+            moved, nearest = moved[near], nearest[near]
+            arm, offset = (moved - pose.translation).T, (moved - self.points[nearest]).T
+            columns = _point_columns(arm, offset) if normals is None else _plane_columns(arm, offset, normals[nearest].T)
+            return np.einsum("in,jn->ij", columns, columns)
+
+        return np.sum(list(map_blocks(block_moments, blocks)), axis=0)
+
+
+def _point_columns(arm: FloatArray, offset: FloatArray) -> FloatArray:
+    """(7, k) columns from p - g and p - q, (3, k) each."""
+    return np.concatenate([arm, -offset, np.ones((1, arm.shape[1]))])
+
+
+def _plane_columns(arm: FloatArray, offset: FloatArray, normal: FloatArray) -> FloatArray:
+    """(8, k) columns from p - g, p - q and n, (3, k) each."""
+    columns = np.ones((8, arm.shape[1]))
+    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        columns[axis] = arm[i] * normal[j] - arm[j] * normal[i]
+    columns[3:6] = normal
+    columns[6] = normal[0] * offset[0] + normal[1] * offset[1] + normal[2] * offset[2]
+    return columns
+
+
+def blocks_of(points: FloatArray) -> list[FloatArray]:
+    """The points in blocks of a fixed size, the last one shorter."""
+    return [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
+
+
+def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
+    """An index that puts neighbours in space next to each other: the points' own order (a sensor's rows), else Morton's curve."""
+    stride = max(len(points) // _BLOCK, 1)
+    steps = np.abs(points[1::stride] - points[:-1:stride]).max(axis=1)
+    if np.median(steps) <= _SCATTERED * np.ptp(points[::stride], axis=0).max():
+        return slice(None)
+    low = np.array([points[:, axis].min() for axis in range(3)])
+    cell = max(float((points[:, axis] - low[axis]).max()) for axis in range(3)) / 1023
+    x, y, z = (_spread_bits(((points[:, axis] - low[axis]) / cell).astype(np.uint32)) for axis in range(3))
+    return np.argsort(x | y << 1 | z << 2, kind="stable")
+
+
+def _spread_bits(number: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Ten bits, each moved to three times its place, so that three numbers interleave to a Morton code."""
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        number = (number | number << np.uint32(shift)) & np.uint32(mask)
+    return number
+
+
+def checked_cloud(points: FloatArray, name: str) -> FloatArray:
+    """(n, 3) points as they are; InputError where they cannot determine a pose."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"expected shape (n, 3), got {points.shape}", where=name)
+    if len(points) < LEAST_POINTS:
+        raise InputError(f"{len(points)} points are too few", where=name, allowed=f"at least {LEAST_POINTS}", remedy=_SEES)
+    finite = np.isfinite(points)
+    if not finite.all():
+        bad = int((~finite.all(axis=1)).sum())
+        raise InputError(f"{bad:,} of {len(points):,} points are not finite", where=name, remedy="remove them before registering")
+    if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(points):  # a sample may be one column of a grid
+        raise InputError("the points lie on one line, which determines no pose", where=name)
+    return points
+
+
+def _on_a_line(points: FloatArray) -> bool:
+    local = points - points.mean(axis=0)
+    variances = np.linalg.eigvalsh(np.einsum("ni,nj->ij", local, local))
+    return not variances[1] > ON_A_LINE * variances[2]
+
+
+def _unit(normals: FloatArray, count: int) -> FloatArray:
+    if np.shape(normals) != (count, 3):
+        raise InputError(f"expected shape ({count}, 3), got {np.shape(normals)}", where="reference normals")
+    length = np.sqrt(np.einsum("ni,ni->n", normals, normals))
+    good = np.isfinite(length) & (length > 0)
+    if not good.all():
+        raise InputError(
+            f"{int((~good).sum()):,} of {count:,} are zero or not finite", where="reference normals", remedy="remove these points"
+        )
+    return normals / length[:, None]

@@ -1,0 +1,17 @@
+"""What the pictures of a diagnosis share."""
+
+from __future__ import annotations
+
+import io
+
+from matplotlib.figure import Figure
+
+from pipeline.report.plain_text import plain_text
+
+
+def png(figure: Figure, dpi: int = 110) -> bytes:
+    """The figure as PNG; equal figures give equal bytes."""
+    buffer = io.BytesIO()
+    with plain_text(figure):
+        figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()

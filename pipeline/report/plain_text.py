@@ -1,0 +1,35 @@
+"""Text in pictures as it stands: a $ in the name of a sensor or a file is no formula."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from matplotlib import rc_context
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@contextmanager
+def plain_text(figure: Figure) -> Iterator[None]:
+    """Draw a figure inside: none of its texts is taken for Matplotlib's mathematics; a logarithmic axis needs plain labels."""
+    with rc_context({"text.parse_math": False}):  # for the ticks, whose texts are made while drawing
+        for text in figure.findobj(Text):
+            text.set_parse_math(False)
+        yield
+
+
+def powers_of_ten(axis: Axis) -> None:
+    """Label the ticks of a logarithmic (or symlog) axis 10⁻² ... 10³; others than powers of ten, and 0, as numbers."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def power_of_ten(value: float) -> str:
+    """A number as a power of ten in Unicode, where it is one."""
+    mantissa, exponent = f"{value:.6e}".split("e")
+    return f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if float(mantissa) == 1 else f"{value:g}"

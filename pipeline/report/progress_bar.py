@@ -1,0 +1,43 @@
+"""Progress as a bar on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Self, TextIO
+
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+from rich.progress import Progress as RichProgress
+
+from pipeline.report.progress import Progress
+
+
+class BarProgress(Progress):
+    """A bar that is drawn again several times a second and vanishes at the end."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self._bar = _Bar(self, stream)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+
+class _Bar(RichProgress):
+    """rich's bar, asking `source` how far it is whenever it is drawn."""
+
+    def __init__(self, source: Progress, stream: TextIO) -> None:
+        self._source = source
+        time, stage = TextColumn("{task.fields[time]}"), TextColumn("{task.description}")
+        super().__init__(BarColumn(), TaskProgressColumn(), time, stage, console=Console(file=stream), transient=True)
+        self.add_task("", total=1.0, time="")
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        source = self._source
+        for task in self.task_ids:  # rich draws once before there is one
+            self.update(task, completed=source.share, description=source.current, time=source.time)
+        yield from super().get_renderables()

@@ -1,0 +1,103 @@
+"""What a run was observed with, as rows of its report: sensor, place, distance, noise, and how finely it samples the wall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.report.page import true_minus
+from pipeline.run.site import Site
+from scene.mesh import FloatArray
+from sensors.effects.base import Effect
+from sensors.model import OrientationNoise, Spread
+from sensors.observation import Sensor
+from sensors.stereo import REDUCTION, StereoPair
+from sensors.stereo_matched import MatchedStereoPair
+from sensors.tls import LaserScanner
+
+_ARCSEC = np.degrees(1.0) * 3600
+"""Seconds of arc in a radian."""
+_ONE_SIGMA = "(1 \N{GREEK SMALL LETTER SIGMA})"
+
+
+def instrument_figures(site: Site) -> dict[str, str]:
+    """Name to value, with its unit, of what a reader looks for first: which sensor saw the wall, from where, how well."""
+    own = _scanner_figures(site.sensor, site) if isinstance(site.sensor, LaserScanner) else _pair_figures(site.sensor, site)
+    return {**own, **_places(site)}
+
+
+def _scanner_figures(scanner: LaserScanner, site: Site) -> dict[str, str]:
+    config, noise = scanner.config, scanner.model.noise
+    steps = config.azimuth_step_rad, config.zenith_step_rad
+    on_the_wall = [step * _ranges(site.mesh.vertices, scanner.position)[1] * 1e3 for step in steps]
+    growing = f" and {noise.range_ppm:g} ppm of it" if noise.range_ppm else ""
+    faces = ", mean of two faces" if config.faces == 2 else ""
+    return {
+        "Sensor": f"terrestrial laser scanner, {config.name or 'of no preset'}; {config.pulse_rate_hz / 1e3:g} kHz{faces}",
+        "Noise": f"range {noise.range_sigma_m * 1e3:.3g} mm{growing}, angles {noise.angle_sigma_rad * _ARCSEC:.3g}″ {_ONE_SIGMA}",
+        "Effects": _effects(scanner.model.effects),
+        "Angular step": " x ".join(f"{step * 1e3:.3g}" for step in steps)
+        + " mrad, azimuth x zenith; "
+        + " x ".join(f"{size:.3g}" for size in on_the_wall)
+        + " mm at the median distance",
+    }
+
+
+def _pair_figures(sensor: Sensor, site: Site) -> dict[str, str]:
+    pair = sensor.pair if isinstance(sensor, MatchedStereoPair) else sensor
+    if not isinstance(pair, StereoPair):
+        raise TypeError(f"neither a scanner nor a pair: {type(sensor).__name__}")
+    left, right, noise = pair.cameras.left, pair.cameras.right, pair.model.noise
+    base = float(np.linalg.norm(right.position - left.position))
+    pixel_mm = _ranges(site.mesh.vertices, site.frame.to_wall(left.position))[1] / left.f_px * 1e3
+    smooth = f"{noise.regularization_sigma_px:g} px every {noise.regularization_step_px:g} px (regularization)"
+    simulated = f"{noise.parallax_sigma_px:g} px (parallax) and {smooth}"
+    matched = "the matcher's own: photographs are rendered and matched (sgbm)"
+    drawn = "; orientation drawn in each epoch" if _is_drawn(noise.orientation) else ""
+    return {
+        "Sensor": f"stereo pair, {left.width} x {left.height} px, principal distance {left.f_px:,.0f} px, base {base:.2f} m",
+        "Noise": f"{matched if isinstance(sensor, MatchedStereoPair) else simulated}{drawn} {_ONE_SIGMA}",
+        "Effects": _effects(pair.model.effects),
+        "Pixel on the wall": f"{pixel_mm:.3g} mm at the median distance; depth map {REDUCTION[pair.quality] * pixel_mm:.3g} mm",
+    }
+
+
+def _is_drawn(noise: OrientationNoise) -> bool:
+    """Whether any orientation parameter differs from its calibrated value."""
+    return any(getattr(noise, name) != Spread() for name in type(noise).model_fields)
+
+
+def _effects(effects: Sequence[Effect]) -> str:
+    """Their names, with the parameters that are not at their defaults."""
+    return "; ".join(_with_parameters(effect) for effect in effects if not effect.is_null) or "none beyond the noise"
+
+
+def _with_parameters(effect: Effect) -> str:
+    values = {name: getattr(effect, name) for name in type(effect).model_fields if name != "name"}
+    own = {name: value for name, value in values.items() if value != type(effect).model_fields[name].default}
+    told = ", ".join(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}" for name, value in own.items())
+    return f"{effect.name} ({told})" if told else effect.name
+
+
+def _places(site: Site) -> dict[str, str]:
+    """World coordinates of the sensor's eyes and how far the wall is from each."""
+    return {
+        row: value
+        for name, eye in site.viewpoints.items()
+        for row, value in (
+            (f"Position ({name})", ", ".join(true_minus(each, 2) for each in site.frame.to_world(eye)) + " m (x, y, z, world)"),
+            (f"Distance to the wall ({name})", _in_words(_ranges(site.mesh.vertices, eye))),
+        )
+    }
+
+
+def _ranges(vertices: FloatArray, eye: FloatArray) -> tuple[float, float, float]:
+    """Least, median and largest distance, m, of the wall's (n, 3) vertices from a (3,) eye in the same frame."""
+    least, median, largest = np.quantile(np.linalg.norm(vertices - eye, axis=1), [0.0, 0.5, 1.0])
+    return float(least), float(median), float(largest)
+
+
+def _in_words(ranges: tuple[float, float, float]) -> str:
+    least, median, largest = ranges
+    return f"{median:.1f} m (median; {least:.1f} m to {largest:.1f} m)"

@@ -1,0 +1,246 @@
+"""The files of an epoch. A folder gets its final name when all of its files are written.
+
+What is written is known by its checksums, so that a later call can tell whether it is whole.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.annotate import LabelledImage, coco
+from pipeline.change.difference import statistics
+from pipeline.change.m3c2 import M3c2Map
+from pipeline.change.tiles import tiles
+from pipeline.config.simulation import SimulationConfig
+from pipeline.formats.atomic import explained, give_name, note, noting, to_disk, write_bytes, write_json
+from pipeline.formats.checksum import sha256
+from pipeline.formats.e57 import write_e57
+from pipeline.formats.geotiff import write_geotiff, write_tiff
+from pipeline.formats.inside import inside
+from pipeline.formats.laz import write_laz
+from pipeline.formats.ply import write_ply, write_ply_points
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.xyz import write_xyz
+from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
+from pipeline.run.acquisition import Look
+from pipeline.run.epoch import Epoch, Reference
+from pipeline.run.recorded_points import recorded_points, scans_of
+from pipeline.run.site import Site
+from pipeline.surface.metashape_export import write_metashape_export
+from scene.blocks import Blocks
+from scene.carve import block_meshes
+from scene.imported import ImportedWall
+from scene.mesh import WALL, FloatArray, TriangleMesh
+
+EPOCH_RECORD = "epoch.json"
+Checksums = dict[str, str]
+"""SHA-256 of files, by their names relative to the run's folder."""
+M3C2_ANNOTATIONS = "annotations_m3c2"
+"""Key of an epoch's record, and the name of the run's file."""
+
+
+def epoch_folder(out: Path, number: int) -> Path:
+    return out / f"epoch_{number:03d}"
+
+
+def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
+    """Whether the files are there with these checksums. Raises InputError for a name, of the file `where`, out of the folder."""
+    files = {inside(out, name, where): digest for name, digest in checksums.items()}
+    return bool(files) and all(path.is_file() and sha256(path) == digest for path, digest in files.items())
+
+
+def write_reference(out: Path, config: SimulationConfig, site: Site, reference: Reference, seen: Look) -> Checksums:
+    """Write epoch_000, of what the sensor has `seen`, and the hillshade of the reference."""
+    with noting() as written, _folder(out, 0) as folder:
+        _write_common(folder, config, site, seen, reference.surface, reference.caster.mesh, [])
+        write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
+        record = {
+            "epoch": 0,
+            **_seen_record(seen),
+            "blocks": [],
+            "annotations": coco([], config.annotation),
+        }
+        write_json(folder / EPOCH_RECORD, record)
+    return _checksums(out, written)
+
+
+def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Reference, epoch: Epoch) -> Checksums:
+    """Write an epoch's folder, its difference map, tiles and pictures."""
+    name = f"difference_{epoch.number:03d}"
+    grid = reference.raster.grid
+    with noting() as written, _folder(out, epoch.number) as folder:
+        _write_common(folder, config, site, epoch.seen, epoch.surface, epoch.carved.mesh, epoch.blocks)
+        write_geotiff(
+            out / f"{name}.tif", epoch.difference, grid, description="reference minus epoch, m; missing rock is positive"
+        )
+        if config.products.block_meshes:
+            _write_block_meshes(folder / "blocks", site.mesh, epoch.solids)
+        if epoch.m3c2 is not None:
+            _write_m3c2(out, epoch.number, epoch.m3c2)
+        images = list(_images(out, config, epoch, reference, name))
+        sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
+        masks = epoch.raster.block != WALL
+        write_bytes(out / f"{name}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
+        write_bytes(
+            out / f"hillshade_{epoch.number:03d}.png", hillshade_figure(epoch.raster.heights, grid, f"Epoch {epoch.number}")
+        )
+        histogram = histogram_figure(epoch.difference[~masks], epoch.difference[masks])
+        write_bytes(out / f"histogram_{epoch.number:03d}.png", histogram)
+        if epoch.registration is not None:
+            write_bytes(out / f"icp_{epoch.number:03d}.png", convergence_figure(epoch.registration.history))
+        write_json(folder / EPOCH_RECORD, _record(config, epoch, images, sigma))
+    return _checksums(out, written)
+
+
+def _checksums(out: Path, written: list[Path]) -> Checksums:
+    return {str(path.relative_to(out)): sha256(path) for path in written if path.exists()}
+
+
+def _record(config: SimulationConfig, epoch: Epoch, images: list[LabelledImage], sigma: float) -> dict[str, Any]:
+    return {
+        "epoch": epoch.number,
+        **_seen_record(epoch.seen),
+        "volume_balance_m3": epoch.carved.balance_m3,
+        "wall_volume_m3": epoch.carved.wall_volume_m3,
+        "registration": None if epoch.registration is None else epoch.registration.to_dict(),
+        "statistics": {
+            "inside_blocks": epoch.statistics.inside.to_dict(),
+            "outside_blocks": epoch.statistics.outside.to_dict(),
+            "sigma_m": sigma,
+        },
+        "blocks": epoch.blocks,
+        "annotations": coco(images, config.annotation),
+        **({} if epoch.m3c2 is None else _m3c2_record(config, epoch.number, epoch.m3c2)),
+    }
+
+
+def _m3c2_record(config: SimulationConfig, number: int, found: M3c2Map) -> dict[str, Any]:
+    image = LabelledImage(f"m3c2_{number:03d}.tif", found.block, found.grid, number)
+    return {"m3c2": found.summary(), M3C2_ANNOTATIONS: coco([image], config.annotation)}
+
+
+def _write_m3c2(out: Path, number: int, found: M3c2Map) -> None:
+    """The distances and their level of detection as maps, the distances as a picture, and all of it as points."""
+    write_geotiff(out / f"m3c2_{number:03d}.tif", found.distance, found.grid, description="M3C2, m; missing rock is positive")
+    write_geotiff(out / f"m3c2_lod_{number:03d}.tif", found.level, found.grid, description="M3C2 level of detection 95 %, m")
+    calm = statistics(found.distance[found.block == WALL])
+    sigma = max(calm.nmad, 1e-4) if calm.count else 1e-3
+    write_bytes(out / f"m3c2_{number:03d}.png", difference_figure(found.distance, found.grid, found.block, sigma, "M3C2"))
+    maps: dict[str, NDArray[Any]] = {"distance_m": found.distance, "lod_m": found.level, "block": found.block}
+    maps["significant"] = found.significant.astype(np.uint8)
+    extra = {name: values.ravel()[found.place] for name, values in maps.items()}
+    write_laz(out / f"m3c2_{number:03d}.laz", found.points, extra=extra)
+
+
+def _seen_record(seen: Look) -> dict[str, Any]:
+    """Number of points and, of several stations, how the further ones were registered to the first."""
+    points = sum(int(each.valid.sum()) + (0 if each.further is None else len(each.further.cell)) for each in seen.observations)
+    registered = () if seen.joined is None else seen.joined.registrations
+    return {"points": points} | ({"stations": [found.to_dict() for found in registered]} if registered else {})
+
+
+def _images(out: Path, config: SimulationConfig, epoch: Epoch, reference: Reference, name: str) -> Iterator[LabelledImage]:
+    """The images of the data set: the difference map, or its tiles, which are written here."""
+    labels = np.where(np.isnan(epoch.difference), WALL, epoch.raster.block)
+    if config.tiles is None:
+        yield LabelledImage(f"{name}.tif", labels, reference.raster.grid, epoch.number)
+        return
+    for tile in tiles(epoch.difference, labels, reference.raster.grid, config.tiles):
+        file_name = f"tiles/{name}_{tile.name}.tif"
+        write_geotiff(out / file_name, tile.values, tile.grid)
+        yield LabelledImage(file_name, tile.block, tile.grid, epoch.number, tile.row, tile.column)
+
+
+def _write_common(
+    folder: Path,
+    config: SimulationConfig,
+    site: Site,
+    seen: Look,
+    surface: TriangleMesh,
+    truth: TriangleMesh,
+    blocks: list[dict[str, Any]],
+) -> None:
+    """What every epoch has: points, depth map, surface, truth, blocks."""
+    cloud = recorded_points(seen.observations)
+    write_cloud(folder / "points.laz", cloud)
+    if "ply" in config.products.formats:
+        write_ply_points(folder / "points.ply", cloud)
+    if "xyz" in config.products.formats:
+        write_xyz(folder / "points.xyz", cloud)
+    if "e57" in config.products.formats:
+        write_e57(folder / "points.e57", scans_of(seen.observations))
+    if seen.observation.sensor == "stereo":
+        depth = seen.observation.depth.astype(np.float32)
+        write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
+    write_ply(folder / "surface.ply", surface)
+    write_ply(folder / "truth.ply", truth)
+    write_json(folder / "blocks.json", blocks)
+    wanted = config.products.world
+    if wanted or (wanted is None and isinstance(config.wall, ImportedWall)):
+        write_cloud(folder / "points_world.laz", replace(cloud, points=site.frame.to_world(cloud.points)))
+        write_ply(folder / "surface_world.ply", _in_world(surface, site))
+    if config.products.metashape and seen.depth_maps is not None:
+        write_metashape_export(folder / "metashape", *seen.depth_maps)
+
+
+def write_cloud(path: Path, cloud: PointCloud) -> None:
+    """Write points.laz, with the channels that the format has a place of its own for in theirs."""
+    extra = dict(cloud.extra)
+    write_laz(
+        path,
+        cloud.points,
+        intensity=cloud.intensity,
+        gps_time=cloud.gps_time,
+        return_number=extra.pop("return_number", None),
+        number_of_returns=extra.pop("number_of_returns", None),
+        scan_angle_rad=extra.pop("scan_angle_rad", None),
+        extra=extra,
+    )
+
+
+def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:
+    """The four meshes of each block (thesis 3.3): wall difference, intersection, niche, removed block."""
+    for index in range(len(blocks)):
+        meshes = block_meshes(wall, blocks, index)
+        for field in fields(meshes):
+            write_ply(folder / f"block_{index + 1:04d}_{field.name}.ply", getattr(meshes, field.name))
+
+
+def _in_world(mesh: TriangleMesh, site: Site) -> TriangleMesh:
+    vertices: FloatArray = site.frame.to_world(mesh.vertices)
+    return replace(mesh, vertices=vertices)
+
+
+@contextmanager
+def _folder(out: Path, number: int) -> Iterator[Path]:
+    """The epoch's folder under a temporary name, renamed when everything in it and beside it is written."""
+    final = epoch_folder(out, number)
+    temporary = final.with_name(f".{final.name}")
+    temporary.mkdir(parents=True, exist_ok=True)
+    yield temporary
+    files = [path.relative_to(temporary) for path in sorted(temporary.rglob("*")) if path.is_file()]
+    with explained(final):
+        if final.exists():
+            _give_names(temporary, final, files)
+        else:
+            give_name(temporary, final)
+    for name in files:
+        note(final / name)
+
+
+def _give_names(temporary: Path, final: Path, files: list[Path]) -> None:
+    """Put the files into an epoch's folder that was found damaged, beside what else is in it."""
+    for name in files:
+        with explained(final / name):
+            (final / name).parent.mkdir(parents=True, exist_ok=True)
+            (temporary / name).replace(final / name)
+            to_disk((final / name).parent)
+    shutil.rmtree(temporary)

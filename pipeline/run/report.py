@@ -1,0 +1,79 @@
+"""A run's report out of what its folder holds: the epochs' records and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pipeline.run.instrument import instrument_figures
+from pipeline.run.page import BlockRow, EpochReport, RegistrationSummary, RunReport, write_report
+from pipeline.run.site import Site
+
+
+def write_run_report(out: Path, identity: dict[str, Any], site: Site, records: list[dict[str, Any]], *, complete: bool) -> Path:
+    """Write report.html of a run folder.
+
+    identity: sensor, seed and config as in run.json; records: of the finished epochs, the reference first. Returns its path.
+    """
+    path = out / "report.html"
+    reference = out / "reference.png"
+    report = RunReport(
+        title=f"{site.name.replace('_', ' ').capitalize()}: rockfall seen by {_instrument(identity['sensor'])}",
+        sensor=identity["sensor"],
+        seed=identity["seed"],
+        reference=reference.read_bytes() if reference.exists() else b"",
+        epochs=[_epoch(out, record) for record in records[1:]],
+        config=identity["config"],
+        key_figures=_key_figures(site, identity["config"], records),
+        complete=complete,
+    )
+    write_report(path, report)
+    return path
+
+
+def _instrument(sensor: str) -> str:
+    return "a stereo pair" if sensor == "stereo" else "a laser scanner"
+
+
+def _key_figures(site: Site, config: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, str]:
+    width, height, _ = site.mesh.bounds[1] - site.mesh.bounds[0]
+    figures = {
+        **instrument_figures(site),
+        "Wall": f"{width:.1f} m x {height:.1f} m, {len(site.mesh.faces):,} triangles",
+        "Pixel of the difference map": f"{config['difference']['gsd_m'] * 1e3:g} mm",
+        "Points of the reference": f"{records[0]['points']:,}" if records else "none",
+    }
+    return figures | ({"Repairs of the mesh": "; ".join(site.repairs)} if site.repairs else {})
+
+
+def _epoch(out: Path, record: dict[str, Any]) -> EpochReport:
+    number, annotated = record["epoch"], {annotation["block"] for annotation in record["annotations"]["annotations"]}
+    registration = record["registration"]
+    pictures = {name: out / f"{name}_{number:03d}.png" for name in ("hillshade", "difference", "histogram", "icp")}
+    fields = ("rms_m", "inliers", "points", "iterations", "reason")
+    return EpochReport(
+        number=number,
+        points=record["points"],
+        inside=record["statistics"]["inside_blocks"],
+        outside=record["statistics"]["outside_blocks"],
+        sigma_m=record["statistics"]["sigma_m"],
+        blocks=[_row(block, block["label"] in annotated) for block in record["blocks"]],
+        hillshade=pictures["hillshade"].read_bytes(),
+        difference=pictures["difference"].read_bytes(),
+        histogram=pictures["histogram"].read_bytes(),
+        convergence=pictures["icp"].read_bytes() if registration else None,
+        registration=RegistrationSummary(**{name: registration[name] for name in fields}) if registration else None,
+    )
+
+
+def _row(block: dict[str, Any], annotated: bool) -> BlockRow:
+    return BlockRow(
+        label=block["label"],
+        shape=block["shape"],
+        size_m=block["size_m"],
+        volume_m3=block["volume_m3"],
+        measured_volume_m3=block["measured_volume_m3"] if block["measured_area_m2"] else None,
+        position_m=block["position_m"],
+        world_position_m=block["world_position_m"],
+        annotated=annotated,
+    )

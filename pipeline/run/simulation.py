@@ -1,0 +1,250 @@
+"""A whole run: the folder that `simulate` fills, epoch by epoch, and how an interrupted one goes on.
+
+An epoch is done when its folder has its final name and run.json its checksums: everything of it is written before. What is in an
+interrupted run's folder is therefore usable, and a later call with `resume` makes only what is missing or damaged; the bytes are
+those of an undisturbed run. One process at a time works in a folder.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, StringConstraints
+
+from pipeline.change.annotate import merge
+from pipeline.config.simulation import CamerasFile, SensorName, SimulationConfig
+from pipeline.formats.atomic import noting, write_json
+from pipeline.formats.checksum import sha256
+from pipeline.formats.lock import is_free, locked
+from pipeline.report.progress import Progress
+from pipeline.report.provenance import versions
+from pipeline.run.epoch import STAGES, observe_epoch, observe_reference
+from pipeline.run.products import (
+    EPOCH_RECORD,
+    M3C2_ANNOTATIONS,
+    Checksums,
+    epoch_folder,
+    is_whole,
+    write_epoch,
+    write_reference,
+)
+from pipeline.run.report import write_run_report
+from pipeline.run.site import Site, prepare_site
+from scene.backend import VARIANT
+from scene.config import parse
+from scene.errors import InputError
+from scene.imported import ImportedWall
+from scene.keyed_random import KeyedRandom
+
+RUN_FILE = "run.json"
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run left behind. folder: of the run; report: its report.html; epochs: the records of the finished epochs."""
+
+    folder: Path
+    report: Path
+    epochs: list[dict[str, Any]]
+
+
+class _RunFile(BaseModel):
+    """What a later call wants of run.json. products: checksums of each finished epoch's files, by the name of its folder."""
+
+    model_config = ConfigDict(extra="allow")
+    products: dict[Annotated[str, StringConstraints(pattern=r"^epoch_\d+$")], Checksums] = {}
+
+
+@dataclass
+class _Run:
+    """A run under way. identity: what tells it from others; products: as in run.json; site: once it is set up."""
+
+    out: Path
+    identity: dict[str, Any]
+    progress: Progress
+    products: dict[str, Checksums] = field(default_factory=dict)
+    site: Site | None = None
+
+    def has(self, number: int) -> bool:
+        return epoch_folder(self.out, number).name in self.products
+
+    def note(self, number: int, checksums: Checksums) -> None:
+        """Write into run.json that an epoch is finished."""
+        found = {**self.products, epoch_folder(self.out, number).name: checksums}
+        self.products = {name: found[name] for name in sorted(found, key=lambda name: (len(name), name))}
+        write_json(self.out / RUN_FILE, {**self.identity, "complete": False, "products": self.products})
+
+
+def simulate(
+    config: SimulationConfig, sensor: SensorName, out: Path, *, resume: bool = False, progress: Progress | None = None
+) -> RunSummary:
+    """Observe a wall before and after rocks fall, and write a run folder.
+
+    out: a folder that is new or empty, or with `resume` that of an interrupted run of the same config. Raises InputError for
+    a folder in use, another config, and whatever is wrong with wall, sensor or blocks. On an interrupt the products of the
+    finished epochs are completed before KeyboardInterrupt goes on.
+    """
+    progress = progress or Progress()
+    progress.plan(_plan(config))
+    identity = {"schema": SCHEMA, "sensor": sensor, "seed": config.seed, "config": config.model_dump(mode="json")}
+    identity["inputs"] = _inputs(config)
+    run = _Run(out, identity, progress)
+    if resume and not (out / RUN_FILE).exists():
+        raise InputError("holds no run to resume", where=f"--out {out}", remedy="start it without --resume")
+    with locked(out), noting() as written:
+        _claim(run, resume)
+        try:
+            site = _observe(run, config, sensor)
+        except InputError:
+            _leave_nothing_half_written(run, resume, written)
+            raise
+        except KeyboardInterrupt:
+            _remove_unfinished(out)
+            if run.site is not None and run.has(0):
+                _finish(run, run.site, complete=False)
+            raise
+        with progress.stage("report"):
+            return _finish(run, site, complete=True)
+
+
+def _observe(run: _Run, config: SimulationConfig, sensor: SensorName) -> Site:
+    """Make the epochs that are not there; returns what they were observed of."""
+    out, progress, random = run.out, run.progress, KeyedRandom(config.seed)
+    with progress.stage("wall"):
+        site = run.site = prepare_site(config, sensor, random)
+    reference = observe_reference(config, site, random, progress)
+    if reference.seen is not None and not run.has(0):
+        with progress.stage("epoch 0: write"):
+            run.note(0, write_reference(out, config, site, reference, reference.seen))
+    reference = replace(reference, seen=None)
+    for number in range(1, config.epochs + 1):
+        if not run.has(number):
+            epoch = observe_epoch(config, site, reference, number, random, progress)
+            with progress.stage(f"epoch {number}: write"):
+                run.note(number, write_epoch(out, config, site, reference, epoch))
+    return site
+
+
+def _plan(config: SimulationConfig) -> dict[str, float]:
+    stages = {f"epoch 0: {name}": STAGES[name] for name in ("observe", "mesh", "difference", "write")}
+    stages |= {f"epoch {number}: {name}": weight for number in range(1, config.epochs + 1) for name, weight in STAGES.items()}
+    return {"wall": 3.0, **stages, "report": 1.0}
+
+
+def _inputs(config: SimulationConfig) -> dict[str, str]:
+    """The config's input files and their SHA-256: a mesh replaced under the same name makes another run.
+
+    A file that is not there is left out: whoever reads it says so.
+    """
+    named = [config.wall.mesh] if isinstance(config.wall, ImportedWall) else []
+    named += [config.cameras.file] if isinstance(config.cameras, CamerasFile) else []
+    files = [file for path in named for file in (sorted(path.glob("*.txt")) if path.is_dir() else [path]) if file.is_file()]
+    return {str(path): sha256(path) for path in files}
+
+
+def _claim(run: _Run, resume: bool) -> None:
+    """Make sure that the folder is ours to write to: new, empty, or an interrupted run of the same identity, whose epochs that
+    are whole are taken over."""
+    out, identity, path = run.out, run.identity, run.out / RUN_FILE
+    if not resume:
+        if not is_free(out):
+            remedy = "go on with --resume, or choose another --out" if path.exists() else "choose another --out"
+            raise InputError("the folder exists and is not empty", where=f"--out {out}", remedy=remedy)
+        write_json(path, {**identity, "complete": False})
+        return
+    earlier = _read(path)
+    _require_same(earlier, identity, out)
+    _remove_unfinished(out)
+    known = parse(_RunFile, earlier, str(path)).products
+    run.products = {
+        name: checksums
+        for name, checksums in known.items()
+        if f"{name}/{EPOCH_RECORD}" in checksums and is_whole(out, checksums, path)
+    }
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        found = None
+    if not isinstance(found, dict):
+        raise InputError("is damaged: the run cannot be gone on with", where=str(path), remedy="choose another --out")
+    return found
+
+
+def _require_same(earlier: dict[str, Any], identity: dict[str, Any], out: Path) -> None:
+    """Raise InputError where the run in the folder is another one."""
+    changed = [key for key, value in identity.items() if earlier.get(key) != json.loads(json.dumps(value))]
+    if changed == ["inputs"]:
+        replaced = [
+            Path(path).name for path, digest in identity["inputs"].items() if earlier.get("inputs", {}).get(path) != digest
+        ]
+        raise InputError(
+            f"the run in the folder was begun with another {', '.join(replaced)}",
+            where=f"--out {out}",
+            remedy="put the file back as it was, or choose another --out",
+        )
+    if changed:
+        raise InputError(
+            f"the run in the folder has another {' and '.join(changed)}",
+            where=f"--out {out}",
+            remedy="resume with the same config, sensor and seed, or choose another --out",
+        )
+
+
+def _remove_unfinished(out: Path) -> None:
+    for left in out.glob(".epoch_*"):
+        shutil.rmtree(left)
+
+
+def _leave_nothing_half_written(run: _Run, resumed: bool, written: list[Path]) -> None:
+    """After wrong input: remove what this run has written, unless an epoch is finished that could be gone on from.
+
+    What others put into the folder meanwhile stays, and the folder with it.
+    """
+    _remove_unfinished(run.out)
+    if resumed or run.has(1):
+        return
+    for path in written:
+        with suppress(OSError):  # is gone: it was renamed with its folder
+            path.unlink()
+    folders = {folder for path in written for folder in path.parents if run.out in folder.parents}
+    for folder in sorted(folders, reverse=True):  # the inner ones first
+        with suppress(OSError):  # is gone, or holds another's file
+            folder.rmdir()
+
+
+def _finish(run: _Run, site: Site, *, complete: bool) -> RunSummary:
+    """Write what covers all epochs: annotations.json, report.html and run.json."""
+    out, identity = run.out, run.identity
+    records = [json.loads((out / name / EPOCH_RECORD).read_text(encoding="utf-8")) for name in run.products]
+    report = write_run_report(out, identity, site, records, complete=complete)
+    annotations = [record.pop("annotations") for record in records]
+    write_json(out / "annotations.json", merge(annotations))
+    if any(M3C2_ANNOTATIONS in record for record in records):
+        beside = [record.pop(M3C2_ANNOTATIONS) for record in records if M3C2_ANNOTATIONS in record]
+        write_json(out / f"{M3C2_ANNOTATIONS}.json", merge(beside))
+    record = {
+        **identity,
+        "complete": complete,
+        "versions": versions(),
+        "backend": VARIANT,
+        "wall": {"name": site.name, "repairs": list(site.repairs), "triangles": len(site.mesh.faces)},
+        "wall_frame": {
+            "matrix_world_to_wall": site.frame.matrix.tolist(),
+            "rotation": site.frame.rotation.tolist(),
+            "origin_m": site.frame.origin.tolist(),
+        },
+        "epochs": records,
+        "products": run.products,
+        "seconds": run.progress.timings,
+    }
+    write_json(out / RUN_FILE, record)
+    return RunSummary(out, report, records)

@@ -1,0 +1,88 @@
+"""The stage of a simulation: the wall in its frame, and the sensor in front of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipeline.config.simulation import SensorName, SimulationConfig
+from scene.frame import WallFrame
+from scene.imported import ImportedWall
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray, TriangleMesh
+from scene.wall import Wall, build_wall
+from scene.winding import check_near, facing
+from sensors.camera import CameraPair
+from sensors.observation import Sensor
+from sensors.placement import Target
+from sensors.stereo import StereoPair
+from sensors.stereo_matched import MatchedStereoPair
+from sensors.tls import LaserScanner
+
+
+@dataclass(frozen=True)
+class Site:
+    """The untouched wall (wall frame), its frame, and the sensor that observes it.
+
+    name: of the wall; repairs: what was mended in an imported mesh; viewpoints: where the sensor's eyes are, by their place in
+    the config, wall frame; further_stations: of a laser scanner with several, those after the first, which is `sensor`.
+    """
+
+    name: str
+    repairs: tuple[str, ...]
+    mesh: TriangleMesh
+    frame: WallFrame
+    sensor: Sensor
+    viewpoints: dict[str, FloatArray]
+    further_stations: tuple[LaserScanner, ...] = ()
+
+
+def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Site:
+    """Build the wall, place the sensor and fit the wall's frame, whose z axis points to the sensor.
+
+    Raises InputError for a wall that cannot be used and a sensor that cannot be placed.
+    """
+    wall = build_wall(config.wall, random.child("wall"))
+    target = Target(wall.mesh)
+    if sensor == "stereo":
+        cameras = config.camera_pair(target)
+        frame = WallFrame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
+        positions = {f"cameras, {side}": getattr(cameras, side).position for side in ("left", "right")}
+        mesh, repairs = _faced(config, wall, frame, positions)
+        pair = _stereo(config, cameras, frame, random)
+        eyes = {name: frame.to_wall(position) for name, position in positions.items()}
+        return Site(wall.name, repairs, mesh, frame, pair, eyes)
+    stations = config.stations_of_the_scanner()
+    poses = [station.place(target) for station in stations]
+    frame = WallFrame.fit(wall.mesh.vertices, poses[0][0])
+    positions = {f"station, number {number}": position for number, (position, _) in enumerate(poses, start=1)}
+    positions = positions if len(poses) > 1 else {"station": poses[0][0]}
+    mesh, repairs = _faced(config, wall, frame, positions)
+    instrument = config.scanner, config.tls_model(), config.products.truth_channels
+    scanners = [
+        LaserScanner.aimed(pose, frame, mesh.vertices, *instrument, station.pose_sigma)
+        for pose, station in zip(poses, stations, strict=True)
+    ]
+    eyes = {name: scanner.position for name, scanner in zip(positions, scanners, strict=True)}
+    return Site(wall.name, repairs, mesh, frame, scanners[0], eyes, tuple(scanners[1:]))
+
+
+def _faced(
+    config: SimulationConfig, wall: Wall, frame: WallFrame, positions: Mapping[str, FloatArray]
+) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """The wall in its frame, one from a file wound as the sensors see it, and what was mended in it. positions: world frame."""
+    check_near(wall.mesh.vertices, positions, wall.name)
+    mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
+    if not isinstance(config.wall, ImportedWall):
+        return mesh, wall.repairs
+    mesh, words = facing(mesh, [frame.to_wall(position) for position in positions.values()], str(config.wall.mesh))
+    return mesh, (*wall.repairs, *([words] if words else []))
+
+
+def _stereo(config: SimulationConfig, cameras: CameraPair, frame: WallFrame, random: KeyedRandom) -> Sensor:
+    """The pair with the config's matcher; the rock's texture stays the same from epoch to epoch."""
+    pair = StereoPair(cameras, frame, config.stereo_model(), config.depth_map, config.products.truth_channels)
+    if config.matcher == "simulated":
+        return pair
+    texture = config.texture.texture(random.child("texture"))
+    return MatchedStereoPair(pair, texture, config.illumination, config.exposure, config.matching)

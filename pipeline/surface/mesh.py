@@ -1,0 +1,263 @@
+"""From points to a surface: grid triangulation of an organised observation, Poisson reconstruction of an unorganised cloud.
+
+Grid triangulation joins each sample to its neighbours in the sensor's own rows and columns: four samples make a cell, a cell two
+triangles along its shorter diagonal, or one where a corner is missing. An edge is cut at a depth discontinuity, where its ends
+differ in range r (distance from the viewpoint) by more than a step and it lies nearly along the line of sight:
+
+    |r_2 - r_1| > depth_step_m   and   |r_2 - r_1| > |p_2 - p_1| cos(grazing_angle_rad)
+
+The first condition keeps noise from tearing a densely sampled surface, the second keeps a steep but continuous slope whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from scene.config import Config
+from scene.errors import InputError
+from scene.mesh import FloatArray, IntArray, TriangleMesh, area_normals
+from sensors.observation import Observation
+
+BoolArray = NDArray[np.bool_]
+
+_POISSON_DEPTH_LIMIT = 12
+"""The deepest octree chosen by itself: 4,096 cells along the cloud's longest side."""
+_NORMAL_NEIGHBOURS = 30
+_VOTES = 4096
+"""Triangles asked for the winding of an organised grid; all but folded ones agree."""
+
+
+class SurfaceConfig(Config):
+    """How points become a surface."""
+
+    method: Literal["grid", "poisson"] = Field("grid", description="grid triangulation, or Open3D's Poisson reconstruction")
+    depth_step_m: float = Field(0.3, ge=0, description="a smaller range difference of neighbouring samples is never cut")
+    grazing_angle_rad: float = Field(
+        0.15, ge=0, lt=np.pi / 2, description="an edge at a larger angle to the line of sight is never cut; 0 cuts nothing"
+    )
+    holes: Literal["keep", "fill"] = Field("keep", description="leave missing samples open, or interpolate the small holes")
+    maximum_hole_px: int = Field(64, ge=1, description="holes: fill, the largest hole that is filled, in missing samples")
+    poisson_depth: int | None = Field(
+        None, ge=4, le=16, description="depth of the octree; null: its cells as large as the points' spacing"
+    )
+    poisson_trim_spacings: float = Field(
+        3.0, gt=0, description="the Poisson surface ends this many median point spacings from the nearest point"
+    )
+
+
+def mesh_observation(observation: Observation, config: SurfaceConfig) -> TriangleMesh:
+    """The surface through an observation's points, wall frame, counter-clockwise seen from its viewpoint.
+
+    The vertices are the samples that some triangle uses, in the sensor's order, each with its block in `vertex_block`.
+    Raises InputError where no triangle is left.
+    """
+    points, block = observation.points, observation.block
+    if config.method == "poisson":
+        return mesh_cloud(points[observation.valid], block[observation.valid], observation.viewpoint, config)
+    if config.holes == "fill":
+        points, block = _fill_holes(points, block, config.maximum_hole_px)
+    cells = _triangulate(points, observation.viewpoint, config)
+    used = cells.used(block.shape)
+    if not used.any():
+        raise InputError(
+            f"no triangle between the {int(observation.valid.sum()):,} points of the {observation.sensor} observation",
+            where="surface",
+            remedy="enlarge surface.depth_step_m, take a smaller sampling step or check that the sensor sees the wall",
+        )
+    vertices = points[used]
+    faces = _oriented(cells.faces(used), vertices, observation.viewpoint)
+    return TriangleMesh(vertices, faces, vertex_block=block[used].astype(np.int32, copy=False))
+
+
+def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, config: SurfaceConfig) -> TriangleMesh:
+    """Screened Poisson reconstruction (Kazhdan and Hoppe 2013, by Open3D) of an unorganised cloud, wall frame.
+
+    points: (n, 3), m; block: (n,) labels; viewpoint: (3,), m, the side that the normals and the winding look to. Poisson
+    closes the surface where there are no points; vertices farther from every point than `poisson_trim_spacings` median spacings
+    are trimmed. Labels come from the nearest point. Single-threaded: with more threads Open3D gives other bytes in every run.
+    """
+    if len(points) <= _NORMAL_NEIGHBOURS:
+        raise InputError(f"{len(points)} points are too few", where="Poisson surface", allowed="more than 16")
+    depth = config.poisson_depth or octree_depth(points)
+    vertices, faces = _poisson(points, viewpoint, depth)
+    return labelled_surface(vertices, faces, points, (points, block), config)
+
+
+def labelled_surface(
+    vertices: FloatArray, faces: IntArray, points: FloatArray, labels: tuple[FloatArray, IntArray], config: SurfaceConfig
+) -> TriangleMesh:
+    """A surface made from `points` by others, without what lies `poisson_trim_spacings` median spacings from them or farther.
+
+    labels: (n, 3) points and their (n,) blocks; each vertex takes that of the nearest. Raises InputError where nothing is left.
+    """
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points).query(vertices, workers=-1)[0] <= config.poisson_trim_spacings * _spacing(points)
+    faces = faces[near[faces].all(axis=1)]
+    if len(faces) == 0:
+        raise InputError(
+            "nothing of the Poisson surface lies near the points",
+            where="surface",
+            remedy="raise surface.poisson_depth or surface.poisson_trim_spacings",
+        )
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    nearest = cKDTree(labels[0]).query(vertices[used], workers=-1)[1]
+    return TriangleMesh(vertices[used], _numbers(used)[faces], vertex_block=labels[1][nearest].astype(np.int32))
+
+
+def octree_depth(points: FloatArray) -> int:
+    """The octree depth whose cells are as large as the median spacing of (n, 3) points; InputError where they coincide."""
+    longest = float(np.ptp(points, axis=0).max())
+    return int(np.clip(np.ceil(np.log2(longest / _spacing(points))), 4, _POISSON_DEPTH_LIMIT))
+
+
+def _spacing(points: FloatArray) -> float:
+    """Median distance of a point to the nearest other one, m."""
+    from scipy.spatial import cKDTree
+
+    spacing = float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))
+    if not spacing > 0:
+        raise InputError("most points of the cloud lie twice in the same place", where="surface", remedy="remove duplicates")
+    return spacing
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """The triangles of each cell of an organised (h, w) grid; all arrays (h-1, w-1) bool.
+
+    A cell's corners are a, b in its first row and c, d in its second. falling: it is split along a-d into (a, c, d) and
+    (d, b, a), else along b-c into (a, c, b) and (d, b, c); first, second: which of the two triangles exist.
+    """
+
+    first: BoolArray
+    second: BoolArray
+    falling: BoolArray
+
+    def used(self, shape: tuple[int, ...]) -> BoolArray:
+        """(h, w) the samples that some triangle uses."""
+        used = np.zeros(shape, dtype=bool)
+        used[:-1, :-1] |= self.first | (self.second & self.falling)
+        used[:-1, 1:] |= self.second | (self.first & ~self.falling)
+        used[1:, :-1] |= self.first | (self.second & ~self.falling)
+        used[1:, 1:] |= self.second | (self.first & self.falling)
+        return used
+
+    def faces(self, used: BoolArray) -> IntArray:
+        """(m, 3) triangles over the numbered `used` samples, all of one winding; the first of every cell, then the second."""
+        number = _numbers(used)
+        a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+        first = [a[self.first], c[self.first], np.where(self.falling, d, b)[self.first]]
+        second = [d[self.second], b[self.second], np.where(self.falling, a, c)[self.second]]
+        return np.stack([np.concatenate(pair) for pair in zip(first, second, strict=True)], axis=1)
+
+
+def _triangulate(points: FloatArray, viewpoint: FloatArray, config: SurfaceConfig) -> _Cells:
+    """Split every cell of (h, w, 3) points where it gives most triangles, in a tie along the shorter diagonal."""
+    local = points - viewpoint
+    coordinates = np.ascontiguousarray(np.moveaxis(local, 2, 0), dtype=np.float32)  # for tests only: micrometres suffice
+    distance = np.sqrt(np.einsum("ijk,ijk->ij", local, local))
+    edges = _Edges(coordinates, distance.astype(np.float32), config)
+    along_rows, _ = edges.join(np.s_[:, :-1], np.s_[:, 1:])
+    along_columns, _ = edges.join(np.s_[:-1, :], np.s_[1:, :])
+    ad, ad_length = edges.join(np.s_[:-1, :-1], np.s_[1:, 1:])
+    bc, bc_length = edges.join(np.s_[:-1, 1:], np.s_[1:, :-1])
+    ab, cd, ac, bd = along_rows[:-1], along_rows[1:], along_columns[:, :-1], along_columns[:, 1:]
+    acd, dba, acb, dbc = ad & ac & cd, ad & ab & bd, bc & ac & ab, bc & bd & cd
+    surplus = (acd.view(np.int8) + dba.view(np.int8)) - (acb.view(np.int8) + dbc.view(np.int8))
+    falling = (surplus > 0) | ((surplus == 0) & (ad_length <= bc_length))
+    return _Cells(np.where(falling, acd, acb), np.where(falling, dba, dbc), falling)
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges between samples; coordinates: (3, h, w) float32, relative to the viewpoint, m; distance: (h, w) from it, m."""
+
+    coordinates: NDArray[np.float32]
+    distance: NDArray[np.float32]
+    config: SurfaceConfig
+
+    def join(self, start: tuple[slice, ...], end: tuple[slice, ...]) -> tuple[BoolArray, NDArray[np.float32]]:
+        """Whether the edges from `start` to `end` samples are whole (False at NaN), and their squared lengths, m2."""
+        squared = np.square(self.coordinates[0][end] - self.coordinates[0][start])
+        for axis in (1, 2):
+            squared += np.square(self.coordinates[axis][end] - self.coordinates[axis][start])
+        jump = np.square(self.distance[end] - self.distance[start])
+        step = np.float32(self.config.depth_step_m**2)
+        if self.config.grazing_angle_rad == 0:
+            return squared < np.inf, squared
+        return (jump <= step) | (jump <= np.float32(np.cos(self.config.grazing_angle_rad) ** 2) * squared), squared
+
+
+def _numbers(used: BoolArray) -> IntArray:
+    """The new index of each kept element, in order; meaningless where `used` is False."""
+    return (np.cumsum(used, dtype=np.int32) - np.int32(1)).reshape(used.shape)
+
+
+def _oriented(faces: IntArray, vertices: FloatArray, viewpoint: FloatArray) -> IntArray:
+    """The faces, all reversed where most of a sample of them are clockwise seen from the viewpoint."""
+    corners = vertices[faces[:: max(len(faces) // _VOTES, 1)]]
+    normal = area_normals(corners)
+    towards = np.einsum("ij,ij->i", normal, viewpoint - corners[:, 0])
+    return faces if np.median(towards) >= 0 else np.ascontiguousarray(faces[:, ::-1])
+
+
+def _fill_holes(points: FloatArray, block: IntArray, maximum_px: int) -> tuple[FloatArray, IntArray]:
+    """Interpolate the holes of at most `maximum_px` missing samples that do not touch the grid's border.
+
+    A filled point is the mean of the linear interpolations along its row and its column, weighted by the inverse widths of the
+    hole there: an affine combination, so a hole in a plane is filled exactly. Its label is that of the nearest of the four ends.
+    """
+    missing = np.isnan(points[..., 0])
+    rows, columns = np.nonzero(_small_holes(missing, maximum_px))
+    weighted, weights = np.zeros((len(rows), 3)), np.zeros((len(rows), 1))
+    label, reach = np.zeros(len(rows), dtype=block.dtype), np.full(len(rows), np.iinfo(np.int32).max)
+    for axis, place in enumerate((rows, columns)):
+        before, after = (ends[rows, columns] for ends in _ends(missing, axis))
+        fraction = ((place - before) / (after - before))[:, None]
+        first, last = ((end, columns) if axis == 0 else (rows, end) for end in (before, after))
+        weight = 1.0 / (after - before)[:, None]
+        weighted += weight * ((1 - fraction) * points[first] + fraction * points[last])
+        weights += weight
+        for end, sample in ((before, first), (after, last)):
+            nearer = np.abs(end - place) < reach
+            label, reach = np.where(nearer, block[sample], label), np.where(nearer, np.abs(end - place), reach)
+    points, block = points.copy(), block.copy()
+    points[rows, columns], block[rows, columns] = weighted / weights, label
+    return points, block
+
+
+def _small_holes(missing: BoolArray, maximum_px: int) -> BoolArray:
+    """(h, w) the missing samples in 4-connected holes of at most `maximum_px`, away from the border."""
+    from scipy import ndimage
+
+    holes, _ = ndimage.label(missing)
+    small = np.bincount(holes.ravel()) <= maximum_px
+    for border in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):
+        small[border] = False
+    return small[holes] & missing
+
+
+def _ends(missing: BoolArray, axis: int) -> tuple[IntArray, IntArray]:
+    """(h, w) index along `axis` of the last sample at or before each place and of the next at or after it (-1, n: none)."""
+    size = missing.shape[axis]
+    place = np.arange(size, dtype=np.int32).reshape((-1, 1) if axis == 0 else (1, -1))
+    before = np.maximum.accumulate(np.where(missing, np.int32(-1), place), axis=axis)
+    after = np.flip(np.minimum.accumulate(np.flip(np.where(missing, np.int32(size), place), axis), axis=axis), axis)
+    return before, after
+
+
+def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[FloatArray, IntArray]:
+    """Open3D's reconstruction, with normals that look to the viewpoint; returns vertices and faces."""
+    import open3d  # takes seconds to load and is needed here only
+
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
+    cloud.orient_normals_towards_camera_location(np.asarray(viewpoint, dtype=float))
+    surface, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    return np.asarray(surface.vertices).copy(), np.asarray(surface.triangles, dtype=np.int32).copy()

@@ -1,0 +1,115 @@
+"""Maps that are damaged or claim to be huge, in `train` and `detect`: one message, and nothing half-written is left."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.testing import assert_array_equal
+from test_model import SIDE, SMALL, eager, make_set
+
+from pipeline.change.annotate import run_length_encoding
+from pipeline.cli.main import main
+from pipeline.detect.config import TrainConfig, TrainingConfig
+from pipeline.detect.data import CocoFolder, batches
+from pipeline.formats import geotiff
+from pipeline.formats.geotiff import read_geotiff, read_tiff
+from scene.errors import InputError
+
+__all__ = ["eager"]  # a fixture
+
+
+def _claiming(path: Path, height: int, width: int) -> Path:
+    """A file of some hundred bytes that says that it holds an image of that size."""
+    tifffile.imwrite(path, np.zeros((64, 64), np.float32), compression="zlib", tile=(64, 64))
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        tags = file.pages.first.tags
+        for name, value in (("ImageLength", height), ("ImageWidth", width)):
+            tags[name].overwrite(value, dtype="I")
+    assert path.stat().st_size < 2000
+    return path
+
+
+def _cut(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[:-100])
+    return path
+
+
+def test_an_image_that_claims_gigabytes_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(tifffile.TiffPage, "asarray", lambda *_, **__: pytest.fail("it was read"))
+    for read in (read_tiff, read_geotiff):
+        with pytest.raises(InputError, match=r"30000 x 30000 px, 3.6 GB in memory; allowed: at most 250,000,000 px; cut it"):
+            read(_claiming(tmp_path / "bomb.tif", 30000, 30000))
+
+
+@pytest.mark.parametrize(("most", "fits"), [(64 * 64, True), (64 * 64 - 1, False)])
+def test_the_limit_is_where_it_is_said_to_be(tmp_path, monkeypatch, most, fits):
+    monkeypatch.setattr(geotiff, "MOST_PIXELS", most)
+    path = _claiming(tmp_path / "a.tif", 64, 64)
+    if fits:
+        assert read_tiff(path).shape == (64, 64)
+    else:
+        with pytest.raises(InputError, match="at most 4,095 px"):
+            read_tiff(path)
+
+
+def _fails(words: list[str], out: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main([*words, "--out", str(out)]) == 2
+    assert not out.exists()
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("error: ")
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("damage", [_cut, lambda path: path.unlink(), lambda path: _claiming(path, 30000, 30000)])
+def test_detect_writes_nothing_where_a_later_map_cannot_be_read(damage, tmp_path, capsys):
+    folder = make_set(tmp_path / "set", 3, 5)
+    damage(folder / "3.tif")
+    for inputs in ([folder], [folder / "1.tif", folder / "3.tif"]):
+        assert "3.tif" in _fails(["detect", "baseline", *map(str, inputs), "--quiet"], tmp_path / "out", capsys)
+
+
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_a_tile_that_is_cut_short_stops_a_training_before_it_begins(split, tmp_path, capsys):
+    for name in ("train", "val"):
+        make_set(tmp_path / "set" / name, 2, 5)
+    _cut(tmp_path / "set" / split / "2.tif")
+    message = _fails(["train", str(tmp_path / "set"), "--quiet"], tmp_path / "out", capsys)
+    assert f"{split}/2.tif: is not a whole TIFF file" in message
+
+
+@pytest.mark.slow
+def test_a_training_that_fails_in_its_first_epoch_leaves_nothing(tmp_path, eager):
+    """Called as a function, which does not read every tile beforehand."""
+    from pipeline.detect.training import train
+
+    for name in ("train", "val"):
+        make_set(tmp_path / "set" / name, 1, 5)
+    _cut(tmp_path / "set" / "val" / "1.tif")
+    with pytest.raises(InputError, match="whole TIFF"):
+        train(tmp_path / "set", TrainConfig(detector=SMALL, training=TrainingConfig(batch=1, epochs=2)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_polygons_reach_the_network_as_run_lengths_do(tmp_path):
+    """Rectangles, whose outlines and run lengths are of the same pixels: the same batches, which are all that a training sees."""
+    found = []
+    for polygons in (False, True):
+        folder = make_set(tmp_path, 2, 5)
+        content = json.loads((folder / "annotations.json").read_text())
+        for each in content["annotations"]:
+            x, y, width, height = each["bbox"]
+            box = np.ones((height, width), bool)
+            outline = [[x, y, x + width, y, x + width, y + height, x, y + height]]
+            each["segmentation"] = outline if polygons else run_length_encoding(box, y, x, (SIDE, SIDE))
+        (folder / "annotations.json").write_text(json.dumps(content))
+        config = TrainingConfig(batch=2, crop_px=64)
+        found.append(list(batches(CocoFolder(folder), SMALL, config, 0, learning=True)))
+    for one, two in zip(*found, strict=True):
+        for name, values in one.items():
+            assert_array_equal(values, two[name])
+    assert found[0][0]["valid"].sum() > 0

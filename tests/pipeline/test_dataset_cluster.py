@@ -1,0 +1,159 @@
+"""Workers on this machine: nobody else can hand them work, and their death is answered in bounded time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from tiny_dataset import ROOT, TINY
+
+from pipeline.dataset.worker import Order
+from scene.errors import OutsideError
+
+distributed = pytest.importorskip("distributed")
+pytest.importorskip("cryptography")
+cluster = pytest.importorskip("pipeline.dataset.cluster")
+
+ORDERS = [Order("folder", "job", "source", index, ("tls", "wall", "low", 1)) for index in range(4)]
+
+
+def quickly(orders: Sequence[Order]) -> list[dict[str, Any]]:
+    return [{"index": order.index} for order in orders]
+
+
+def deadly(orders: Sequence[Order]) -> list[dict[str, Any]]:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return []
+
+
+def spawned() -> list[psutil.Process]:
+    """The workers of this process."""
+    found = []
+    for child in psutil.Process().children(recursive=True):
+        try:
+            if "spawn_main" in " ".join(child.cmdline()):
+                found.append(child)
+        except psutil.Error:
+            continue
+    return found
+
+
+@contextmanager
+def killer(most: int) -> Iterator[list[int]]:
+    """Kills workers as soon as they are there, `most` of them; a list of those that it killed."""
+    killed: list[int] = []
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.is_set():
+            for each in spawned():
+                if len(killed) < most and each.pid not in killed:
+                    each.kill()
+                    killed.append(each.pid)
+            time.sleep(0.02)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield killed
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_nobody_else_can_hand_the_workers_work() -> None:
+    """Without certificates, and with others than the job's; nor is there a dashboard."""
+    with ExitStack() as stack:
+        own = cluster._local(stack, 1)
+        client = cluster._client(stack, own)
+        at_work = client.submit(time.sleep, 0.01)
+        assert own.scheduler_address.startswith("tls://")
+        for address, security in (
+            (own.scheduler_address.replace("tls://", "tcp://"), None),
+            (own.scheduler_address, distributed.Security.temporary()),
+            (next(iter(client.nthreads())).replace("tls://", "tcp://"), None),
+        ):
+            with pytest.raises(OSError, match=r"."), distributed.Client(address, security=security, timeout=2) as stranger:
+                stranger.submit(os.getpid).result(timeout=5)
+        at_work.result(timeout=60)
+        ports = {each.laddr.port for each in psutil.Process().net_connections() if each.status == psutil.CONN_LISTEN}
+        assert 8787 not in ports
+        assert {each.laddr.ip for each in psutil.Process().net_connections() if each.status == psutil.CONN_LISTEN} == {
+            "127.0.0.1"
+        }
+
+
+def test_workers_killed_at_their_start_are_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "fill_run", quickly)
+    with killer(2) as killed:
+        found = list(cluster.fill_on_cluster(ORDERS, 1, ""))
+    assert len(killed) == 2
+    assert sorted(each["index"] for each in found) == [0, 1, 2, 3]
+
+
+def test_workers_that_never_start_end_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "fill_run", quickly)
+    monkeypatch.setattr(cluster, "_STARTS", 2)
+    with killer(1000) as killed, pytest.raises(OutsideError, match="the same command goes on"):
+        list(cluster.fill_on_cluster(ORDERS, 1, ""))
+    assert 2 <= len(killed) < 20
+
+
+def test_an_epoch_that_kills_its_workers_ends_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "fill_run", deadly)
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
+    with pytest.raises(OutsideError, match="the same command goes on"):
+        list(cluster.fill_on_cluster(ORDERS, 1, ""))
+
+
+def test_a_scheduler_that_dies_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
+    monkeypatch.setattr(cluster, "_LOST_S", 2.0)
+    file = tmp_path / "scheduler.json"
+    program = "from distributed.cli.dask_scheduler import main; main()"
+    scheduler = subprocess.Popen(
+        [sys.executable, "-c", program, "--port", "0", "--scheduler-file", str(file), "--no-dashboard", "--host", "127.0.0.1"],
+        stderr=subprocess.DEVNULL,
+    )
+    while not file.exists():
+        assert scheduler.poll() is None
+        time.sleep(0.05)
+    timer = threading.Timer(2.0, scheduler.kill)
+    timer.start()
+    with pytest.raises(OutsideError, match="the same command goes on"):
+        list(cluster.fill_on_cluster(ORDERS, 0, json.loads(file.read_text())["address"]))
+    scheduler.wait()
+
+
+def test_an_interrupt_reaches_the_job_and_prints_no_traceback(tmp_path: Path) -> None:
+    """Ctrl-C goes to all processes of the terminal."""
+    file, out = tmp_path / "set.yaml", tmp_path / "set"
+    file.write_text(json.dumps(TINY))
+    program = "from pipeline.cli.main import main; raise SystemExit(main())"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "dataset", str(file), "--out", str(out), "--workers", "1", "--quiet"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    while not any((out / "shards").glob("*.json")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    error = process.communicate(timeout=120)[1]
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    assert "interrupted" in error

@@ -1,0 +1,256 @@
+"""What a data set's files say is checked before it is believed: damage is found, and no name leads out of the folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_dataset import TINY, digests, tiny
+
+from pipeline.cli.main import main
+from pipeline.dataset import records
+from pipeline.dataset.combine import merge_datasets, split_dataset
+from pipeline.dataset.loaders import Tiles
+from pipeline.dataset.records import read_dataset_file, read_shard, write_dataset_file, write_shard
+from pipeline.dataset.run import Workers, make_dataset, verify_dataset
+from pipeline.detect.data import CocoFolder
+from pipeline.detect.run import find_inputs
+from pipeline.formats.inside import inside
+from scene.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dataset") / "set"
+    make_dataset(tiny(sensors=["tls"], truth=False, parts=[{**TINY["parts"][0], "train": 1}]), out)
+    return out
+
+
+@pytest.fixture
+def copy(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "sets/set"))
+
+
+def in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The error of a command that ends with exit status 2."""
+    assert main(words) == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error
+    return error
+
+
+def test_nothing_is_left_of_the_lock(made: Path) -> None:
+    assert not list(made.rglob(".*"))
+
+
+def test_a_changed_digit_is_found_and_spoils_no_tile(made: Path, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = copy / "dataset.json"
+    text = path.read_text()
+    path.write_text(text.replace('"size_px": 48', '"size_px": 49'))
+    assert path.read_text() != text
+    next((copy / "train").glob("*.tif")).unlink()
+    before = digests(copy)
+    for words in (["verify", str(copy), "--report-only"], ["verify", str(copy)]):
+        assert "dataset.json: is damaged" in in_one_line(["dataset", *words, "--quiet"], capsys)
+    assert digests(copy) == before
+
+
+def test_a_config_that_is_not_the_epochs_own_makes_no_tile(copy: Path) -> None:
+    """Another config with a right checksum, as by someone who knows how."""
+    known = read_dataset_file(copy)
+    for source in known["sources"].values():
+        source["config"]["annotation"]["minimum_area_px"] = 77
+    write_dataset_file(copy, known["name"], known["sources"], known["epochs"], complete=True)
+    next((copy / "train").glob("*.tif")).unlink()
+    before = digests(copy)
+    with pytest.raises(InputError, match="is not the one that its epochs were made with"):
+        verify_dataset(copy)
+    assert digests(copy) == before
+
+
+@pytest.mark.parametrize("text", ["", "0  README.md\n"])
+def test_a_list_of_checksums_that_lacks_files_is_damage(text: str, made: Path, copy: Path) -> None:
+    (copy / "checksums.sha256").write_text(text)
+    (found,) = verify_dataset(copy, repair=False).damage
+    assert (str(found.file), found.problem) == ("checksums.sha256", "damaged")
+    assert verify_dataset(copy).made == []
+    assert digests(copy) == digests(made)
+
+
+@pytest.mark.parametrize("name", ["train/*.tif", "shards/*.json", "val/annotations.json", "checksums.sha256"])
+def test_a_folder_in_the_place_of_a_file_is_named(name: str, copy: Path) -> None:
+    path = next(copy.glob(name))
+    path.unlink()
+    path.mkdir()
+    assert "a folder" in [damage.problem for damage in verify_dataset(copy, repair=False).damage]
+    with pytest.raises(InputError, match=f"{path.name}: is a folder where a file of the set belongs"):
+        verify_dataset(copy)
+
+
+def changed(**values: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda known: {**known, **values}
+
+
+def prefixed(prefix: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda known: {
+        **known,
+        "sources": {name: {**source, "prefix": prefix} for name, source in known["sources"].items()},
+    }
+
+
+CHANGES: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
+    (lambda known: {}, "'schema' is missing"),
+    (lambda known: [], "expected a mapping"),
+    (lambda known: 3, "expected a mapping"),
+    (changed(epochs={"x": 10**30}), "epochs"),
+    (changed(epochs=10**30), "epochs"),
+    (changed(sources={}), "sources"),
+    (changed(name="../x"), "name"),
+    (prefixed("../../.."), "prefix"),
+    (prefixed("/tmp/x"), "prefix"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), CHANGES)
+def test_a_wrong_dataset_json_is_one_line(
+    change: Callable[[dict[str, Any]], Any], message: str, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = copy / "dataset.json"
+    values = change(read_dataset_file(copy))
+    if isinstance(values, dict):
+        values["sha256"] = records._digest(records._text(values))
+    path.write_text(json.dumps(values))
+    before = digests(copy)
+    for words in (["verify", str(copy)], ["verify", str(copy), "--report-only"], ["split", str(copy), "--out", str(copy / "x")]):
+        assert message in in_one_line(["dataset", *words], capsys)
+    assert digests(copy) == before
+
+
+def test_an_epoch_beyond_the_plan_is_named(copy: Path) -> None:
+    known = read_dataset_file(copy)
+    (source,) = known["epochs"]
+    write_dataset_file(copy, known["name"], known["sources"], {source: [*known["epochs"][source], 10**9]}, complete=True)
+    with pytest.raises(InputError, match="epoch 1000000000, which its config does not plan"):
+        verify_dataset(copy)
+
+
+def forged(folder: Path, file_name: str) -> None:
+    """The first shard with another name of its first tile, and a right checksum."""
+    name = sorted((folder / "shards").iterdir())[0].name
+    record = read_shard(folder, name)
+    assert record is not None
+    record["tiles"][0]["image"]["file_name"] = file_name
+    write_shard(folder, name, record)
+
+
+@pytest.mark.parametrize("name", ["sub/../../../stolen.tif", "/tmp/scarpsim_stolen.tif", "../../stolen.tif"])
+def test_names_in_a_shard_stay_in_the_set(name: str, copy: Path, tmp_path: Path) -> None:
+    forged(copy, name)
+    (tmp_path / "sets/stolen.tif").write_bytes(b"mine")
+    (tmp_path / "stolen.tif").write_bytes(b"mine")
+    with pytest.raises(InputError, match="lies outside of its folder"):
+        split_dataset(copy, tmp_path / "deep/er/parts", ["sensor"])
+    with pytest.raises(InputError, match="lies outside of its folder"):
+        verify_dataset(copy, repair=False)
+    assert not (tmp_path / "deep").exists() or not list((tmp_path / "deep").rglob("*stolen*"))
+
+
+def test_a_link_out_of_the_set_is_not_followed(copy: Path, tmp_path: Path) -> None:
+    tile = next((copy / "train").glob("*.tif"))
+    tile.rename(tmp_path / "elsewhere.tif")
+    tile.symlink_to(tmp_path / "elsewhere.tif")
+    other = Path(shutil.copytree(copy, tmp_path / "other", symlinks=True))
+    for call in (
+        lambda: split_dataset(copy, tmp_path / "parts", ["sensor"]),
+        lambda: merge_datasets([copy, other], tmp_path / "merged"),
+        lambda: verify_dataset(copy),
+    ):
+        with pytest.raises(InputError, match=r"lies outside of its folder|holds epochs that an earlier"):
+            call()
+
+
+@pytest.mark.parametrize("name", ["../secret.tif", "/etc/hostname", "link.tif", "", None, 3, "a\nb"])
+def test_readers_of_annotations_stay_in_the_folder(name: Any, copy: Path) -> None:
+    (copy / "secret.tif").write_bytes(next((copy / "train").glob("*.tif")).read_bytes())
+    (copy / "train/link.tif").symlink_to(copy / "secret.tif")
+    path = copy / "train/annotations.json"
+    content = json.loads(path.read_text())
+    content["images"][0]["file_name"] = name
+    path.write_text(json.dumps(content))
+    for read in (
+        lambda: list(Tiles(copy / "train")),
+        lambda: CocoFolder(copy / "train").labelled(0),
+        lambda: find_inputs([copy / "train"]),
+    ):
+        with pytest.raises(InputError, match=r"annotations\.json"):
+            read()
+
+
+def test_names_that_stay(tmp_path: Path) -> None:
+    assert inside(tmp_path, "tiles/a b.tif", "x") == tmp_path / "tiles/a b.tif"
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").symlink_to("a")
+    assert inside(tmp_path / "b", "c.tif", "x") == tmp_path / "b/c.tif"
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(InputError, match="cannot be"):
+        inside(tmp_path, "loop", "x")
+
+
+def scaled(scale: Any) -> dict[str, Any]:
+    return {"noise": {"low": {**TINY["noise"]["low"], "tls": {"model": {"sensor": "tls"}, "scale": scale}}}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sensors": ["tls", "tls"]}, "names a sensor twice"),
+        ({"noise": {"low": {**TINY["noise"]["low"], "tls": {"model": {"sensor": "tls"}, "scale": -1}}}}, "greater than or equal"),
+        (
+            {"noise": {"low": {**TINY["noise"]["low"], "tls": {"model": {"sensor": "tls"}, "scale": {"ledge": -1}}}}},
+            "greater than",
+        ),
+    ],
+)
+def test_a_config_is_refused_before_its_first_epoch(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        tiny(**changes)
+
+
+def test_a_job_that_cannot_begin_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cluster = pytest.importorskip("pipeline.dataset.cluster")
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    file, out = tmp_path / "set.yaml", tmp_path / "new/set"
+    file.write_text(json.dumps(TINY))
+    for options, message in (
+        (["--scheduler", "tcp://127.0.0.1:9"], "no scheduler answers"),
+        (["--workers", "100000"], "--workers: got 100,000; allowed: 1 to"),
+        (["--by", "sensor"], "--by: goes with split"),
+        (["--report-only"], "--report-only: goes with verify"),
+        (["--set", "tiles.size_px=4096"], "columns of tiles"),
+    ):
+        assert message in in_one_line(["dataset", str(file), "--out", str(out), "--quiet", *options], capsys)
+        assert not out.parent.exists()
+
+
+def test_what_others_put_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.dataset import run
+
+    def fails(order: Any) -> Any:
+        (tmp_path / "set/notes.txt").write_text("mine")
+        raise InputError("no room")
+
+    monkeypatch.setattr(run, "fill", fails)
+    with pytest.raises(InputError, match="no room"):
+        make_dataset(tiny(), tmp_path / "set")
+    assert [path.name for path in (tmp_path / "set").iterdir()] == ["notes.txt"]
+
+
+def test_too_many_workers_are_refused_by_verify_too(copy: Path) -> None:
+    with pytest.raises(InputError, match="--workers"):
+        verify_dataset(copy, Workers(100_000))

@@ -1,0 +1,180 @@
+"""The report of `gap`: one for every verdict, one sign for both sensors, labels that can be read."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gap_cases import write_scan
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from pipeline.cli.main import main
+from pipeline.formats.laz import read_laz
+from pipeline.formats.measurement import Measurement, read_measurement
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.report import figures, report
+from pipeline.gap.report.covariate_ranking import where
+from pipeline.gap.report.figures import gap_figure, maps_figure
+from pipeline.gap.report.in_words import VERDICTS
+from pipeline.gap.report.quantities import with_std
+
+FILES = {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}
+GAP = Gap(before=0.004, after=0.0011, floor=0.001, error=0.0002, floor_error=0.0002, points=900)
+NAMED = Named("tls.range_offset", "physical", {"name": "range_offset", "offset_m": 0.004}, {"offset_m": 3e-10}, (), 0.002, 80.0)
+ALIKE = replace(NAMED, alike=("tls.range_scale",), split_by="a second station at another range")
+EMPIRICAL = replace(NAMED, name="tls.range_empirical", kind="empirical", entry={"name": "range_empirical", "covariate": "zenith"})
+EFFECTS = {"named": (NAMED,), "several": (NAMED, NAMED), "ambiguous": (ALIKE,), "unknown": (EMPIRICAL,)}
+MATRIX = {"names": ["tls.range_offset", "tls.range_scale"], "cosines": [[1.0, 0.5], [0.5, 1.0]], "survival": [0.5, 0.2]}
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[Diagnosis, Measurement]:
+    """A diagnosis of some hundred points."""
+    folder = tmp_path_factory.mktemp("few")
+    write_scan(folder, 1, step_rad=0.05)
+    measurement = read_measurement(folder)
+    return diagnose(measurement), measurement
+
+
+@pytest.mark.parametrize("pictures", [True, False])
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_has_a_report(
+    few: tuple[Diagnosis, Measurement], verdict: str, pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, measurement = few
+    told = verdict != "insufficient_data"
+    case = replace(
+        found,
+        verdict=verdict,
+        effects=EFFECTS.get(verdict, ()),
+        gap=GAP if told and pictures else None,
+        identifiability=MATRIX if told and pictures else found.identifiability,
+        remaining={"p_value": 0.3 if told else None, "note": ""},
+    )
+    if not pictures:
+        monkeypatch.setattr(report, "_pictures", lambda _: {})
+    page = report.write(tmp_path, case, measurement).read_text()
+    assert {path.name for path in tmp_path.iterdir()} >= FILES
+    assert VERDICTS[verdict] in page
+    assert ("What to measure" in page) == (not told)
+    assert ("± &lt; 0.001 mm" in page) == (verdict in ("named", "several", "ambiguous"))
+
+
+def test_nothing_is_written_where_the_report_cannot_be_made(
+    few: tuple[Diagnosis, Measurement], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> str:
+        raise RuntimeError("a fault in the page")
+
+    monkeypatch.setattr(report, "_page", broken)
+    with pytest.raises(RuntimeError, match="a fault"):
+        report.write(tmp_path / "out", *few)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("count", "areas"), [(1, []), (3, []), (50, []), (300, []), (None, [[500.0, 500.0, 600.0, 600.0]])])
+def test_too_few_points_are_answered_with_what_to_measure(
+    count: int | None, areas: list[list[float]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case, out = tmp_path / "case", tmp_path / "out"
+    case.mkdir()
+    write_scan(case, 1, step_rad=0.03, stable_areas=areas)
+    if count is not None:
+        _keep(case / "scan_0.ply", count)
+    assert main(["gap", str(case), "--out", str(out), "--quiet"]) == 0
+    assert {path.name for path in out.iterdir()} >= FILES
+    told = capsys.readouterr().out
+    assert told.startswith("insufficient_data")
+    assert "800 are needed" in told
+    assert "stable_areas" in told
+
+
+def _keep(path: Path, count: int) -> None:
+    """So many points of a binary PLY file of five doubles each."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(body, dtype="<f8").reshape(-1, 5)
+    chosen = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
+    lines = [f"element vertex {count}".encode() if line.startswith(b"element") else line for line in head.splitlines()]
+    path.write_bytes(b"\n".join([*lines, b"end_header\n"]) + chosen.tobytes())
+
+
+@pytest.mark.parametrize("sensor", ["tls", "stereo"])
+def test_missing_rock_is_positive_of_both_sensors(few: tuple[Diagnosis, Measurement], sensor: str, tmp_path: Path) -> None:
+    """A surface 20 mm behind the reference: ranges 20 mm longer, disparities smaller by 20 mm over the depth of a pixel."""
+    found, measurement = few
+    unit = 1.0 if sensor == "tls" else 0.25
+    deeper = np.full(len(found.residuals), 0.02 / unit if sensor == "tls" else -0.02 / unit)
+    sigma = np.full(len(deeper), 0.01 / unit)
+    residuals = replace(found.residuals, sensor=sensor, unit_m=np.full(len(deeper), unit), sigma=sigma, value=deeper)
+    case = replace(found, residuals=residuals, before=deeper, after=deeper)
+    report.write(tmp_path, case, measurement)
+    for name in ("before", "after"):
+        np.testing.assert_allclose(read_laz(tmp_path / f"{name}.laz").extra["residual_m"], 0.02, rtol=1e-12)
+    means = [row["size_m"] for row in where(case) if row["statistic"] == "mean"]
+    assert means
+    np.testing.assert_allclose(means, 0.02, rtol=1e-9)
+
+
+def test_missing_rock_is_red_and_one_bad_cell_does_not_set_the_colours(
+    few: tuple[Diagnosis, Measurement], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, _ = few
+    values = 0.003 * np.random.default_rng(5).standard_normal(len(found.residuals))
+    bad = np.where(np.arange(len(values)) < 0.03 * len(values), 50.0, values)
+    images = _drawn(monkeypatch, lambda: maps_figure(replace(found, before=bad, after=bad))).axes[0].images
+    (image,) = images
+    assert 3.0 < image.get_clim()[1] < 30.0  # mm, of noise of 3 mm
+    red, _, blue, _ = image.to_rgba(20.0)
+    assert red > blue
+
+
+def test_labels_of_the_gap_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where all scores are equal, and where they differ; whiskers end within the axes."""
+    for gap in (GAP, replace(GAP, before=0.001, after=0.001), replace(GAP, before=0.0010001, after=0.0012, floor_error=0.1)):
+        figure = _drawn(monkeypatch, lambda gap=gap: gap_figure(gap))
+        (panel,) = figure.axes
+        boxes = [text.get_window_extent() for text in panel.texts if isinstance(text, Text)]
+        assert len(boxes) == 3
+        assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
+        low, high = panel.get_xlim()
+        assert low < 1e3 * (gap.after - 2 * gap.floor_error) < 1e3 * (gap.before + 2 * gap.error) < high
+
+
+def _drawn(monkeypatch: pytest.MonkeyPatch, draw: Any) -> Figure:
+    """The figure that becomes a PNG."""
+    kept: list[Figure] = []
+
+    def keep(figure: Figure, dpi: int = 110) -> bytes:
+        kept.append(figure)
+        figure.savefig(io.BytesIO(), dpi=dpi)
+        return b""
+
+    monkeypatch.setattr(figures, "png", keep)
+    draw()
+    return kept[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "std", "shown"),
+    [
+        ("step_m", 0.0082523077, 3e-10, "8.252 ± < 0.001 mm"),
+        ("offset_m", 0.00402, 5e-5, "4.02 ± 0.05 mm"),
+        ("offset_m", -0.00402, 9.96e-5, "-4.02 ± 0.10 mm"),
+        ("position_m", 2.5, 0.001, "2.5000 ± 0.0010 m"),
+        ("offset_rad", 1.1e-4, 4e-6, "110 ± 4 µrad"),
+        ("sigma_px", 0.486, 0.0123, "0.486 ± 0.012 px"),
+        ("lines_per_cycle", 37.0, 1e-9, "37.000 ± < 0.001"),
+        ("scale", 1.2, 300.0, "0 ± 300"),
+        ("offset_m", 0.004, None, "4 mm"),
+        ("minimum_power", 1.2e-9, 1e-10, "1.2e-09 ± 1e-10"),
+    ],
+)
+def test_a_value_ends_where_its_uncertainty_does(key: str, value: float, std: float | None, shown: str) -> None:
+    assert with_std(key, value, std) == shown

@@ -1,0 +1,151 @@
+"""The verdict of `gap` and its words over every combination of the numbers that they rest on: none contradicts another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+import pytest
+
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.verdict import Evidence, lower_noise, too_noisy, verdict_of
+from pipeline.gap.naming.verify import Gap
+from pipeline.gap.report.in_words import paragraph, title
+from pipeline.gap.report.report import summary
+from sensors.model import StereoModel, TlsModel
+
+ERROR = 0.0001
+GAPS = [
+    None,
+    *(
+        Gap(before=before, after=after, floor=0.0014, error=ERROR, floor_error=ERROR, points=1000)
+        for before in (0.0014, 0.0015, 0.0048)
+        for after in (before, 0.0014, 0.0052)
+    ),
+]
+P_VALUES = [None, 0.002, 0.01, 0.02, 0.5]
+SPREADS = [1.0, 0.11]
+ROWS = [
+    {"covariate": "range", "statistic": "mean", "p_value": p, "region": {"from": 10.0, "to": 20.0}, "size_m": 0.0021}
+    for p in (0.001, 0.3)
+]
+
+
+def _effect(name: str, kind: str = "physical", alike: tuple[str, ...] = ()) -> Named:
+    return Named(name, kind, {"name": name.partition(".")[2], "sigma_m": 0.01}, {}, alike, 0.002, 20.0)
+
+
+NAMED = [
+    (),
+    (_effect("tls.range_noise"),),
+    (_effect("tls.range_noise", alike=("tls.angle_noise",)),),
+    (_effect("tls.range_noise"), _effect("tls.wobble")),
+    (_effect("tls.range_empirical", "empirical"),),
+    (_effect("tls.range_empirical", "empirical"), _effect("tls.wobble")),
+]
+
+
+class _Residuals(list[int]):
+    sensor = "tls"
+
+
+@dataclass
+class _Found:
+    """What the words of a diagnosis are made of."""
+
+    effects: tuple[Named, ...]
+    evidence: Evidence
+    changes: tuple[Any, ...] = ()
+    residuals: _Residuals = field(default_factory=lambda: _Residuals(range(1000)))
+
+    @property
+    def verdict(self) -> str:
+        return verdict_of(self.effects, self.evidence)
+
+    @property
+    def gap(self) -> Gap | None:
+        return self.evidence.gap
+
+    @property
+    def remaining(self) -> dict[str, Any]:
+        lower = lower_noise(TlsModel(), self.evidence.spread)
+        return {"p_value": self.evidence.p_value, "note": "; ".join(too_noisy(self.evidence.spread, lower))}
+
+
+def _every() -> Iterator[tuple[Any, Evidence, str]]:
+    """Each combination, and all that is said of it, but those that cannot be: without an effect the gap stays."""
+    for named, gap, p_value, spread in product(NAMED, GAPS, P_VALUES, SPREADS):
+        if gap is not None and not named and gap.after != gap.before:
+            continue
+        found: Any = _Found(named, Evidence(gap, p_value, spread))
+        for row in ROWS:
+            yield found, found.evidence, f"{title(found)}. {paragraph(found, [row])} {summary(found)}"
+
+
+def test_no_gap_needs_a_gap_at_the_floor_and_a_p_value_that_does_not_reject() -> None:
+    for found, evidence, _ in _every():
+        gap, p_value = evidence.gap, evidence.p_value
+        near = gap is not None and gap.before - gap.floor <= 2 * ERROR
+        agrees = not found.effects and near and p_value is not None and p_value > 0.01
+        assert (found.verdict == "no_gap") == agrees
+
+
+def test_nothing_is_said_to_agree_that_does_not() -> None:
+    for found, evidence, said in _every():
+        agrees = found.verdict == "no_gap" and evidence.spread == 1.0
+        assert ("The measurement agrees" in said) == agrees
+        assert ("No effect is missing" in said) == (found.verdict == "no_gap")
+
+
+def test_a_gap_that_nothing_closes_is_not_reported_as_closed() -> None:
+    for found, evidence, said in _every():
+        assert "0 % of the gap is closed" not in said.replace("100 %", "")
+        assert " -" not in said
+        gap = evidence.gap
+        if gap is not None and (not found.effects or gap.after >= gap.before):
+            assert "% of the gap is closed" not in said
+        if gap is not None and gap.before - gap.floor > 2 * ERROR:
+            assert "no more than their uncertainty" not in said
+
+
+def test_what_is_rejected_without_a_description_says_where_and_how_much() -> None:
+    for found, _, said in _every():
+        bare = found.verdict == "unknown" and not found.effects
+        assert ("It shows most in the mean against range, from 10 to 20: 2.1 mm there" in said) == bare
+        if bare:
+            assert "an empirical term describes it" not in said
+            assert "that is not in the catalogue" not in said
+
+
+def test_what_an_effect_leaves_over_is_said() -> None:
+    for found, evidence, said in _every():
+        left = bool(found.effects) and evidence.p_value is not None and evidence.p_value <= 0.01
+        assert ("does not explain all of it" in said) == left
+
+
+def test_too_much_noise_is_said_with_less_that_would_do() -> None:
+    for found, evidence, said in _every():
+        assert ("the residuals spread 11% of what the model predicts" in said) == (evidence.spread < 1.0)
+        if evidence.spread < 1.0:
+            assert "range_sigma_m 0.00033" in said
+            assert "too noisy" in said or found.verdict != "no_gap"
+
+
+def test_nothing_found_and_nothing_measured_is_no_answer() -> None:
+    assert verdict_of((), Evidence(None, 0.5)) == "insufficient_data"
+    assert verdict_of((), Evidence(None, None)) == "insufficient_data"
+    assert verdict_of((), Evidence(None, 0.002)) == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        (TlsModel(), {"range_sigma_m": 0.0015, "angle_sigma_rad": 2.5e-5}),
+        (StereoModel(), {"parallax_sigma_px": 0.15, "regularization_sigma_px": 0.05}),
+    ],
+)
+def test_all_noise_is_lowered_alike(model: TlsModel | StereoModel, expected: dict[str, float]) -> None:
+    assert lower_noise(model, 0.5) == pytest.approx(expected)
+    assert lower_noise(model, 1.0) == {}

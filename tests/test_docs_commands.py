@@ -1,0 +1,306 @@
+"""Every command of README.md and docs/ does what its page says: it is run on a small scene, or resolved as if it were.
+
+A command that stands in none of the lists here fails `test_every_command_is_in_a_list`. The how-tos' commands are carried out by
+test_docs.py, those of docs/mistakes.md by test_mistakes.py.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import howtos
+import pytest
+import yaml
+from docs_commands import PAGES, ROOT, check_overrides, commands, flags_of, holds, known_flags, parsed, resolved
+
+from pipeline.cli.main import COMMANDS, main, simulate
+from pipeline.config.bundled import configs_folder
+from pipeline.config.presets import read_preset
+from pipeline.config.simulation import load_config
+from pipeline.formats.ply import write_ply
+from pipeline.view.server import open_results
+from scene.keyed_random import KeyedRandom
+from scene.procedural import ProceduralWall
+
+TINY = [
+    *("--set", "scanner.azimuth_step_rad=0.002", "--set", "scanner.zenith_step_rad=0.002"),
+    *("--set", "difference.gsd_m=0.1", "--set", "rockfall.count=2", "--quiet"),
+]
+TINY_WALL = ["--set", "wall.width_m=6", "--set", "wall.height_m=4", "--set", "wall.resolution_m=0.2"]
+INIT = "scarpsim init --out site.yaml"
+FIRST = "simulate --sensor tls --config site.yaml --set wall='{mesh: wall.ply}' --set scanner.preset=riegl_vz400i"
+MY_SITE = "scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml"
+MY_SET = "scarpsim init --dataset small"
+PLAN = "scarpsim inspect configs/sites/glendale.yaml --out plan"
+SCRIPT = "simulate --sensor tls --json --quiet"
+COMPLETION = "scarpsim completion bash"
+VIEW = "scarpsim view runs/my_run"
+RUN = (INIT, FIRST, MY_SITE, MY_SET, PLAN, SCRIPT, COMPLETION, VIEW)
+"""Carried out by the tests of their own below."""
+
+RESOLVED = (
+    "simulate --sensor stereo --config configs/sites/bulga.yaml --set epochs=20 --set 'tiles={size_px: 512}' --out runs/bulga",
+    "simulate --sensor stereo --set matcher=sgbm",
+    "simulate --sensor tls --config gap/model_after.yaml",
+    "simulate --sensor tls --config site.yaml",
+    "simulate --sensor tls --config runs/mine/run.json",
+    "simulate --sensor tls --set scanner=my_scanner.yaml",
+    "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high",
+    "simulate --sensor stereo --config my_site.yaml --set sensor=calibration/calibrated.yaml",
+    "scarpsim inspect glendale",
+    "scarpsim inspect configs/sites/glendale.yaml --set station.distance_m=100 --set cameras.distance_m=100 --out plans/100m",
+    "scarpsim inspect configs/sites/glendale.yaml --sensor tls --set scanner=riegl_vz400i --json",
+    "scarpsim compare my_site.yaml riegl_vz400i",
+    "scarpsim compare configs/demo.yaml riegl_vz400i --own-step --epochs 8 --sizes-m 0.04 0.6",
+    "scarpsim calibrate maps/*.tif --sensor stereo --config my_site.yaml --out calibration",
+    "scarpsim calibrate maps --config configs/sites/glendale.yaml --sensor stereo --set sensor=glendale_low "
+    "--set difference.gsd_m=0.04 --set calibration.window_px=32 --set calibration.simulations=100",
+    "scarpsim icp-study configs/demo.yaml --sensor stereo --set sensor=glendale_high --set cameras.distance_m=105 "
+    "--set cameras.base_m=28",
+    "scarpsim gap --identifiability configs/sites/glendale.yaml --sensor tls --out plan",
+    "scarpsim dataset configs/datasets/small.yaml --out sets/small --workers 2",
+    "scarpsim dataset configs/datasets/detector.yaml --out sets/detector --workers 2",
+    "scarpsim dataset configs/datasets/detector_test.yaml --out sets/detector_test --workers 2",
+    "scarpsim train sets/small --out detector",
+    "scarpsim train sets/small --config configs/detectors/fine.yaml --out detector",
+    "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.epochs=110 --out detector",
+)
+"""Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
+
+PARSED = (
+    "scarpsim icp-study runs/my_site",
+    "scarpsim calibrate my_measurement --out calibration",
+    "scarpsim dataset verify sets/small",
+    "scarpsim dataset verify sets/small --report-only",
+    "scarpsim dataset merge sets/a sets/b --out sets/ab",
+    "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
+    "scarpsim detect detector/best runs/bulga",
+    "scarpsim detect detector/best runs/bulga --out found",
+    "scarpsim detect baseline runs/bulga --out found_by_threshold",
+    "scarpsim evaluate sets/small/test found/detections.json --by noise --confidence 0.5 --confidence 0.95",
+    "scarpsim view runs/my_run --detections found",
+    "scarpsim view diagnosis",
+    "scarpsim view sets/small/test",
+    "scarpsim doctor",
+)
+"""Work on results alone: their words are parsed."""
+
+NAMED = (
+    "scarpsim --help",
+    "scarpsim COMMAND --help",
+    "scarpsim schema KIND",
+    "scarpsim completion --help",
+    "scarpsim simulate",
+    "scarpsim calibrate",
+    "scarpsim calibrate MEASUREMENT --out calibration",
+    "scarpsim compare",
+    "scarpsim compare CONFIG [CONFIG ...] [--measured FOLDER ...] [--epochs N] [--sizes-m FIRST LAST | --blocks config] "
+    "[--own-step]",
+    "scarpsim detect",
+    "scarpsim detect default",
+    "scarpsim evaluate",
+    "scarpsim gap",
+    "scarpsim gap --identifiability",
+    "scarpsim gap --identifiability CONFIG",
+    "scarpsim gap --identifiability SITE.yaml",
+    "scarpsim gap MEASUREMENT --identifiability",
+    "scarpsim gap MEASUREMENT --out DIR",
+    "scarpsim gap MEASUREMENT --out gap",
+    "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
+    "scarpsim inspect",
+    "scarpsim inspect CONFIG",
+    "scarpsim view",
+)
+"""Not to be typed as they stand: the command and its flags must be there."""
+
+OF_A_STYLE_TO_COME = ("simulate --sensor tls --set wall.style=my_style --set rockfall.count=10 --out runs/my_style",)
+"""With a style that the page tells how to write."""
+
+
+def carry_out(command: str, *further: str) -> str:
+    """Run a command with further words; returns what it prints."""
+    program, *words = shlex.split(command)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        code = {"scarpsim": main, "simulate": simulate}[program]([*words, *further])
+    assert code == 0, command
+    return printed.getvalue()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder where README's first commands were typed, with the other files that the pages speak of, as working folder."""
+    before, folder = Path.cwd(), tmp_path_factory.mktemp("docs")
+    os.chdir(folder)
+    try:
+        write_ply(Path("wall.ply"), ProceduralWall(width_m=6.0, height_m=4.0, resolution_m=0.2).mesh(KeyedRandom(1)))
+        carry_out(INIT)
+        carry_out(FIRST, *TINY, "--out", "runs/my_run")
+        carry_out(MY_SITE)
+        shutil.copytree("runs/my_run", "runs/mine")
+        for name, model in MODELS.items():
+            Path(name).parent.mkdir()
+            Path(name).write_text(yaml.safe_dump(model))
+        (text,) = re.findall(r"```yaml\n(name: My scanner.*?)```", (ROOT / "docs/extend/sensor.md").read_text(), re.DOTALL)
+        Path("my_scanner.yaml").write_text(text)
+        yield folder
+    finally:
+        os.chdir(before)
+
+
+MODELS: dict[str, Any] = {
+    "gap/model_after.yaml": {"sensor": "tls", "effects": [{"name": "range_offset", "offset_m": 0.004}]},
+    "calibration/calibrated.yaml": {"sensor": "stereo", "noise": {"parallax_sigma_px": 0.37}},
+}
+"""Stand for what `scarpsim gap` and `scarpsim calibrate` write."""
+
+
+def test_every_command_is_in_a_list() -> None:
+    """And none is in a list that no page shows any more; the lists hold each once."""
+    listed = [*RUN, *RESOLVED, *PARSED, *NAMED, *OF_A_STYLE_TO_COME]
+    assert len(set(listed)) == len(listed)
+    carried_out = {
+        line for page in howtos.PICTURES for step in howtos.steps(page) if not step.file for line in step.text.splitlines()
+    }
+    shown = {command for page in PAGES if page.name != "mistakes.md" for command in commands(page)}
+    assert shown - carried_out - set(listed) == set(), "put these into one of the lists, at best RUN"
+    assert set(listed) - shown == set(), "no page shows these"
+    assert carried_out <= shown, "commands are not found"
+
+
+def test_commands_are_found_in_all_their_forms(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    indented, fenced = "    simulate --sensor tls | jq '.a'  # so", "```bash\nscarpsim doctor\n```"
+    page.write_text(f"See `scarpsim\ngap X`, `simulated`, `scarpsim`.\n\n{indented}\n\n{fenced}\n")
+    assert commands(page) == ["scarpsim doctor", "simulate --sensor tls", "scarpsim gap X"]
+
+
+def test_init_writes_the_demo_s_config() -> None:
+    assert load_config(Path("site.yaml"), [], None, None) == load_config(configs_folder() / "demo.yaml", [], None, None)
+
+
+def test_the_first_simulation_is_of_the_mesh_and_the_scanner_that_were_asked_for() -> None:
+    """The RIEGL VZ-400i: 1.2 MHz, 30 to 130 degrees in zenith, 3 mm, 0.35 mrad at 1/e2."""
+    run = json.loads(Path("runs/my_run/run.json").read_text())
+    scanner, (model,) = run["config"]["scanner"], [each for each in run["config"]["sensor"] if each["sensor"] == "tls"]
+    assert run["sensor"] == "tls"
+    assert run["wall"]["name"] == "wall"
+    assert (scanner["name"], scanner["pulse_rate_hz"]) == ("RIEGL VZ-400i", 1.2e6)
+    assert scanner["zenith_limits_rad"] == pytest.approx([0.5235988, 2.2689280])
+    assert model["noise"]["range_sigma_m"] == 0.003
+    assert [(effect["name"], effect["divergence_rad"]) for effect in model["effects"]] == [
+        ("beam_divergence", pytest.approx(0.35e-3))
+    ]
+    report = Path("runs/my_run/report.html").read_text()
+    for words in ("RIEGL VZ-400i; 1200 kHz", "range 3 mm", "beam_divergence (divergence_rad 0.00035)", "Distance to the wall"):
+        assert words in report
+
+
+def test_the_run_folder_holds_what_the_readme_says() -> None:
+    """Files of a laser scanner's run; `depth_left.tif` is the pair's."""
+    for name in ("difference_001.tif", "annotations.json", "report.html"):
+        assert (Path("runs/my_run") / name).stat().st_size > 0
+    for name in ("points.laz", "surface.ply", "truth.ply", "blocks.json"):
+        assert (Path("runs/my_run/epoch_001") / name).stat().st_size > 0
+
+
+def test_init_with_a_site_and_a_scanner() -> None:
+    config, site = (
+        load_config(path, [], None, None) for path in (Path("my_site.yaml"), configs_folder() / "sites/glendale.yaml")
+    )
+    preset = read_preset("riegl_vz400i")
+    assert (config.wall, config.rockfall, config.station) == (site.wall, site.rockfall, site.station)
+    assert (config.scanner.name, config.tls_model()) == (preset.name, preset.model())
+    assert Path("scarpsim.simulation.schema.json").is_file()
+
+
+def test_init_with_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    carry_out(MY_SET)
+    assert Path("scarpsim.yaml").read_text().endswith((configs_folder() / "datasets/small.yaml").read_text())
+
+
+def test_the_plan_says_what_the_readme_promises() -> None:
+    """Maps of precision, spacing, blind spots and the smallest block. Of the scanner here; a how-to inspects both sensors."""
+    carry_out(PLAN, *TINY_WALL, "--sensor", "tls", "--set", "planning.gsd_m=0.5", "--quiet")
+    maps = {path.stem for path in Path("plan").glob("*.tif")}
+    assert {"tls_normal_sigma_m", "tls_spacing_line_m", "tls_views", "tls_smallest_block_m"} <= maps
+    assert Path("plan/report.html").is_file()
+
+
+def test_a_script_finds_the_value_that_the_page_asks_jq_for() -> None:
+    (path,) = re.findall(r"\| jq '\.([^']+)'", (ROOT / "docs/command_line.md").read_text())
+    value = json.loads(carry_out(SCRIPT, *TINY, *TINY_WALL, "--out", "runs/script"))
+    for key, index in re.findall(r"(\w+)(?:\[(\d+)\])?", path):
+        value = value[key] if not index else value[key][int(index)]
+    assert 0.0005 < value < 0.05, "the NMAD of the differences, m"
+
+
+def test_the_completion_knows_the_commands() -> None:
+    script = carry_out(COMPLETION)
+    assert "icp-study" in script
+    assert "--sensor" in script
+
+
+def test_the_viewer_opens_the_run() -> None:
+    _, given = parsed(VIEW)
+    assert open_results(given.folder).steps == {"1": "epoch 1"}
+
+
+@pytest.mark.parametrize("command", RESOLVED)
+def test_a_command_resolves_to_what_it_asks_for(command: str) -> None:
+    assert list(resolved(command)), "nothing to look at: this one is only parsed"
+    check_overrides(command)
+    CLAIMS.get(command, lambda: None)()
+
+
+@pytest.mark.parametrize("command", PARSED)
+def test_a_command_is_parsed(command: str) -> None:
+    parsed(command)
+
+
+@pytest.mark.parametrize("command", NAMED)
+def test_a_command_that_is_named_is_there(command: str) -> None:
+    name = command.split()[1]
+    if name not in ("--help", "COMMAND"):
+        assert name in COMMANDS
+        assert flags_of(command) <= known_flags(name) | {"--help"}
+
+
+@pytest.mark.parametrize("command", OF_A_STYLE_TO_COME)
+def test_a_command_for_a_style_to_come_works_with_one_that_is_there(command: str) -> None:
+    check_overrides(command.replace("my_style", "bulga"))
+
+
+def the_effect_arrives() -> None:
+    (config,) = resolved("simulate --sensor tls --config gap/model_after.yaml")
+    (model,) = config["sensor"]
+    assert holds(model["effects"], [{"name": "range_offset", "offset_m": 0.004}])
+
+
+def the_run_is_the_same() -> None:
+    (config,) = resolved("simulate --sensor tls --config runs/mine/run.json")
+    assert config == json.loads(Path("runs/my_run/run.json").read_text())["config"]
+
+
+def the_scanner_is_compared() -> None:
+    names = [config["scanner"]["name"] for config in resolved("scarpsim compare configs/demo.yaml riegl_vz400i")]
+    assert names[-1] == "RIEGL VZ-400i"
+    assert len(names) == 3, "both sensors of the demo, and the scanner"
+
+
+CLAIMS: dict[str, Callable[[], None]] = {
+    "simulate --sensor tls --config gap/model_after.yaml": the_effect_arrives,
+    "simulate --sensor tls --config runs/mine/run.json": the_run_is_the_same,
+    "scarpsim compare configs/demo.yaml riegl_vz400i --own-step --epochs 8 --sizes-m 0.04 0.6": the_scanner_is_compared,
+}
+"""What a page says of a command beyond its --set."""
