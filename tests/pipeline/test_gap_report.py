@@ -22,7 +22,7 @@ from pipeline.gap.naming.workflow import Diagnosis, diagnose
 from pipeline.gap.report import figures, report
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.figures import gap_figure, maps_figure
-from pipeline.gap.report.in_words import VERDICTS
+from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.report.quantities import with_std
 
 FILES = {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}
@@ -56,7 +56,7 @@ def test_every_verdict_has_a_report(
         effects=EFFECTS.get(verdict, ()),
         gap=GAP if told and pictures else None,
         identifiability=MATRIX if told and pictures else found.identifiability,
-        remaining={"p_value": 0.3 if told else None, "note": ""},
+        remaining={**found.remaining, "p_value": 0.3 if told else None, "note": ""},
     )
     if not pictures:
         monkeypatch.setattr(report, "_pictures", lambda _: {})

@@ -216,6 +216,6 @@ def test_what_comes_from_a_file_stays_text(tmp_path: Path) -> None:
     assert "<script>" not in page
     assert page.count("&lt;script&gt;alert(1)") == 5
     for path in TEMPLATES.rglob("*.jinja"):
-        assert template(path.name).environment.autoescape is True
+        assert template(path.relative_to(TEMPLATES).as_posix()).environment.autoescape is True
         past = re.findall(r"\{\{([^}]*)\| *safe", path.read_text())
         assert all(re.fullmatch(r"\s*'[^']*'\s*", value) for value in past), path.name

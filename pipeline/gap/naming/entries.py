@@ -83,10 +83,13 @@ class Named:
         }
 
 
-def with_effects(model: TlsModel | StereoModel, entries: list[dict[str, Any]]) -> TlsModel | StereoModel:
-    """The model with further effects, checked as a config is."""
+def with_effects(
+    model: TlsModel | StereoModel, entries: list[dict[str, Any]], noise: dict[str, float] | None = None
+) -> TlsModel | StereoModel:
+    """The model with further effects and other values of its noise, checked as a config is."""
     values = model.model_dump(mode="json")
-    return parse(type(model), {**values, "effects": [*values["effects"], *entries]}, "model_after.yaml")
+    changed = {"effects": [*values["effects"], *entries], "noise": {**values["noise"], **(noise or {})}}
+    return parse(type(model), {**values, **changed}, "model_after.yaml")
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:

@@ -25,7 +25,7 @@ VERDICTS = {
 }
 _NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px", "regularization_sigma_px")
 NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
-TOO_NOISY = "No effect is missing, but the model does not agree: its noise is too large."
+TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,10 @@ class Evidence:
         """Whether the model without any effect is not rejected: by the gap on held-out points, and by what remains."""
         return self.gap is not None and not self.gap.above_floor and self.p_value is not None and not self.rejects
 
+    def only_too_noisy(self, named: Sequence[Named]) -> bool:
+        """Whether the model's noise is too large and nothing else was found to be wrong."""
+        return self.spread < 1.0 and not named and not self.rejects
+
 
 def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
     """What the effects that were named, and the numbers, come to."""
@@ -64,11 +68,13 @@ def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
     return "ambiguous" if named[0].alike else "named"
 
 
-def in_a_sentence(verdict: str, named: Sequence[Named], spread: float) -> str:
+def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> str:
     """A verdict in words."""
+    if verdict in ("no_gap", "unknown") and evidence.only_too_noisy(named):
+        return TOO_NOISY
     if verdict == "unknown" and not any(item.kind == "empirical" for item in named):
         return NOT_DESCRIBED
-    return TOO_NOISY if verdict == "no_gap" and spread < 1.0 else VERDICTS[verdict]
+    return VERDICTS[verdict]
 
 
 def left_over(named: Sequence[Named], evidence: Evidence) -> str:
@@ -78,11 +84,11 @@ def left_over(named: Sequence[Named], evidence: Evidence) -> str:
     return f"That does not explain all of it: what remains has a p-value of {evidence.p_value:.2g}."
 
 
-def closing(gap: Gap, named: bool) -> str:
-    """How far the gap closes, in words."""
+def closing(gap: Gap, mended: bool) -> str:
+    """How far the gap closes, in words. mended: whether the model after is another one than before."""
     if gap.closed is None:
         return "before and floor differ by no more than their uncertainty"
-    if not named:
+    if not mended:
         return "before is above the floor by more than its uncertainty, and nothing closes that"
     share = round(100 * gap.closed)
     return f"{share} % of the gap is closed" if share > 0 else "none of the gap is closed"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,11 @@ _FEWEST_POINTS = 100
 
 @dataclass(frozen=True)
 class Shown:
-    """The model with some effects, (n,) residuals against it, registered, the pose (6,) of that, and the gap that is left."""
+    """The model with some effects, and values of a lower noise, (n,) residuals against it, registered, the pose (6,) of that, and
+    the gap that is left."""
 
     named: list[Named]
+    lower: dict[str, float]
     model: TlsModel | StereoModel
     value: FloatArray
     pose: FloatArray
@@ -47,7 +49,8 @@ class Showing:
 
     measurement: where its sensor stood; residuals: against its model, of which the rows `chosen` register; tested, learned: (n,)
     points that no step has looked at, and those that naming may; losses: what was found of them, and the pulses that it was not
-    fitted to; reference_sigma: in the observable's unit; largest: predicted sigmas by which points may be off.
+    fitted to; reference_sigma: in the observable's unit; largest: predicted sigmas by which points may be off; lower: values of the
+    model's noise that are proposed since it is too large.
     """
 
     measurement: Measurement
@@ -59,6 +62,7 @@ class Showing:
     reference_sigma: float
     largest: float
     random: KeyedRandom
+    lower: dict[str, float] = field(default_factory=dict)
 
     @property
     def pose(self) -> FloatArray:
@@ -70,9 +74,11 @@ class Showing:
 
         As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
         one goes without which those are predicted best. What is described, not named, stays: without it nothing would be said
-        to be wrong.
+        to be wrong. A lower noise is proposed only if it predicts better.
         """
         shown, words = self._of(named, self.tested), []
+        if self.lower and shown.is_worse:
+            return replace(self, lower={}).show(named)
         learned = self._of(named, self.learned) if shown.is_worse else shown
         while shown.is_worse:
             doubtful = [item for item in shown.named if item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES]
@@ -86,14 +92,14 @@ class Showing:
         return shown, words
 
     def _of(self, named: list[Named], rows: BoolArray) -> Shown:
-        model = with_effects(self.measurement.model, [item.entry for item in named])
+        model = with_effects(self.measurement.model, [item.entry for item in named], self.lower)
         before = self.pose
-        if named:
+        if named or self.lower:
             value, pose = self._registered(model)
         else:
             value, pose = self.residuals.value - self.residuals.pose @ before, before
         versions = Version(self.measurement.model, before), Version(model, pose)
-        return Shown(named, model, value, pose, self._gap(named, versions, rows))
+        return Shown(named, self.lower, model, value, pose, self._gap(named, versions, rows))
 
     def _registered(self, model: TlsModel | StereoModel) -> tuple[FloatArray, FloatArray]:
         """(n,) residuals of the same points against another model, NaN where that misses the reference; the pose (6,)."""

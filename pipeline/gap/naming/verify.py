@@ -129,9 +129,10 @@ def _simulated_disparities(measurement: Measurement, model: StereoModel, residua
 
 
 def observed(residuals: Residuals) -> FloatArray:
-    """(n,) measured minus geometric observable, without any effect of the model."""
+    """(n,) measured minus geometric observable, without any effect of the model, as if all epochs were taken from one place."""
     g = residuals.geometry
-    return np.asarray(g.measured_m - g.range_m if residuals.sensor == "tls" else g.found - g.disparity)
+    difference = np.asarray(g.measured_m - g.range_m if residuals.sensor == "tls" else g.found - g.disparity)
+    return difference if residuals.away is None else difference - residuals.away
 
 
 def measure_gap(

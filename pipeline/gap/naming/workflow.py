@@ -84,6 +84,11 @@ class Diagnosis:
         """The numbers that the verdict and its words rest on."""
         return Evidence(self.gap, self.remaining["p_value"], self.remaining["spread"])
 
+    @property
+    def mended(self) -> bool:
+        """Whether the model after is another one than before."""
+        return bool(self.effects or self.remaining["lower_noise"])
+
 
 def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], None] | None = None) -> Diagnosis:
     """Find what separates the measurement from its model, name it, add it and measure the gap again.
@@ -126,10 +131,10 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         reference_sigma=naming.reference_sigma,
         largest=OUTLIER * state.scale,
         random=random,
+        lower=lower_noise(there.model, naming.share),
     )
     shown, harmful = showing.show(named)
-    lower = lower_noise(there.model, naming.share)
-    notes = [*naming.notes, *too_noisy(naming.share, lower), *wide, *dropped, *harmful]
+    notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *wide, *dropped, *harmful]
     evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share)
     value = plain.value - plain.pose @ showing.pose
     clock.lap("verification")
@@ -146,7 +151,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         gap=shown.gap,
         tried=naming.tried,
         spread_tried=naming.spread_tried,
-        remaining=_remaining(evidence.p_value, notes, naming.share, lower),
+        remaining=_remaining(evidence.p_value, notes, naming.share, shown.lower),
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,

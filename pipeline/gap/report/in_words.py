@@ -29,8 +29,10 @@ def title(found: Diagnosis) -> str:
     """The outcome in a few words."""
     names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
     match found.verdict:
+        case "no_gap" | "unknown" if found.evidence.only_too_noisy(found.effects):
+            return "No effect was found to be missing, but the model is too noisy"
         case "no_gap":
-            return "No effect is missing" + (", but the model is too noisy" if found.evidence.spread < 1.0 else "")
+            return "No effect is missing"
         case "insufficient_data":
             return "Too few data to say what is missing"
         case "unknown" if not found.effects:
@@ -44,11 +46,11 @@ def title(found: Diagnosis) -> str:
 def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
     """What was compared, what was found, how far the gap closes. rows: as `where` gives them."""
     parts = [f"{len(found.residuals):,} {_INSTRUMENTS[found.residuals.sensor]} were compared with what the model predicts."]
-    parts.append(in_a_sentence(found.verdict, found.effects, found.evidence.spread))
+    parts.append(in_a_sentence(found.verdict, found.effects, found.evidence))
     parts += [_effect(effect) for effect in found.effects]
     parts += [each for each in (left_over(found.effects, found.evidence), _shown_most(found, rows)) if each]
     if found.gap is not None:
-        parts.append(_gap(found.gap, bool(found.effects)))
+        parts.append(_gap(found.gap, found.mended))
     if found.changes:
         volume = sum(abs(change.volume_m3) for change in found.changes)
         regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
@@ -165,9 +167,9 @@ def _described(effect: Named) -> str:
     return "is in the directions from which nothing returns" if lost else "is larger than the model says"
 
 
-def _gap(gap: Gap, named: bool) -> str:
+def _gap(gap: Gap, mended: bool) -> str:
     factor, unit = gap.shown
     before, after, floor = (f"{factor * value:.3f} {unit}" for value in (gap.before, gap.after, gap.floor))
-    scores = f"{before} before, {after} after" if named else f"{before} before"
+    scores = f"{before} before, {after} after" if mended else f"{before} before"
     text = f"On blocks that no step has used, the gap is {scores}; the model's own noise leaves {floor}"
-    return f"{text}{', so ' if gap.closed is None else ': '}{closing(gap, named)}."
+    return f"{text}{', so ' if gap.closed is None else ': '}{closing(gap, mended)}."

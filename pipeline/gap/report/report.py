@@ -78,7 +78,7 @@ def write(out: Path, found: Diagnosis, measurement: Measurement) -> Path:
 
 def summary(found: Diagnosis) -> str:
     """The verdict in some lines of text."""
-    lines = [f"{found.verdict}: {in_a_sentence(found.verdict, found.effects, found.evidence.spread)}"]
+    lines = [f"{found.verdict}: {in_a_sentence(found.verdict, found.effects, found.evidence)}"]
     if found.verdict == "insufficient_data":
         lines += [f"  {found.remaining['note']}", f"  to measure: {REQUEST[0].lower()}{REQUEST[1:]}"]
     for effect in found.effects:
@@ -89,7 +89,7 @@ def summary(found: Diagnosis) -> str:
     if found.gap is not None:
         factor, unit = found.gap.shown
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
-        lines.append(f"  gap {scores}: {closing(found.gap, bool(found.effects))}")
+        lines.append(f"  gap {scores}: {closing(found.gap, found.mended)}")
     return "\n".join(lines)
 
 

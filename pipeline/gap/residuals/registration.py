@@ -51,8 +51,9 @@ def residuals_of(measurement: Measurement) -> Residuals:
     if len(numbers) < 2:
         return found
     poses = np.stack([registered(found.part(epochs == number))[1] for number in numbers])
-    away = (poses - poses.mean(axis=0))[np.searchsorted(numbers, epochs)]
-    return replace(found, value=found.value - np.einsum("ni,ni->n", found.pose, away))
+    apart = (poses - poses.mean(axis=0))[np.searchsorted(numbers, epochs)]
+    away = np.einsum("ni,ni->n", found.pose, apart)
+    return replace(found, value=found.value - away, away=away)
 
 
 def settled(
