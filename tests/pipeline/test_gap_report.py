@@ -17,12 +17,12 @@ from pipeline.cli.main import main
 from pipeline.formats.laz import read_laz
 from pipeline.formats.measurement import Measurement, read_measurement
 from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.naming.workflow import Diagnosis, diagnose
 from pipeline.gap.report import figures, report
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.figures import gap_figure, maps_figure
-from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.report.quantities import with_std
 
 FILES = {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}

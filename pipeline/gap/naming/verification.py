@@ -49,8 +49,8 @@ class Showing:
 
     measurement: where its sensor stood; residuals: against its model, of which the rows `chosen` register; tested, learned: (n,)
     points that no step has looked at, and those that naming may; losses: what was found of them, and the pulses that it was not
-    fitted to; reference_sigma: in the observable's unit; largest: predicted sigmas by which points may be off; lower: values of the
-    model's noise that are proposed since it is too large.
+    fitted to; reference_sigma: in the observable's unit; largest: predicted sigmas by which points may be off; lower: values of
+    the model's noise that are proposed since it is too large.
     """
 
     measurement: Measurement

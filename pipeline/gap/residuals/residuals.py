@@ -61,8 +61,8 @@ class Residuals:
     point is smooth enough for a mean to make sense, and of stable ground; even: the same of any ground; pose: (n, 6) derivatives
     by translation (m) and rotation (rad) of the sensor in the wall frame; at: (n, 2) wall frame x, y of the reference's point,
     which unlike the measured one does not move with the noise, m; covariates: named (n,) arrays; index: (n,) rows of the
-    measurement's points; away: (n,) what was taken off `value` because epochs were taken from places of their own, None where they
-    were not; missing: of the pulses that were sent and should have met the wall, None where the pattern is not known;
+    measurement's points; away: (n,) what was taken off `value` because epochs were taken from places of their own, None where
+    they were not; missing: of the pulses that were sent and should have met the wall, None where the pattern is not known;
     shared_noise: predicted noise that neighbours share.
     """
 
