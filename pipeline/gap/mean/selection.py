@@ -117,6 +117,11 @@ class _Set:
         return plain
 
 
+def _weak(form: Tried | None) -> float:
+    """Score of a free form that is too weak to be said, and that a weak effect of the catalogue has to do better than; else 0."""
+    return form.score if form is not None and form.score < _LEAST_FREE_SCORE else 0.0
+
+
 def _stands_out(item: Tried, decoy: float) -> bool:
     """Whether a free form does better than mere places, of which the best scores `decoy`."""
     if item.candidate.form == SURFACE:
@@ -296,7 +301,7 @@ class MeanSearch:
             chosen.append(Chosen(form.candidate, (), self.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.tried(members)
         best, chosen = self._beyond_places(best)
-        if best.score <= empty.decoy:  # whatever it is, no effect of the catalogue says it as well as mere places do
+        if best.score <= max(empty.decoy, _weak(empty.free)):  # no effect of the catalogue says it as well
             return [], empty.tried
         return chosen, best.tried
 

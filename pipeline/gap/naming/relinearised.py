@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, Grid, harmonics, precision_of
-from pipeline.gap.mean.selection import Chosen, MeanSearch, Tried
+from pipeline.gap.mean.selection import CLASS_MARGIN, Chosen, MeanSearch, Tried
 from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, with_effects
 from pipeline.gap.naming.families import PERIODIC, families_of
 from pipeline.gap.other.spread import SpreadFound
@@ -71,6 +71,11 @@ class _Alone:
     there: Measurement
     log_likelihood: float
 
+    @property
+    def score(self) -> float:
+        """Of all points, less what the effect costs."""
+        return self.log_likelihood - (self.chosen.gain - self.chosen.score)
+
     @classmethod
     def of(cls, points: Points, first: MeanSearch, chosen: Chosen, estimate: Estimate) -> _Alone | None:
         """None where it is beyond what can be, or where the rays of many points would miss the reference with it."""
@@ -124,8 +129,19 @@ def _largest_alone(points: Points, first: MeanSearch) -> _Alone | None:
         if not found and abs(alone.log_likelihood - first.log_likelihood(points.part.value, candidate)) < _SLOPES_SERVE:
             return None
         found.append(alone)
-    likely = sorted(found, key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
-    return max((_converged(points, first, each) for each in likely), key=lambda each: each.log_likelihood, default=None)
+    ranked = sorted(found, key=lambda each: -each.log_likelihood)
+    variants = {each.chosen.candidate.name: each for each in reversed(ranked)}
+    likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
+    converged = sorted((_converged(points, first, each) for each in likely), key=lambda each: -each.score)
+    return _with_class(converged) if converged else None
+
+
+def _with_class(converged: list[_Alone]) -> _Alone:
+    """The best, with those that would do as well: slopes say so of effects that were not taken exactly only."""
+    best, *others = converged
+    near = {each.chosen.candidate.name for each in others if each.score > best.score - CLASS_MARGIN}
+    slopes = set(best.chosen.alike) - {each.chosen.candidate.name for each in others}
+    return replace(best, chosen=replace(best.chosen, alike=tuple(sorted(near | slopes))))
 
 
 def _converged(points: Points, first: MeanSearch, alone: _Alone) -> _Alone:
