@@ -30,7 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="with --identifiability: of a config's sensors"
     )
     parser.add_argument(
-        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
+        "--set",
+        action="append",
+        default=[],
+        dest="overrides",
+        metavar="KEY=VALUE",
+        help="a threshold of the diagnosis, as mean.class_margin=4 (gap.json lists them under decisions); with --identifiability "
+        "a key of the config",
     )
     parser.add_argument(
         "--reference-error",
@@ -50,10 +56,12 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
     from pipeline.formats.measurement import read_measurement
+    from pipeline.gap.decisions import read_decisions
     from pipeline.gap.naming.workflow import STEPS, diagnose
     from pipeline.gap.report.report import summary, write
     from pipeline.report.progress import shown_progress
 
+    decisions = read_decisions(arguments.overrides)
     weights = {**STEPS, "report": 2.0}
     steps = iter(weights)
     with shown_progress(quiet=arguments.quiet) as progress, ExitStack() as stage:
@@ -65,7 +73,7 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
         progress.plan(weights)
         begin_next()
         measurement = read_measurement(arguments.measurement)
-        found = diagnose(measurement, arguments.seed, begin_next)
+        found = diagnose(measurement, arguments.seed, begin_next, decisions)
         report = write(out, found, measurement)
     return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "gap.json"))
 

@@ -9,7 +9,7 @@ import numpy as np
 from gap_cases import write_scan
 
 from pipeline.formats.measurement import read_measurement
-from pipeline.gap.mean.selection import MeanSearch
+from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.residuals.registration import settled
 from scene.keyed_random import KeyedRandom
@@ -38,7 +38,7 @@ def _search(folder: Path, step_rad: float, bent: float = BENT) -> tuple[list[str
     ours = next((each.candidate for each in chosen if each.candidate.name == "range_incidence_bias"), None)
     if ours is None:
         return names, np.nan, np.nan, len(part)
-    fit = search.fit([ours])
+    fit = search.design.fit([ours])
     return names, float(fit.coefficients[-1]), float(np.sqrt(fit.covariance[-1, -1])), len(part)
 
 

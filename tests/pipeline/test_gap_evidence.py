@@ -13,7 +13,7 @@ from gap_cases import Array, Scan, smooth_noise, write_scan
 
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate
-from pipeline.gap.mean.selection import MeanSearch, Tried
+from pipeline.gap.mean.selection import Choice, Members, Tried
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.held_out import score_effects
 from pipeline.gap.naming.workflow import diagnose, few
@@ -95,13 +95,13 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) 
     assert [item.name for item in scored.failed] == ["tls.range_empirical", "tls.range_incidence_bias"]
 
 
-class _Scripted(MeanSearch):
+class _Scripted:
     """A search whose scores, by name and form ("" of an effect), are those of a script for each set of names that is known."""
 
     def __init__(self, scores: Callable[[set[str]], dict[tuple[str, str], float]]) -> None:
         self._scores = scores
 
-    def tried(self, members: tuple[Tried, ...]) -> tuple[Tried, ...]:
+    def tried(self, members: Members) -> tuple[Tried, ...]:
         known = {member.name for member in members}
         found = [
             Tried(name, bool(form), score, score, Candidate(name, np.zeros((1, 1)), lambda _: {}, (), {}, bool(form), form))
@@ -113,8 +113,14 @@ class _Scripted(MeanSearch):
     def p_value(self, score: float) -> float:
         return 0.001
 
-    def _kin(self, form: Tried) -> set[str]:
+    def score(self, members: Members) -> float:
+        return sum(member.score for member in members)
+
+    def kin(self, form: Tried) -> set[str]:
         return {form.name}
+
+    def may_be_the_reference(self, members: Members, form: Tried) -> bool:
+        return False
 
 
 @pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (35.0, {"collimation"}), (45.0, set())])
@@ -124,7 +130,7 @@ def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) ->
     def scores(known: set[str]) -> dict[tuple[str, str], float]:
         return {("collimation", ""): 40.0, ("range_scale", ""): 28.0 if known else 18.0, ("place along 30", "wave"): places}
 
-    chosen, _ = _Scripted(scores).select()
+    chosen, _ = Choice(_Scripted(scores)).select()
     assert {each.candidate.name for each in chosen} == named
 
 
@@ -136,5 +142,5 @@ def test_an_effect_beside_a_free_form_says_more_than_a_form_of_two_covariates(su
         form = 70.0 if "camera_shift" in known else 60.0
         return {("camera_shift", ""): 20.0, ("radius", "smooth"): form, ("image_x and image_y", "surface"): surface}
 
-    chosen, _ = _Scripted(scores).select()
+    chosen, _ = Choice(_Scripted(scores)).select()
     assert {each.candidate.name for each in chosen} == named

@@ -15,8 +15,8 @@ from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_challenge.strength import Target
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanModel, fitted
-from pipeline.gap.mean.selection import MeanSearch
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.naming.held_out import score_effects
@@ -77,8 +77,8 @@ def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> Non
     rng = np.random.default_rng(1)
     faint = 1e-7 * (bias.columns[:, :1] + rng.standard_normal((len(part), 1)))
     precision = np.concatenate([np.zeros(6), [25.0]])
-    search = MeanSearch(replace(part, pose=np.concatenate([part.pose, faint], axis=1)), families, KeyedRandom(1), precision)
-    found = search.fit([bias])
+    design = Design.of(replace(part, pose=np.concatenate([part.pose, faint], axis=1)), families, KeyedRandom(1), precision)
+    found = design.fit([bias])
     assert abs(found.coefficients[6]) < 0.01
     assert found.covariance[6, 6] == pytest.approx(0.2**2, rel=1e-3)
     assert found.coefficients[7] == pytest.approx(0.01, abs=5 * np.sqrt(found.covariance[7, 7]))

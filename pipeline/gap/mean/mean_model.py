@@ -11,6 +11,7 @@ every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each can
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,10 +85,11 @@ class MeanModel:
     def _at(self, length: int, ratio: float) -> Covariance:
         return Covariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
 
-    def narrowed(self, designs: list[Projected], value: Projected) -> tuple[list[Covariance], list[int]]:
+    def narrowed(self, designs: list[Projected], value: Projected) -> tuple[MeanModel, list[Covariance], list[int]]:
         """Covariances under which the value is likely, whichever of the designs is fitted (the least and the most of them).
 
-        Bases that none of them needs are forgotten: returns also which are kept, for `Projected.kept` of what there is already.
+        Returns the model without the bases that none of them needs, those covariances, and which bases are kept, for
+        `Projected.kept` of what there is already.
         """
         ratios = [0.0, *map(float, _RATIOS)]
         tops = np.empty((len(designs), len(self._bases)), dtype=int)
@@ -98,13 +100,14 @@ class MeanModel:
                 found = [normal.at(self._at(basis, ratio)).log_likelihood for ratio in ratios]
                 tops[row, basis], heights[row, basis] = int(np.argmax(found)), max(found)
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
-        self._bases = [self._bases[basis] for basis in kept]
+        narrower = copy(self)
+        narrower._bases = [self._bases[basis] for basis in kept]
         chosen: list[Covariance] = []
         for number, basis in enumerate(kept):
             low, high = max(tops[:, basis].min() - 1, 0), min(tops[:, basis].max() + 1, len(ratios) - 1)
             places = np.unique(np.rint(np.linspace(low, high, min(_MOST_RATIOS, high - low + 1))).astype(int))
             chosen += [self._at(number, ratios[place]) for place in places]
-        return [*dict.fromkeys(chosen)], kept
+        return narrower, [*dict.fromkeys(chosen)], kept
 
     @property
     def fine(self) -> list[Covariance]:

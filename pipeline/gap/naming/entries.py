@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import HARMONICS, SURFACE, Candidate
 from pipeline.gap.mean.selection import Chosen
 from pipeline.gap.other.locking import Locking
@@ -38,8 +39,6 @@ _FITTED = 1.1
 By development cases, of whose 61 intervals of 90 % without it 52 held the truth."""
 _WEAKEST = 20
 """Spacings of the weakest powers that tell how near they come to a limit."""
-_BEYOND = 100.0
-"""Times its typical size, an effect explains nothing: no instrument is so far out."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def is_possible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
         return False
     effect = with_effects(model, [entry]).effects[-1]
     sizes = effect.typical_sizes() if effect.catalogue else {}
-    return all(abs(getattr(effect, key)) <= _BEYOND * abs(typical) for key, typical in sizes.items())
+    return all(abs(getattr(effect, key)) <= decided().mean.largest_size * abs(typical) for key, typical in sizes.items())
 
 
 def from_comb(comb: Comb, part: Residuals) -> Named:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import Candidate, Grid, free_forms, places, surface_form
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.naming.entries import PLANES
@@ -16,8 +17,6 @@ from sensors.effects import EFFECTS, effect_of
 PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
 """Sines, and along what: an error that repeats but is no sine is not theirs."""
 _NOT_FREE = ("edge_step", "line", "disparity_fraction")
-_LARGEST = 20.0
-"""Standard deviation of an effect's size before there are data, in typical sizes."""
 
 
 def believes(measurement: Measurement, name: str) -> bool:
@@ -51,4 +50,4 @@ def _with_precision(candidate: Candidate | Grid) -> Candidate | Grid:
         typical.get(key, first) / max(abs(candidate.parameters(unit)[key]), 1e-300) if not key.startswith("phase") else first
         for key, unit in zip(candidate.names, units, strict=True)
     ]
-    return replace(candidate, precision=1 / (_LARGEST * np.array(sizes)) ** 2)
+    return replace(candidate, precision=1 / (decided().mean.typical_sizes * np.array(sizes)) ** 2)

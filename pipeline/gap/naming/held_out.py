@@ -9,19 +9,14 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.naming.entries import Named, with_effects
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.registration import pose_of, settled
-from pipeline.gap.residuals.residuals import OUTLIER, BoolArray, Residuals
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.mesh import FloatArray
 
 _POINTS_PER_PATCH = 30.0
-_LARGEST = 5.0
-"""Deviations are cut off at so many sigmas: an outlier has no more to say."""
-_SIGMAS = 2.5
-"""By how many standard deviations the gain of a true effect may chance to lie below what the training blocks let expect."""
-_MOST_LOST = 1.5
-"""What chance may take at the most: held-out blocks that are less likely by more with an effect speak against it."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +80,7 @@ def _gain(
 def _usual(value: FloatArray, sigma: FloatArray) -> BoolArray:
     """(n,) which residuals are no outliers: debris, and what fell, would move the mean of a patch."""
     z = value / sigma
-    return np.asarray(np.abs(z) < OUTLIER * max(nmad(z), 1.0))
+    return np.asarray(np.abs(z) < decided().points.outlier * max(nmad(z), 1.0))
 
 
 def _least(expected: float) -> float:
@@ -94,7 +89,7 @@ def _least(expected: float) -> float:
     The gain of a true effect, half a difference of two chi^2, has about twice its expectation as variance.
     """
     likely = max(expected, 0.0)
-    return max(min(0.0, likely - _SIGMAS * float(np.sqrt(2 * likely))), -_MOST_LOST)
+    return max(min(0.0, likely - decided().held_out.sigmas * float(np.sqrt(2 * likely))), -decided().held_out.most_lost)
 
 
 def _value(
@@ -120,6 +115,6 @@ def _log_score(value: FloatArray, sigma: FloatArray, patch: NDArray[np.int64], r
     total = np.bincount(patch, weight)
     mean = np.bincount(patch, weight * value) / total
     variance = 1 / total + reference_sigma**2
-    left = np.clip((value - mean[patch]) / sigma, -_LARGEST, _LARGEST)
+    left = np.clip((value - mean[patch]) / sigma, -decided().held_out.clip, decided().held_out.clip)
     among = -0.5 * np.sum(left**2) - np.sum(np.log(sigma)) + 0.5 * np.sum(np.log(1 / total))
     return float(among - 0.5 * np.sum(mean**2 / variance + np.log(variance)))

@@ -8,7 +8,8 @@ from typing import Any
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.mean.candidates import PLACE
-from pipeline.gap.mean.selection import MeanSearch, Tried
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.entries import Named, from_comb, from_locking, from_mean, from_spread, within_bounds
 from pipeline.gap.naming.families import believes, families_of
 from pipeline.gap.naming.relinearised import Points, beyond, followed_up, noisier, weighed
@@ -94,9 +95,10 @@ def name_effects(
     first = MeanSearch(weighed(part, spread, scale), families, random)
     found = followed_up(points, first)
     wrong = beyond(measurement, found.estimates, found.at)
-    left = found.search.without(found.beside)
+    design = found.search.design
+    left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
-        spread, spread_tried = _spread(measurement, found.at, found.search.cells, left, random, left_out)
+        spread, spread_tried = _spread(measurement, found.at, design.cells, left, random, left_out)
     if not spread and isinstance(measurement.model, StereoModel) and (_NODES, False) not in left_out:
         nodes = find_nodes(found.at, left, measurement.model, random)
         spread = [] if nodes is None else [nodes]
@@ -105,8 +107,8 @@ def name_effects(
     moving = [from_mean(each, found.at) for each in found.estimates]
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
-    names, cosines, survival = first.identifiability()
-    share = 1.0 if spread else share_of_spread(found.at, found.search.cells, left)
+    names, cosines, survival = first.design.identifiability()
+    share = 1.0 if spread else share_of_spread(found.at, design.cells, left)
     notes = (*part.notes, *_words(left_out))
     p_value = found.search.p_value(found.tried[0].score) if found.tried else None
     alone = first.tried(()) if moving else ()
@@ -115,7 +117,7 @@ def name_effects(
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     tried = found.chosen[0].tried if found.chosen else found.tried
     shown = tuple(item for item in tried if not item.name.startswith(PLACE))
-    sigma = found.search.reference_sigma(found.beside)
+    sigma = design.reference_sigma([each.candidate for each in found.beside])
     return named, Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma)
 
 

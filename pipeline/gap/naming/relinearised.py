@@ -8,22 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, Grid, harmonics, precision_of
-from pipeline.gap.mean.selection import CLASS_MARGIN, Chosen, MeanSearch, Tried
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.mean.selection import Chosen, Tried
 from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, with_effects
 from pipeline.gap.naming.families import PERIODIC, families_of
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.registration import registered, settled
-from pipeline.gap.residuals.residuals import OUTLIER, BoolArray, Residuals
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects import effect_of
 from sensors.effects.matching_noise import MatchingNoise
 
-_SLOPES_SERVE = 10.0
-"""Log-likelihood by which slopes may be wrong on an effect for them to serve."""
-_LEAST_KEPT = 0.9
-"""Share of the points whose rays must still meet the reference with an effect."""
 _MOST_CONVERGED, _ROUNDS, _CONVERGED = 3, 4, 1.0
 """Effects whose values are sought exactly, by so many rounds, while the log-likelihood rises by so much."""
 
@@ -83,12 +81,14 @@ class _Alone:
             return None
         there, found = _with(points, [estimate])
         rough, _, scale = registered(found)
-        largest = OUTLIER * scale * found.sigma
+        largest = decided().points.outlier * scale * found.sigma
         value, kept = np.zeros(len(points.part)), _kept(found, points.part)
-        if kept.mean() < _LEAST_KEPT:
+        if kept.mean() < decided().points.kept:
             return None
         value[kept] = np.where(found.smooth, np.clip(rough, -largest, largest), 0.0)
-        return cls(chosen, estimate, _at_points(found, points.part), there, first.log_likelihood(value, estimate.candidate))
+        return cls(
+            chosen, estimate, _at_points(found, points.part), there, first.design.log_likelihood(value, estimate.candidate)
+        )
 
     def better(self, points: Points, first: MeanSearch) -> _Alone | None:
         """With its values moved by the slopes here."""
@@ -126,7 +126,8 @@ def _largest_alone(points: Points, first: MeanSearch) -> _Alone | None:
         alone = _Alone.of(points, first, chosen, estimate)
         if alone is None:
             continue
-        if not found and abs(alone.log_likelihood - first.log_likelihood(points.part.value, candidate)) < _SLOPES_SERVE:
+        by_slopes = first.design.log_likelihood(points.part.value, candidate)
+        if not found and abs(alone.log_likelihood - by_slopes) < decided().mean.slopes_serve:
             return None
         found.append(alone)
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
@@ -139,7 +140,7 @@ def _largest_alone(points: Points, first: MeanSearch) -> _Alone | None:
 def _with_class(converged: list[_Alone]) -> _Alone:
     """The best, with those that would do as well: slopes say so of effects that were not taken exactly only."""
     best, *others = converged
-    near = {each.chosen.candidate.name for each in others if each.score > best.score - CLASS_MARGIN}
+    near = {each.chosen.candidate.name for each in others if each.score > best.score - decided().mean.class_margin}
     slopes = set(best.chosen.alike) - {each.chosen.candidate.name for each in others}
     return replace(best, chosen=replace(best.chosen, alike=tuple(sorted(near | slopes))))
 
@@ -184,8 +185,8 @@ def weighed(part: Residuals, spread: list[SpreadFound], scale: float) -> Residua
 
 
 def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
-    candidates, fit = search.refined([item.candidate for item in chosen])
-    places = search.split(np.arange(len(fit.coefficients)), candidates)
+    candidates, fit = search.design.refined([item.candidate for item in chosen])
+    places = search.design.split(np.arange(len(fit.coefficients)), candidates)
     return [
         Estimate(item, candidate, fit.coefficients[place], fit.covariance[np.ix_(place, place)])
         for item, candidate, place in zip(chosen, candidates, places, strict=True)
@@ -220,7 +221,7 @@ def _again(
         alone,
     )
     chosen, tried = search.select()
-    fit = search.refined([item.candidate for item in chosen])[1]
+    fit = search.design.refined([item.candidate for item in chosen])[1]
     kept, start = [], at.pose.shape[1]
     for each, matrix in zip(known, columns, strict=True):
         place = slice(start, start := start + matrix.shape[1])
@@ -250,7 +251,7 @@ def _without_sines(estimates: list[Estimate]) -> list[Estimate]:
 def _at_points(found: Residuals, part: Residuals) -> Residuals:
     """What was found at the points of a part, where the surface is smooth there too and they are no outliers."""
     rough, _, scale = registered(found)
-    good = found.smooth & (np.abs(rough) < OUTLIER * scale * found.sigma)
+    good = found.smooth & (np.abs(rough) < decided().points.outlier * scale * found.sigma)
     place = np.full(int(max(found.index.max(), part.index.max())) + 1, -1)
     place[found.index[good]] = np.flatnonzero(good)
     rows = place[part.index]

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.gap.decisions import decided
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verify import Gap
 from sensors.model import StereoModel, TlsModel
 
-LEAST_P = 0.01
-"""Of what remains: at or below it the model is rejected."""
 VERDICTS = {
     "no_gap": "The measurement agrees with the model: nothing was found that the model does not hold.",
     "named": "One effect explains where measurement and model disagree.",
@@ -43,7 +42,7 @@ class Evidence:
     @property
     def rejects(self) -> bool:
         """Whether what remains is more than chance would give."""
-        return self.p_value is not None and self.p_value <= LEAST_P
+        return self.p_value is not None and self.p_value <= decided().verdict.least_p
 
     @property
     def agrees(self) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
 from pipeline.gap.residuals.registration import moved
@@ -32,7 +33,6 @@ _DRAWS = 8
 _MOST_POINTS = 30_000
 _POINTS_PER_PATCH = 30.0
 _FEWEST_POINTS = 8
-_MOST_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ class Gap:
     @property
     def above_floor(self) -> bool:
         """Whether before lies above the floor by more than the uncertainty of that."""
-        return self.before - self.floor > _MOST_SIGMAS * self.floor_error
+        return self.before - self.floor > decided().verdict.gap_sigmas * self.floor_error
 
     @property
     def uncertain(self) -> bool:
         """Whether before - floor is within its own uncertainty, and before - after, scored on the same patches, within its."""
-        return not self.above_floor and self.before - self.after <= _MOST_SIGMAS * self.error
+        return not self.above_floor and self.before - self.after <= decided().verdict.gap_sigmas * self.error
 
     def to_dict(self) -> dict[str, Any]:
         """As gap.json holds it."""

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.formats.measurement import Measurement
 from pipeline.formats.measurement_checks import check_near, check_noise
+from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.entries import Named, from_missing, from_shape, from_tails, only_within_bounds, with_effects
 from pipeline.gap.naming.families import believes
@@ -30,7 +31,7 @@ from pipeline.gap.other.stereo_shapes import find_shapes
 from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
 from pipeline.gap.residuals.changes import SceneChange, find_changes
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
-from pipeline.gap.residuals.residuals import OUTLIER, BoolArray, Residuals
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
 from pipeline.gap.residuals.tls_residuals import missing_returns, with_order
 from scene.keyed_random import KeyedRandom
@@ -42,16 +43,13 @@ from sensors.model import StereoModel, TlsModel
 
 STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
 """The steps of `diagnose` and about what each takes, s."""
-FEWEST_POINTS = 800
-_FEWEST_EPOCHS = 3
-"""From so many epochs on the last is held out as a whole."""
 _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
-_LEFT_OVER = 0.02
-"""Of the gain of an empirical term on the mean, what a spread gains that is only the part of the form that the term misses."""
-_EARLY_SIGMAS, _EARLY_M = 8.0, 0.5
 _NOT_FREE = {"tls": ("edge_step", "line"), "stereo": ("edge_step", "incidence")}
 """Covariates by sensor that an empirical term cannot be a function of."""
+
+
+_USUAL = Decisions()
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class Diagnosis:
     """What was found.
 
     held_out: (n,) points never used in naming; before, after: (n,) residuals with registration taken off, in the observable's
-    unit; pose: (6,) shift (m) and turn (rad) of the sensor, wall frame; timings: s by step.
+    unit; pose: (6,) shift (m) and turn (rad) of the sensor, wall frame; timings: s by step; decisions: what was decided by.
     """
 
     verdict: str
@@ -78,6 +76,7 @@ class Diagnosis:
     identifiability: dict[str, Any]
     seconds: float
     timings: dict[str, float]
+    decisions: Decisions = _USUAL
 
     @property
     def evidence(self) -> Evidence:
@@ -90,12 +89,18 @@ class Diagnosis:
         return bool(self.effects or self.remaining["lower_noise"])
 
 
-def diagnose(measurement: Measurement, seed: int = 1, progress: Callable[[str], None] | None = None) -> Diagnosis:
+def diagnose(
+    measurement: Measurement,
+    seed: int = 1,
+    progress: Callable[[str], None] | None = None,
+    decisions: Decisions = _USUAL,
+) -> Diagnosis:
     """Find what separates the measurement from its model, name it, add it and measure the gap again.
 
-    progress: called with the name of each step of `STEPS` that is done.
+    progress: called with the name of each step of `STEPS` that is done; decisions: the thresholds to decide by.
     """
-    with threadpool_limits(1, "blas"):  # the same sums on any number of threads, and none that wait for each other
+    # the same sums on any number of threads, and none that wait for each other
+    with deciding(decisions), threadpool_limits(1, "blas"):
         return _diagnose(measurement, _Clock(progress), KeyedRandom(seed, ("gap",)))
 
 
@@ -111,7 +116,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     if measurement.sensor == "tls":
         plain = replace(plain, missing=missing_returns(there, plain))
     clock.lap("residuals")
-    if plain.smooth.sum() < FEWEST_POINTS:
+    if plain.smooth.sum() < decided().points.fewest:
         return _insufficient(measurement, plain, clock)
     explained = _named(there, plain, held_points, random)
     state, named, naming = explained.state, explained.named, explained.naming
@@ -129,7 +134,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         learned=state.shown & ~state.held_out,
         losses=losses,
         reference_sigma=naming.reference_sigma,
-        largest=OUTLIER * state.scale,
+        largest=decided().points.outlier * state.scale,
         random=random,
         lower=lower_noise(there.model, naming.share),
     )
@@ -155,13 +160,14 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,
+        decisions=decided(),
     )
 
 
 def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
     """(n,) points of the last epoch where there are enough to learn from without it."""
     last = int(epochs.max(initial=0))
-    return epochs == last if last + 1 >= _FEWEST_EPOCHS else np.zeros(len(epochs), dtype=bool)
+    return epochs == last if last + 1 >= decided().points.fewest_epochs else np.zeros(len(epochs), dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -198,7 +204,7 @@ class _State:
         rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
         held_out = held_points[residuals.index]
-        usable = residuals.smooth & ~changed & (np.abs(rough) < OUTLIER * scale * residuals.sigma)
+        usable = residuals.smooth & ~changed & (np.abs(rough) < decided().points.outlier * scale * residuals.sigma)
         chosen = _thinned(np.flatnonzero(usable & ~held_out))
         return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
 
@@ -274,7 +280,8 @@ def _confirmed(there: Measurement, state: _State, named: list[Named], reference_
     scored = score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
     words = [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
     described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
-    left = [item for item in scored.named if item.spreads and item.gain < _LEFT_OVER * max(described, default=0.0)]
+    least = decided().held_out.left_over * max(described, default=0.0)
+    left = [item for item in scored.named if item.spreads and item.gain < least]
     words += [f"{item.name} dropped: so much is left over by the empirical term" for item in left]
     steady = _thinned(np.flatnonzero(fit & ~state.held_out))
     kept = [item for item in scored.named if item not in left]
@@ -364,11 +371,12 @@ def _remaining(p_value: float | None, notes: list[str], spread: float = 1.0, low
 
 
 def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> Diagnosis:
-    note = f"{int(residuals.smooth.sum())} points on smooth parts of the reference and stable ground, {FEWEST_POINTS} are needed"
+    count, least = int(residuals.smooth.sum()), decided().points.fewest
+    note = f"{count} points on smooth parts of the reference and stable ground, {least} are needed"
     empty = np.zeros(len(residuals))
     return Diagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, np.zeros(6), measurement.model,
-        None, (), (), _remaining(None, [note]), {"names": [], "cosines": [], "survival": []}, clock.total, clock.laps,
+        None, (), (), _remaining(None, [note]), {"names": [], "cosines": [], "survival": []}, clock.total, clock.laps, decided(),
     )  # fmt: skip
 
 
@@ -379,7 +387,11 @@ def _missing(measurement: Measurement, state: _State) -> tuple[MissingFound, Boo
     if missing is None or any(believes(measurement, name) for name in LOSSES):
         return None
     held_out = held_out_blocks(missing.at, state.cells.side_m)
-    early = residuals.smooth & ~state.changed & (state.rough < -np.maximum(_EARLY_SIGMAS * residuals.sigma, _EARLY_M))
+    early = (
+        residuals.smooth
+        & ~state.changed
+        & (state.rough < -np.maximum(decided().losses.early_sigmas * residuals.sigma, decided().losses.early))
+    )
     drops = isolated(residuals.at, early)
     found = find_missing(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)

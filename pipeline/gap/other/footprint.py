@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scan_simulation import mean_model, simulate_ranges
@@ -20,10 +21,6 @@ _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
 _FINER = (1.12, 1.03)
 _MOST_POINTS = 30_000
-_FEWEST = 20
-_BLOCK_SIGMAS = 2.0
-"""By how much the blocks have to agree: four of four. No other effect puts points between the two sides of an edge: of 60
-development cases without a footprint none came to half of the gain that is asked for, or to 1.9."""
 _PROFILE = 0.12
 """Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
 
@@ -38,7 +35,7 @@ def find_footprint(
     some = np.flatnonzero(~held_out)[thin]
     wide = _moved(measurement, residuals, some, "mean", _DIVERGENCES_RAD[-1])
     some = some[np.abs(wide) > sigma[some]]
-    if len(some) < _FEWEST:
+    if len(some) < decided().shapes.footprint_fewest:
         return []
     blocks = Blocks(Blocks.over(residuals.at).number[some])
 
@@ -50,7 +47,7 @@ def find_footprint(
 
     tops = {mode: refined(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(tops, key=lambda each: float(gains(each, tops[each]).sum()))
-    gain = blocks.tested(gains(mode, tops[mode]), _BLOCK_SIGMAS)
+    gain = blocks.tested(gains(mode, tops[mode]), decided().shapes.footprint_block_sigmas)
     if gain is None:
         return []
     divergence = refined(partial(gains, mode), [tops[mode]], _FINER)

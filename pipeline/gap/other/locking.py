@@ -13,22 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j1, jv
 
+from pipeline.gap.decisions import decided
 from scene.mesh import FloatArray
 
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 _SCALE_UNKNOWN = 0.03
 """The rectification in which the disparities were found is not part of a measurement: its principal distance may be another."""
 _BESIDE = np.concatenate([np.linspace(0.72, 0.9, 10), np.linspace(1.1, 1.28, 10)])
-_FEWEST_CYCLES = 6.0
 _LARGEST = 0.6
 """Amplitude in matched pixels."""
-_SHAPE = 1.5
-"""How much more than the reference itself the measured disparities must crowd."""
-_MOST_BLUR = 0.35
 _MULTIPLES = np.arange(1, 5)
-_SMALLEST_P = 1e-4
-_ALIKE, _FITS = 6.0, 20.0
-"""Difference of chi^2 (of four values) within which two amplitudes fit alike, and the most with which one fits."""
 _FOLDING, _FAR, _NO_SINE = 1 / (2 * np.pi), 0.3, 0.02
 _MOST_POINTS = 60_000
 
@@ -54,20 +48,20 @@ def find_locking(disparity: FloatArray, reference: FloatArray) -> Locking | None
     reach = float(np.ptp(np.quantile(some, [0.02, 0.98])))
     best: tuple[float, float, complex, int] | None = None
     for reduction in _REDUCTIONS:
-        if reach < _FEWEST_CYCLES * reduction:
+        if reach < decided().locking.fewest_cycles * reduction:
             continue
         tried = np.arange((1 - _SCALE_UNKNOWN) / reduction, (1 + _SCALE_UNKNOWN) / reduction, 0.2 / reach)
         means, shape = np.abs(_means(some, tried)), np.abs(_means(known, np.concatenate([tried, _BESIDE / reduction])))
         frequency = _refined(some, float(tried[int(np.argmax(means))]), 0.2 / reach)
         mean = complex(_means(some, np.array([frequency]))[0])
-        gain = len(some) * max(abs(mean) - _SHAPE * float(shape.max()), 0.0) ** 2
+        gain = len(some) * max(abs(mean) - decided().locking.crowding * float(shape.max()), 0.0) ** 2
         if best is None or gain > best[0]:
             best = gain, frequency, mean, len(tried)
     if best is None:
         return None
     gain, frequency, mean, count = best
     by_chance = min(1.0, len(_REDUCTIONS) * count * float(np.exp(-gain)))
-    if by_chance > _SMALLEST_P:
+    if by_chance > decided().locking.significance:
         return None
     share, error = _amplitude(np.array([abs(np.exp(2j * np.pi * k * frequency * some).mean()) for k in _MULTIPLES]), len(some))
     phase = float(np.angle(-np.conj(mean) * np.sign(j1(2 * np.pi * share))))
@@ -82,7 +76,7 @@ def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
         predicted = harmonics * np.exp(-2 * (np.pi * _MULTIPLES * blur[None, :, None]) ** 2)
         return np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
 
-    shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, _MOST_BLUR, 60)
+    shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, decided().locking.most_blur, 60)
     coarse = square(shares, blurs)
     row = _plausible(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)
     for width in (0.01, 0.002):
@@ -94,7 +88,7 @@ def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
     best = float(coarse.min())
     # the spread by curvature, the blur free
     around = shares[row] + np.linspace(-0.02, 0.02, 201)
-    profile = square(around, np.linspace(0.0, _MOST_BLUR, 200)).min(axis=1)
+    profile = square(around, np.linspace(0.0, decided().locking.most_blur, 200)).min(axis=1)
     weight = np.exp(-0.5 * (profile - profile.min()) / max(best, 1.0))
     weight /= weight.sum()
     mean = float(weight @ around)
@@ -108,11 +102,11 @@ def _plausible(shares: FloatArray, square: FloatArray, whole: float) -> int:
     has to fit well, and one beyond `_FAR` gives way to a small one that leaves as little as a matcher's curve is no sine.
     """
     lowest = (square <= np.append(square[1:], np.inf)) & (square <= np.append(np.inf, square[:-1]))
-    rows = np.flatnonzero(lowest & (square < square.min() + _ALIKE))
+    rows = np.flatnonzero(lowest & (square < square.min() + decided().locking.alike))
     unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
     if len(unfolded):
         small = int(unfolded[np.argmin(square[unfolded])])
-        if square.min() > _FITS or (shares[rows[0]] > _FAR and square[small] < _NO_SINE * whole):
+        if square.min() > decided().locking.fits or (shares[rows[0]] > _FAR and square[small] < _NO_SINE * whole):
             return small
     return int(rows[0])
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logit, ndtr
 
+from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import BoolArray, Missing
 from scene.mesh import FloatArray
@@ -18,15 +19,9 @@ from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.precipitation import Precipitation
 
 LOSSES = tuple(effect.tag() for effect in catalogue("tls") if effect.shows_in == ShowsIn.RETURNS)
-_LEAST_GAIN = 9.0
 _PULSES_PER_PATCH = 60.0
-_ABRUPT = 0.7
-_SCATTERED = 0.8
-_FREE_MARGIN, _FREE_RATIO = 6.0, 1.5
-"""A free form must score as much more than the catalogue's effects."""
-_STRIPS, _AGREEMENT = 8, 0.85
-"""Strips across a sector that must agree on its losses, and how well (1: each gains as much as any other). Of 35 cases without
-losses by direction the highest is 0.73, of 3 sectors the lowest 0.96 (development seeds 7 to 9)."""
+_STRIPS = 8
+"""Across a sector, that must agree on its losses."""
 _DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
 """What losses may depend on for no reason of the catalogue (range, incidence and power have theirs), and what goes across it."""
 _BINS = 16
@@ -101,11 +96,12 @@ def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, inte
         limit = replace(limit, score=-np.inf)
     best, other = (limit, rain) if limit.score >= rain.score else (rain, limit)
     free = _free(losses, missing.covariates)
-    if free.score > _FREE_RATIO * max(best.score, 0.0) + _FREE_MARGIN and _strips_agree(missing, best, free, fit):
+    by = decided().losses
+    if free.score > by.free_ratio * max(best.score, 0.0) + by.free_margin and _strips_agree(missing, best, free, fit):
         best = free
     sureness = 1 / _clustering(lost[fit], best.chance[fit], missing.at[fit])
     best = replace(best, gain=best.gain * sureness, score=best.score * sureness)
-    if best.score < _LEAST_GAIN:
+    if best.score < decided().losses.least_gain:
         return None
     return replace(
         best,
@@ -120,7 +116,7 @@ def isolated(at: FloatArray, early: BoolArray) -> int:
     patch, count = patches(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1
     anywhere = number * (1 - (1 - 1 / number) ** count)
-    return count if len(np.unique(patch[early])) >= _SCATTERED * anywhere else 0
+    return count if len(np.unique(patch[early])) >= decided().losses.scattered * anywhere else 0
 
 
 def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
@@ -138,7 +134,7 @@ def _strips_agree(missing: Missing, known: MissingFound, free: MissingFound, fit
     gain = np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p))
     strip = np.searchsorted(np.quantile(across, np.linspace(0, 1, _STRIPS + 1)[1:-1]), across)
     sums = np.bincount(strip, gain, _STRIPS)
-    return float(sums.sum()) > _AGREEMENT * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
+    return float(sums.sum()) > decided().losses.agreement * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
 
 
 def _is_cut(intensity: FloatArray) -> bool:
@@ -149,7 +145,7 @@ def _is_cut(intensity: FloatArray) -> bool:
     """
     ordered = np.sort(np.log(np.maximum(intensity, 1e-12)))
     low, middle, high = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.0005, 0.005, 0.01))
-    return (middle - low) < _ABRUPT * (high - low)
+    return (middle - low) < decided().losses.abrupt * (high - low)
 
 
 def _limit(losses: Losses, log_power: FloatArray) -> MissingFound:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.gap.decisions import decided
 from scene.mesh import FloatArray
 
 _BIN_M = 1e-5
 _SMALLEST_STEP_M, _LARGEST_STEP_M = 5e-5, 0.05
-_STRONG = 0.2
-"""Mean resultant length of the ranges' phases that a comb has and noise never."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ def find_comb(ranges: FloatArray) -> Comb | None:
     strength = np.abs(np.fft.rfft(counts, size)) / len(ranges)
     frequency = np.arange(len(strength)) / (size * _BIN_M)
     allowed = (frequency > 1 / _LARGEST_STEP_M) & (frequency < 1 / _SMALLEST_STEP_M)
-    candidates = np.flatnonzero(allowed & (strength > _STRONG))
+    candidates = np.flatnonzero(allowed & (strength > decided().quantization.strong))
     if not len(candidates):
         return None
     first = candidates[0]  # the fundamental; its multiples come later
@@ -44,7 +43,7 @@ def find_comb(ranges: FloatArray) -> Comb | None:
     peak = first + int(np.argmax(strength[near]))
     step = _refined(ranges, 1 / float(frequency[peak]), reach)
     coherence = float(np.abs(np.exp(2j * np.pi * ranges / step).mean()))
-    return Comb(step, 1e-4 * step**2 / reach, coherence) if coherence > _STRONG else None
+    return Comb(step, 1e-4 * step**2 / reach, coherence) if coherence > decided().quantization.strong else None
 
 
 def _refined(ranges: FloatArray, step: float, reach: float) -> float:

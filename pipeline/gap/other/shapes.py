@@ -8,15 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import BoolArray
 from scene.mesh import FloatArray
 from sensors.effects.base import Effect
 
-_LEAST_GAIN, _BLOCK_SIGMAS = 30.0, 3.0
-"""Total gain, and its ratio to that of the blocks' sums with signs drawn at random."""
-_MOST = 3.0
-"""What one point may say at the most where blocks are asked to agree."""
 _STRAY = 1e-3
 _SLACK = 0.15
 """Share of what an effect adds by which its height on the reference may be off."""
@@ -54,11 +51,12 @@ class Blocks:
         """Gains (n,) by block."""
         return np.asarray(np.bincount(self.number, gains))
 
-    def tested(self, gains: FloatArray, least_sigmas: float = _BLOCK_SIGMAS) -> float | None:
+    def tested(self, gains: FloatArray, least_sigmas: float | None = None) -> float | None:
         """Total of gains (n,), None where they do not convince: blocks all over the wall have to agree."""
-        total, sums = float(gains.sum()), self.sums(np.clip(gains, -_MOST, _MOST))
+        by = decided().shapes
+        total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_of_a_point, by.most_of_a_point))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
-        if total < _LEAST_GAIN or sigmas < least_sigmas:
+        if total < by.least_gain or sigmas < (by.block_sigmas if least_sigmas is None else least_sigmas):
             return None
         return total
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
+from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import Cells, block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.keyed_random import KeyedRandom
@@ -20,32 +21,14 @@ from sensors.effects import catalogue
 from sensors.effects.base import Effect, ShowsIn
 
 DRAWS = 1999
-_ALPHA = 0.004
-_LEAST_GAIN = 6.0
-_LEAST_EXCESS = 0.04
-"""Added variance, as a share of the model's, below which the reference's own small errors may be meant."""
-_LEAST_BETWEEN = 0.75
-"""Share of the added variance by which neighbours must differ: an error of the reference, correlated over metres, moves both."""
-_LEAST_SHARE = 0.9
-"""Of the predicted spread: less is worth a word."""
-_CLIP = 4.5
 _LEAST_LEFT = 0.3
 """Share of a point's variance that its cell's plane must leave."""
-_CLASS_MARGIN = 5.0
-"""Scores within this of the best belong to its class: more than for the mean, as a few steep blocks decide. In three development
-scans the right one was 9 to 15 ahead of its nearest, and that by 1.0 to 1.4 times what the blocks' sums scatter."""
-_FREE_MARGIN, _FREE_GAIN, _FREE_BLOCK_SIGMAS = 6.0, 15.0, 2.0
-_SECOND_GAIN = 3.0
 _BINS = 8
-_FAR, _MOST_FAR, _CUT = 4.0, 0.004, 12.0
-"""Share of residuals beyond so many sigmas: up to 0.0016 in development cases without an effect, 0.02 with 3 % of outliers."""
-_ONE_BLOCK = 0.2
-"""Of the far residuals, the share that one block of the wall may have: more is a change of the scene."""
+_CUT = 12.0
+"""Sigmas at which a far residual is cut off."""
 _HIGHEST = 0.999
 """Quantile of a form of the variance beyond which it is held."""
-_OF_A_TRIAL = 0.5
-"""Cost of a value of which some are tried."""
-_ROUNDS, _BLOCK_SIGMAS = 25, 3.0
+_ROUNDS = 25
 
 
 @dataclass(frozen=True)
@@ -142,7 +125,7 @@ def _candidate(effect: type[Effect], geometry: Any, fixed: dict[str, float]) -> 
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
     columns = np.minimum(columns, np.quantile(columns, _HIGHEST, axis=0))
-    cost = len(sizes) + _OF_A_TRIAL * len(fixed)
+    cost = len(sizes) + decided().spread.cost_of_a_trial * len(fixed)
     return SpreadCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), cost, fixed)
 
 
@@ -160,7 +143,7 @@ def find_spread(
     for again in (True, False):
         # noisy points move a cell's plane, and with that what its quiet points show, unless they have the weight they deserve
         z = standardised(weighed, cells, value)
-        kept = np.isfinite(z) & (np.abs(z) < _CLIP * max(1.0, nmad(z, 0.0)))
+        kept = np.isfinite(z) & (np.abs(z) < decided().spread.clip * max(1.0, nmad(z, 0.0)))
         squared = (z * weighed.sigma / residuals.sigma)[kept] ** 2
         forms = [candidate.variance[kept] / residuals.sigma[kept, None] ** 2 for candidate in candidates]
         singles = [_Joint.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
@@ -173,10 +156,11 @@ def find_spread(
     p_value = _p_value(squared, [form.sum(axis=1) for form in forms], block, random)
     tried = [SpreadTried(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
-    if best.gain < _LEAST_GAIN or p_value > _ALPHA or excess < _LEAST_EXCESS:
+    by = decided().spread
+    if best.gain < by.least_gain or p_value > by.significance or excess < by.least_excess:
         return [], tried
     # of disparities `stereo_noise` looks at neighbours, which noise on nodes moves alike too
-    if residuals.sensor == "tls" and _between_neighbours(residuals, value, kept, best.added(forms)) < _LEAST_BETWEEN:
+    if residuals.sensor == "tls" and _between_neighbours(residuals, value, kept, best.added(forms)) < by.least_between:
         return [], tried
     pairs = [
         _Joint.fitted(squared, forms, [first, second], candidates)
@@ -186,10 +170,10 @@ def find_spread(
     pair = max(pairs, key=lambda fit: fit.score, default=best)
     free_name, free_score, free = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()})
     # where one effect leaves something over, a second of the catalogue comes before a form of no effect
-    needed = _SECOND_GAIN if free_score > best.score + _FREE_MARGIN else _LEAST_GAIN
+    needed = by.second_gain if free_score > best.score + by.free_margin else by.least_gain
     agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    empirical = free_score > chosen.score + _FREE_MARGIN and _blocks_prefer(squared, chosen.added(forms), free, block)
+    empirical = free_score > chosen.score + by.free_margin and _blocks_prefer(squared, chosen.added(forms), free, block)
     if empirical:
         chosen = best
     tried = sorted([*tried, SpreadTried(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
@@ -197,7 +181,7 @@ def find_spread(
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
         others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _differ_by(fit, chosen, number)]
-        near = {candidates[n].name for fit in others if fit.score > chosen.score - _CLASS_MARGIN for n in fit.members}
+        near = {candidates[n].name for fit in others if fit.score > chosen.score - by.class_margin for n in fit.members}
         alike = near - {candidates[each].name for each in chosen.members}
         parameters = candidate.parameters(theta)
         std = candidate.errors(theta, chosen.error[place])
@@ -240,9 +224,9 @@ def share_of_spread(residuals: Residuals, cells: Cells, value: FloatArray) -> fl
     kept = np.isfinite(z)
     squared = np.minimum(z[kept] ** 2, _CUT**2)
     means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
-    below = float(means.sum()) < -_BLOCK_SIGMAS * float(np.linalg.norm(means))
+    below = float(means.sum()) < -decided().spread.block_sigmas * float(np.linalg.norm(means))
     share = float(np.sqrt(squared.mean()))
-    return share if below and share < _LEAST_SHARE else 1.0
+    return share if below and share < decided().spread.too_noisy else 1.0
 
 
 def _best_variants(tried: list[SpreadTried]) -> list[SpreadTried]:
@@ -301,13 +285,13 @@ def _differ_by(fit: _Joint, chosen: _Joint, number: int) -> bool:
 def _blocks_agree(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether the gain of one variance over another is common to the blocks and not due to a few."""
     gain, sigmas = _gain_over(squared, first, second, block)
-    return gain > 0 and sigmas > _BLOCK_SIGMAS
+    return gain > 0 and sigmas > decided().spread.block_sigmas
 
 
 def _blocks_prefer(squared: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
     """The same of a free form, which only has to say that the named one does not fit."""
     gain, sigmas = _gain_over(squared, first, free, block)
-    return gain > _FREE_GAIN and sigmas > _FREE_BLOCK_SIGMAS
+    return gain > decided().spread.free_gain and sigmas > decided().spread.free_block_sigmas
 
 
 def _gain_over(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
@@ -336,11 +320,11 @@ def find_tails(z: FloatArray, block: NDArray[np.int64]) -> float | None:
 
     z: (n,) residuals over the spread that all effects together predict; of normal ones 6e-5 lie beyond 4.
     """
-    far = np.abs(z) > _FAR
-    if far.mean() < _MOST_FAR:
+    far = np.abs(z) > decided().spread.far
+    if far.mean() < decided().spread.most_far:
         return None
     sums = np.bincount(np.unique(block, return_inverse=True)[1], far)
-    spread_out = float(sums.max()) < _ONE_BLOCK * float(sums.sum())
+    spread_out = float(sums.max()) < decided().spread.one_block * float(sums.sum())
     excess = float(np.mean(np.minimum(z**2, _CUT**2))) - 1
     return float(np.sqrt(max(excess, 0.0))) if spread_out else None
 

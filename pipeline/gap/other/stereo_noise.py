@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
+from pipeline.gap.decisions import decided
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_raster import spacing
@@ -31,17 +32,9 @@ _STEPS_PX = tuple(8.0 * 2 ** (half / 2) for half in range(9))
 _POINTS_PER_BLOCK = 400.0
 _FEWEST_BLOCKS, _FEWEST_LAGS = 12, 3
 _CLIP = 4.5
-_FINEST = 2.0
-"""Cells of the raster from which on a grid of nodes differs from white noise."""
-_MARGIN = 6.0
-"""Difference of chi^2 from which on one of the two is named alone."""
 _RIDGE, _FEW = 0.02, 0.2
 """Share of the covariance of lags added to its diagonal: always, and times lags per block of the wall: few blocks mistake it."""
 _DRAWS = 1999
-_ALONE, _LEAST_SIGMAS = 12.0, 4.0
-"""Difference of chi^2 and standard deviations of its variance that noise on nodes needs where points by themselves show none."""
-_LARGEST_REFERENCE_M = 0.02
-"""Error of the reference, correlated over metres, that there may be: smaller noise on nodes cannot be told from it."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,7 @@ class _Variogram:
 
     def best_nodes(self) -> tuple[_Form, float, list[float]] | None:
         """The grid of nodes that fits best with its step, px, and steps that fit as well; None where all are too fine for it."""
-        trials = [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= _FINEST * self.step]
+        trials = [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= decided().nodes.finest * self.step]
         if not trials:
             return None
         form, step = min(trials, key=lambda trial: trial[0].square)
@@ -122,8 +115,8 @@ def find_nodes(part: Residuals, value: FloatArray, model: StereoModel, random: K
         return None
     form, step, near = best
     without = min(variogram.smooth_square, variogram.fitted(np.ones(len(variogram.lag))).square)
-    certain = form.square < without - _ALONE and form.variance > _LEAST_SIGMAS * form.error
-    if not certain or np.sqrt(form.variance) * float(np.median(part.unit_m)) < _LARGEST_REFERENCE_M:
+    certain = form.square < without - decided().nodes.least_gain and form.variance > decided().nodes.least_sigmas * form.error
+    if not certain or np.sqrt(form.variance) * float(np.median(part.unit_m)) < decided().nodes.reference_error:
         return None
     signs = random.child("nodes").generator().choice([-1.0, 1.0], size=(len(form.blocks), _DRAWS))
     p_value = float((1 + np.sum(np.abs(form.blocks @ signs) >= form.variance)) / (1 + _DRAWS))
@@ -140,12 +133,12 @@ def _named(white: SpreadFound, part: Residuals, value: FloatArray, model: Stereo
     plain = variogram.fitted(np.ones(len(variogram.lag)))
     if plain.variance > 0:
         both = _with_variance(both, plain, 1.0)
-    resolved = _FINEST * variogram.step <= _STEPS_PX[0]  # else a grid may be too fine for this raster to tell
+    resolved = decided().nodes.finest * variogram.step <= _STEPS_PX[0]  # else a grid may be too fine for this raster to tell
     white = replace(both, alike=white.alike) if resolved else both
     best = variogram.best_nodes()
-    if best is None or plain.square < best[0].square - _MARGIN:
+    if best is None or plain.square < best[0].square - decided().nodes.margin:
         return white
-    if best[0].variance <= 0 or plain.square < best[0].square + _MARGIN:
+    if best[0].variance <= 0 or plain.square < best[0].square + decided().nodes.margin:
         return both
     nodes = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), alike=())
     return _on_nodes(nodes, *best)

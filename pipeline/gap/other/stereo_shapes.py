@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
@@ -28,12 +29,6 @@ _RADII = (1, 2, 3, 4, 5, 6, 8)
 _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 """Cells that outlines grow by, and standard deviations of the low-pass in cells."""
 _FINER = (1.1, 1.03)
-_CLEAR = 3.0
-"""Predicted sigmas by which an effect at depth steps must move a point for it to bear witness."""
-_CLEAR_STEP = 1.3
-"""How many times the least depth step it must be: what counts as one, matchers do not agree."""
-_FEWEST_FILLED, _LEAST_FILLED_GAIN = 8, 10.0
-_LEAST_HELD = 0.6
 _FILLED, _STRAY_FILLED = 0.9, 0.02
 """Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
 _NEAR_STEPS = 2
@@ -58,7 +53,7 @@ class _Witnesses:
         without = self.raster.moved(beside, self.disparity)
         moved = self.raster.moved([*beside, effect], self.disparity)
         if isinstance(effect, EdgeFattening):
-            clear = np.maximum(_CLEAR * self.sigma, _CLEAR_STEP * self.raster.jump_px)
+            clear = np.maximum(decided().shapes.clear_sigmas * self.sigma, decided().shapes.clear_step * self.raster.jump_px)
             moved = np.where(np.abs(moved - without) > clear, moved, without)
         more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
         return np.where((moved == without) | self.held_out, 0.0, more)
@@ -67,7 +62,8 @@ class _Witnesses:
         """Of effects that may feign each other, the one that explains more of the points that any of them moves clearly."""
         without = self.raster.moved(beside, self.disparity)
         moved = [self.raster.moved([*beside, each.effect], self.disparity) for each in found]
-        clear = ~self.held_out & np.any([np.abs(each - without) > _CLEAR * self.sigma for each in moved], axis=0)
+        least = decided().shapes.clear_sigmas * self.sigma
+        clear = ~self.held_out & np.any([np.abs(each - without) > least for each in moved], axis=0)
         gains = [float(log_density(self.rough, each, self.sigma)[clear].sum()) for each in moved]
         return found[int(np.argmax(gains))]
 
@@ -156,12 +152,12 @@ def _filling(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
     before = raster.after(beside)
     points = np.isnan(raster.at_points(before)) & raster.at_points(raster.hidden)
     gain = float(witnesses.gains(beside, OcclusionFill(reach_px=1e5))[points].sum())
-    if points.sum() < _FEWEST_FILLED or gain < _LEAST_FILLED_GAIN:
+    if points.sum() < decided().shapes.fewest_filled or gain < decided().shapes.least_filled_gain:
         return None
     widths, held = _strips(before, raster)
     reach, std = _reach(widths, held, raster.step)
     narrow = held[widths <= reach / raster.step]
-    if narrow.mean() < _LEAST_HELD:
+    if narrow.mean() < decided().shapes.least_held:
         return None
     return ShapeFound(OcclusionFill(reach_px=reach), {"reach_px": std}, gain, points)
 

@@ -11,8 +11,9 @@ import yaml
 from pipeline.formats.atomic import write_json, write_text, writing
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import deciding
 from pipeline.gap.naming.verdict import closing, in_a_sentence
-from pipeline.gap.naming.workflow import FEWEST_POINTS, Diagnosis
+from pipeline.gap.naming.workflow import Diagnosis
 from pipeline.gap.report.covariate_ranking import steady, where
 from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
 from pipeline.gap.report.in_words import (
@@ -30,11 +31,6 @@ from pipeline.gap.report.quantities import with_std
 from pipeline.report.page import p_value_in_words, template
 
 _MOST_TRIED = 25
-REQUEST = (
-    f"At least {FEWEST_POINTS} points on smooth rock of stable ground, spread over the wall: scan or match more densely, take in "
-    "more of the wall, or widen stable_areas (wall frame, m) where they leave out what did not move."
-)
-"""What insufficient_data asks for."""
 
 
 def to_dict(found: Diagnosis, measurement: Measurement) -> dict[str, Any]:
@@ -52,6 +48,7 @@ def to_dict(found: Diagnosis, measurement: Measurement) -> dict[str, Any]:
         "identifiability": found.identifiability,
         "gap": found.gap.to_dict() if found.gap else None,
         "remaining": found.remaining,
+        "decisions": found.decisions.model_dump(),
         "seconds": round(found.seconds, 2),
     }
 
@@ -61,8 +58,9 @@ def write(out: Path, found: Diagnosis, measurement: Measurement) -> Path:
 
     before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one.
     """
-    pictures = _pictures(found)
-    page = _page(found, pictures)
+    with deciding(found.decisions):
+        pictures = _pictures(found)
+        page = _page(found, pictures)
     write_json(out / "gap.json", to_dict(found, measurement))
     write_text(out / "model_after.yaml", _yaml(found.model_after.model_dump(mode="json", exclude_defaults=False)))
     points = measurement.frame.to_world(measurement.cloud.points[found.residuals.index])
@@ -78,9 +76,14 @@ def write(out: Path, found: Diagnosis, measurement: Measurement) -> Path:
 
 def summary(found: Diagnosis) -> str:
     """The verdict in some lines of text."""
+    with deciding(found.decisions):
+        return _summary(found)
+
+
+def _summary(found: Diagnosis) -> str:
     lines = [f"{found.verdict}: {in_a_sentence(found.verdict, found.effects, found.evidence)}"]
     if found.verdict == "insufficient_data":
-        lines += [f"  {found.remaining['note']}", f"  to measure: {REQUEST[0].lower()}{REQUEST[1:]}"]
+        lines += [f"  {found.remaining['note']}", f"  to measure: {_request(found)}"]
     for effect in found.effects:
         alike = f"; cannot be told from {', '.join(effect.alike)}" if effect.alike else ""
         lines.append(f"  {effect.name} ({values(effect)}){alike}")
@@ -91,6 +94,14 @@ def summary(found: Diagnosis) -> str:
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
         lines.append(f"  gap {scores}: {closing(found.gap, found.mended)}")
     return "\n".join(lines)
+
+
+def _request(found: Diagnosis) -> str:
+    """What insufficient_data asks for."""
+    return (
+        f"at least {found.decisions.points.fewest} points on smooth rock of stable ground, spread over the wall: scan or match "
+        "more densely, take in more of the wall, or widen stable_areas (wall frame, m) where they leave out what did not move."
+    )
 
 
 def _pictures(found: Diagnosis) -> dict[str, bytes]:
@@ -128,7 +139,7 @@ def _page(found: Diagnosis, pictures: dict[str, bytes]) -> str:
         p_value=p_value_in_words,
         with_std=with_std,
         with_unit=with_unit,
-        request=REQUEST,
+        request=_request(found),
         total=sum(found.timings.values()) or 1.0,
     )
 

@@ -29,6 +29,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtri
 
 from pipeline.change.robust import nmad
+from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import NEIGHBOURS, Sight
 from pipeline.gap.residuals.standardized import medians, spread, standardized
@@ -39,10 +40,6 @@ Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 _LEVELS = (2.5, 4.0, 8.0)
 """Sigmas from which on points belong together."""
-_BY_CHANCE = 0.01
-"""Changes that may be found in a measurement in which nothing moved."""
-_FEWEST = 5
-_MIDDLE_SIGMAS = 3.5
 _RATIOS, _NOISE = (2.0, np.inf), 3.0
 """Two neighbours agree where one departs no more than so many times as much as the other, or so many sigmas more. Fewer agree by
 chance where it is narrow; a block of five points whose depth varies is found where it is wide, if there are few outliers."""
@@ -53,17 +50,8 @@ _SHAPES = np.cumsum(np.log([1, 4, 5, 5.5, 5.8, 6.006, 6.157, 6.271, 6.361, 6.433
 _GROWTH = float(np.log(6.6))
 _EDGE_STEPS = 3
 """Points at edges of the reference that a change may go on over."""
-_FAINT, _LEAST_AROUND = 3.0, 0.4
-"""Standard deviations of medians of nine points from which on they belong together; and what that is at the least, of sigmas:
-1.25 / 3 by white noise."""
-_SMALLEST_M = 0.02
-"""A median of neighbours that departs less tells no change: what is wrong with the reference and with rays is as large."""
-_MARGIN = 3.0
-"""Spacings around a change in which points are set aside with it."""
-_LARGEST_SHARE = 0.25
-"""A region that takes more of the wall is no compact change."""
-_STRIPE = 30.0
-"""Spacings from which on a region that is less than a tenth as wide as long is a stripe, and no compact change."""
+_LEAST_AROUND = 0.4
+"""Standard deviation of medians of nine points at the least, of sigmas: 1.25 / 3 by white noise."""
 _ROUNDS = 3
 _SAMPLE, _ALMOST_ALL = 4000, 5.0
 
@@ -105,10 +93,10 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
         departure, z = standardized(residuals, sight.even_plane, quiet)
         around = sight.median_around(np.where(eligible, z, 0.0))
         faint = around / np.maximum(spread(residuals, around, quiet), _LEAST_AROUND)
-        faint[np.abs(around) * residuals.sigma * residuals.unit_m < _SMALLEST_M] = 0.0
+        faint[np.abs(around) * residuals.sigma * residuals.unit_m < decided().changes.smallest] = 0.0
         label, limit = _components(z, faint, sight, eligible)
         members = np.flatnonzero(label >= 0)
-        beside = sight.beside(members, _MARGIN) if len(members) else np.zeros(len(residuals), dtype=bool)
+        beside = sight.beside(members, decided().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
         if not (beside & ~before).any():
             break
     limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
@@ -120,12 +108,12 @@ def _components(z: FloatArray, faint: FloatArray, sight: Sight, eligible: BoolAr
 
     z: (n,) departures in sigmas; faint: (n,) the same of medians of neighbours.
     """
-    spread_out = np.abs(faint) > _FAINT
+    spread_out = np.abs(faint) > decided().changes.faint
     side = np.where(spread_out, np.sign(faint), np.sign(z)) * (spread_out | (np.abs(z) > _LEVELS[0]))
     first, second = sight.around(np.flatnonzero(side))
     together = side[first] * side[second] > 0
     pairs, size = (first[together], second[together]), np.abs(z)
-    least = max(_MIDDLE_SIGMAS, _correlated_sigmas(z, sight, eligible))
+    least = max(decided().changes.middle_sigmas, _correlated_sigmas(z, sight, eligible))
     core = _faint(faint, spread_out, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
@@ -144,7 +132,7 @@ def _faint(faint: FloatArray, spread_out: BoolArray, pairs: Pairs, eligible: Boo
     inside = label >= 0
     highest = np.zeros(int(label.max(initial=-1)) + 1)
     np.maximum.at(highest, label[inside], np.where(eligible, np.abs(faint), 0.0)[inside])
-    return np.isin(label, np.flatnonzero(highest > -ndtri(_BY_CHANCE / (2 * eligible.sum())))) & inside
+    return np.isin(label, np.flatnonzero(highest > -ndtri(decided().changes.by_chance / (2 * eligible.sum())))) & inside
 
 
 def _agreeing(pairs: Pairs, size: FloatArray, ratio: float) -> Pairs:
@@ -172,7 +160,8 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
     for _ in range(len(count)):
         stray = np.sort(z[inside][~accepted[label[inside]]])
         by_chance = _log_expected(count, int(eligible.sum()), len(stray), _agreeing_share(stray, ratio))
-        again = (count >= _FEWEST) & (middle > least) & (by_chance < np.log(_BY_CHANCE / _LOOKS))
+        rare = by_chance < np.log(decided().changes.by_chance / _LOOKS)
+        again = (count >= decided().changes.fewest) & (middle > least) & rare
         if np.array_equal(again, accepted):
             break
         accepted = again
@@ -209,7 +198,7 @@ def _correlated_sigmas(z: FloatArray, sight: Sight, eligible: BoolArray) -> floa
     chosen = counts >= NEIGHBOURS // 2
     if not chosen.any():
         return 0.0
-    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(_BY_CHANCE / (2 * len(known))))
+    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(decided().changes.by_chance / (2 * len(known))))
 
 
 def _grown(core: BoolArray, size: FloatArray, pairs: Pairs, eligible: BoolArray) -> BoolArray:
@@ -251,7 +240,8 @@ def _compact(label: NDArray[np.int64], sight: Sight, points: int) -> NDArray[np.
     place = sight.even_plane[order]
     length = (np.maximum.reduceat(place, starts) - np.minimum.reduceat(place, starts)).max(axis=1)
     size = np.diff(np.append(starts, len(order))) / len(np.unique(sight.epoch))
-    compact = (size * len(np.unique(sight.epoch)) < _LARGEST_SHARE * points) & ((length < _STRIPE) | (size > 0.1 * length**2))
+    stripe = (length >= decided().changes.stripe) & (size <= 0.1 * length**2)
+    compact = (size * len(np.unique(sight.epoch)) < decided().changes.largest_share * points) & ~stripe
     return np.where(np.isin(label, label[order][starts][compact]), label, -1)
 
 

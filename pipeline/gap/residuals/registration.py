@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
@@ -17,7 +18,6 @@ from scene.mesh import FloatArray
 from sensors.camera import Camera, CameraPair
 
 _ROUNDS = 6
-_OUTLIER = 3.5
 _FEWEST = 100
 _FAR_M, _MOST_MOVES = 0.002, 3
 
@@ -31,7 +31,7 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
         value = residuals.value - residuals.pose @ pose
         z = np.abs(value / residuals.sigma)
         scale = max(1.0, nmad(z[residuals.smooth], 0.0))
-        kept = residuals.smooth & (z < _OUTLIER * scale)
+        kept = residuals.smooth & (z < decided().points.unregistered * scale)
         if kept.sum() < _FEWEST:
             kept = residuals.smooth
     return value, pose, scale

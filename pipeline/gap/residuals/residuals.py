@@ -14,10 +14,6 @@ from sensors.effects.matching_noise import MatchingNoise
 from sensors.model import StereoModel
 
 BoolArray = NDArray[np.bool_]
-OUTLIER = 5.0
-"""Predicted sigmas, times what residuals spread of them, beyond which a point has no say."""
-
-
 _GRID = (np.arange(24) + 0.5) / 24
 """Distances within a square of side 1, along one side, over which a mean is taken."""
 

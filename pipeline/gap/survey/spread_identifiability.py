@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.gap.decisions import decided
 from pipeline.gap.other.spread import spread_candidates
 from pipeline.gap.survey.planned import Survey, View
 from pipeline.gap.survey.survey_design import SIGNAL_TO_NOISE, signatures
@@ -16,8 +17,6 @@ from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.precipitation import Precipitation
 from sensors.effects.range_quantization import RangeQuantization
 
-_LEAST_EXCESS = 0.03
-"""Added variance, as a share of the model's, that a diagnosis asks for at the least."""
 _LOSSES = 0.01
 """Share of returns that are taken to be missing anyway."""
 _NO_NUMBER = "no signature in closed form: the diagnosis tries it, this table has no number for it"
@@ -68,12 +67,13 @@ def _spread(view: View) -> list[OtherEffect]:
     residuals = view.residuals
     candidates = spread_candidates(residuals)
     found: dict[str, OtherEffect] = {}
+    excess = decided().spread.least_excess
     for candidate in candidates:
         form = candidate.variance.sum(axis=1) / residuals.sigma**2
         information = 0.5 * float(np.sum(form**2)) * view.whole / len(residuals)
         theta = SIGNAL_TO_NOISE / np.sqrt(max(information, 1e-300))
-        least = _LEAST_EXCESS / max(float(np.mean(form)), 1e-300)
-        note = "" if theta > least else f"below that it adds less than {_LEAST_EXCESS:.0%} to the variance, which is not named"
+        least = excess / max(float(np.mean(form)), 1e-300)
+        note = "" if theta > least else f"below that it adds less than {excess:.0%} to the variance, which is not named"
         value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
         name = f"{residuals.sensor}.{candidate.name}"
         if name not in found or value < found[name].seen_from:

@@ -1,0 +1,52 @@
+"""What every family of explanations gains where there is nothing to explain: the null distribution of the largest gain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.gap.mean.design import DRAWS, Design
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+
+_NEAR_NULL = 8
+"""Covariances, the most likely ones, at which the draws are fitted."""
+
+
+@dataclass(frozen=True)
+class NullGains:
+    """Gains of every family in draws of pose, the reference's correlated error and noise alone, (DRAWS,) each."""
+
+    gains: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, design: Design, random: KeyedRandom) -> NullGains:
+        """By the most likely covariances, each family at its best value."""
+        near = design.equations.some(design.likely[:_NEAR_NULL])
+        draws = design.model.null_draws(design.null, DRAWS, random.child("between"))
+        sines = design.model.between(design.waves.means)
+        right, constant, waves = [], [], []
+        for at in near.at:
+            weighted = draws[at.length] * at.weight[:, None]
+            constant.append(0.5 * (np.log(at.weight).sum() - np.sum(draws[at.length] * weighted, axis=0)))
+            right.append(design.drawn + design.fixed.between[at.length].T @ weighted)
+            waves.append(design.waves.noise + sines[at.length].T @ weighted)
+        drawn = near.of_values(np.stack(right), np.stack(constant), np.stack(waves))
+        plain, fixed, searched = drawn.profile(design.base, design.plain_columns)
+        return cls(
+            {
+                name: np.maximum(np.concatenate([fixed[rows], searched[numbers]]).max(axis=0) - plain, 0.0)
+                for name, (rows, numbers) in design.families.members.items()
+            }
+        )
+
+    def penalty(self, family: str) -> float:
+        """Twice what a family gains on average where there is nothing."""
+        return 2 * float(self.gains[family].mean())
+
+    def p_value(self, score: float) -> float:
+        """Of the largest score over all families where there is nothing: (1 + b) / (1 + N)."""
+        scores = np.stack([gains - 2 * gains.mean() for gains in self.gains.values()])
+        return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + DRAWS))

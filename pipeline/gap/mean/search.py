@@ -1,0 +1,118 @@
+"""The search for effects on the mean: what every explanation gains beside others, over one design."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.gap.decisions import decided
+from pipeline.gap.mean.candidates import Candidate, Explanation, Grid
+from pipeline.gap.mean.design import Design
+from pipeline.gap.mean.null_gains import NullGains
+from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
+from pipeline.gap.residuals.residuals import Residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+
+_MOST_LEADING = 8
+"""Effects that are taken exactly."""
+
+
+class MeanSearch:
+    """All explanations on one set of points, as `Choice` asks for them.
+
+    gains_alone: what each gains by itself, given where the residuals' pose holds effects too.
+    """
+
+    def __init__(
+        self,
+        residuals: Residuals,
+        families: list[Candidate | Grid],
+        random: KeyedRandom,
+        pose_precision: FloatArray | None = None,
+        gains_alone: Mapping[Explanation, float] | None = None,
+    ) -> None:
+        """pose_precision: (p,) inverse variance of the coefficients of `residuals.pose` before there are data, 0 by default."""
+        self.design = Design.of(residuals, families, random, pose_precision)
+        self._null = NullGains.of(self.design, random)
+        self._holding: dict[tuple[Candidate, ...], Design] = {}
+        alone = sorted(self._tried((), {}), key=lambda each: each.gain) if gains_alone is None else []
+        self.gains_alone = gains_alone or {(each.name, each.empirical): each.gain for each in alone}
+
+    def select(self) -> tuple[list[Chosen], tuple[Tried, ...]]:
+        """Explanations, and what was tried beside all of them."""
+        return Choice(self).select()
+
+    def tried(self, members: Members) -> tuple[Tried, ...]:
+        """Every family's best variant beside some effects, best score first."""
+        return self._tried(members, self.gains_alone)
+
+    def _tried(self, members: Members, alone: Mapping[Explanation, float]) -> tuple[Tried, ...]:
+        candidates = [member.candidate for member in members]
+        design = self._with(candidates)
+        plain, fixed, searched = design.equations.profile(design.columns(candidates), design.plain_columns)
+        families, found = design.families, []
+        for name, (rows, sines) in families.members.items():
+            gains = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
+            best = int(np.argmax(gains))
+            candidate = families.plain[rows[best]] if best < len(rows) else families.sine(sines[best - len(rows)])
+            gain = float(gains[best])
+            slight = gain < decided().mean.practical_share * alone.get((candidate.name, candidate.empirical), 0.0)
+            found.append(Tried(candidate.name, candidate.empirical, gain - self._null.penalty(name), gain, candidate, slight))
+        return tuple(sorted(found, key=lambda item: -item.score))
+
+    def _with(self, candidates: list[Candidate]) -> Design:
+        """The design with columns for all of them; kept, since the same sets are asked for again and again."""
+        key = tuple(candidate for candidate in candidates if candidate.wave is not None)
+        if not key:
+            return self.design
+        if key not in self._holding:
+            self._holding[key] = self._with([*key[:-1]]).holding(key[-1])
+        return self._holding[key]
+
+    def p_value(self, score: float) -> float:
+        """Of the largest score over all families where there is nothing."""
+        return self._null.p_value(score)
+
+    def score(self, members: Members) -> float:
+        """Of effects together, their periods at the top of the likelihood: the steps of the search cost a strong sine some."""
+        candidates = [member.candidate for member in members]
+        design = self._with(candidates)
+        both = (design.equations.log_likelihood(base)[:, 0].max() for base in (design.columns(candidates), design.base))
+        with_them, without = both
+        return float(with_them - without - sum(member.gain - member.score for member in members))
+
+    def kin(self, form: Tried) -> set[str]:
+        """Covariates that change as that of a free form does."""
+        found = self.design.residuals.covariates
+        covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
+        parts = form.name.split(" and ")
+        alike = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
+        return {name for name, row in zip(covariates, alike, strict=False) if row.max() > decided().mean.kin}
+
+    def may_be_the_reference(self, members: Members, form: Tried) -> bool:
+        """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave."""
+        if form.candidate.form != "wave":
+            return False
+        design = self.design
+        candidates, fit = design.refined([form.candidate, *(member.candidate for member in members)])
+        values = design.split(fit.coefficients, candidates)[0][:2]
+        error = float(np.sqrt(fit.at.ratio)) * design.model.typical_sigma
+        return float(np.std(candidates[0].columns @ values)) < decided().mean.wave_sigmas * error
+
+    def leading(self) -> list[Candidate]:
+        """Effects of the catalogue that are large and explain much by themselves, each variant for itself, best first."""
+        plain, fixed, _ = self.design.equations.profile(self.design.base, self.design.plain_columns)
+        gains = fixed[:, 0] - plain[0]
+        found = [(gain, each) for gain, each in zip(gains, self.design.families.plain, strict=True) if not each.empirical]
+        ranked = sorted(found, key=lambda item: -item[0])
+        least = max(decided().mean.leading_share * ranked[0][0], decided().mean.leading_gain) if ranked else 0.0
+        return [each for gain, each in ranked if gain >= least][:_MOST_LEADING]
+
+    def alone(self, candidate: Candidate) -> Chosen:
+        """A candidate by itself."""
+        best = next(item for item in self.tried(()) if item.name == candidate.name and not item.empirical)
+        item = replace(best, candidate=candidate)
+        return Choice(self).chosen((item,), item)

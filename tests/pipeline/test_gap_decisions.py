@@ -1,0 +1,63 @@
+"""What `gap` decides by: each threshold says what it is, can be set, is written down, and reaches what decides."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from gap_cases import write_scan
+from pydantic import BaseModel
+
+from pipeline.cli.main import main
+from pipeline.gap.decisions import Decisions, decided, deciding, read_decisions
+from pipeline.gap.naming.verify import Gap
+
+EVERY = [(group, key) for group, found in Decisions().model_dump().items() for key in found]
+
+
+@pytest.mark.parametrize(("group", "key"), EVERY)
+def test_each_says_its_unit_what_it_decides_and_where_it_comes_from(group: str, key: str) -> None:
+    model: type[BaseModel] = type(getattr(Decisions(), group))
+    field = model.model_fields[key]
+    assert isinstance(field.json_schema_extra, dict)
+    assert field.description
+    assert field.description.endswith(".")
+    assert field.json_schema_extra["unit"]
+    assert field.json_schema_extra["source"]
+
+
+@pytest.mark.parametrize(("group", "key"), EVERY)
+def test_each_is_used_by_the_diagnosis(group: str, key: str) -> None:
+    """A threshold that nothing reads decides nothing."""
+    sources = (path.read_text() for path in Path("pipeline/gap").rglob("*.py") if path.name != "decisions.py")
+    assert any(f"{group}.{key}" in text or (f"by = decided().{group}" in text and f"by.{key}" in text) for text in sources)
+
+
+def test_what_is_called_within_decides_by_what_was_set() -> None:
+    gap = Gap(before=0.0015, after=0.0015, floor=0.001, error=0.0, floor_error=0.0001, points=100)
+    assert gap.above_floor
+    with deciding(read_decisions(["verdict.gap_sigmas=6"])):
+        assert decided().verdict.gap_sigmas == 6
+        assert not gap.above_floor
+    assert gap.above_floor
+
+
+def test_thresholds_are_set_by_the_command_and_written_down(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = tmp_path / "case"
+    case.mkdir()
+    write_scan(case, 1, step_rad=0.05)
+    assert main(["gap", str(case), "--out", str(tmp_path / "out"), "--set", "points.fewest=900", "--quiet"]) == 0
+    assert "900 are needed" in capsys.readouterr().out
+    assert json.loads((tmp_path / "out/gap.json").read_text())["decisions"]["points"]["fewest"] == 900
+
+
+@pytest.mark.parametrize("wrong", ["points.few=3", "mean.significance=2", "spread.least_gain=much", "mean.class_margin=.inf"])
+def test_a_threshold_that_cannot_be_is_answered_in_a_sentence(
+    wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["gap", str(tmp_path), "--out", str(tmp_path / "out"), "--set", wrong]) == 2
+    told = capsys.readouterr().err
+    assert wrong.split("=")[0] in told
+    assert "Traceback" not in told
+    assert not (tmp_path / "out").exists()
