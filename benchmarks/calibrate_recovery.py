@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from pipeline.calibrate.calibrate import calibrate_material
-from pipeline.calibrate.inputs import Material
-from pipeline.calibrate.maps import noise_map
-from pipeline.calibrate.parameters import parameters
+from pipeline.calibration.calibrate import calibrate_material
+from pipeline.calibration.inputs import Material
+from pipeline.calibration.maps import noise_map
+from pipeline.calibration.parameters import parameters
 from pipeline.change.difference import raster_grid
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import load_config

@@ -12,9 +12,9 @@ import argparse
 import numpy as np
 from measure import bare_cast, medians
 
-from pipeline.calibrate.maps import noise_map
-from pipeline.calibrate.reobserve import Reobserver
-from pipeline.calibrate.windows import choose_windows
+from pipeline.calibration.maps import noise_map
+from pipeline.calibration.reobserve import Reobserver
+from pipeline.calibration.windows import choose_windows
 from pipeline.change.difference import raster_grid
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import load_config

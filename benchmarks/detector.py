@@ -37,7 +37,7 @@ def processor_seconds(*works: Callable[[], object]) -> list[float]:
 
 
 def examples(count: int, size: int, most_blocks: int, channels: int) -> dict[str, np.ndarray]:
-    """A batch as `pipeline.detect.data.batches` makes it."""
+    """A batch as `pipeline.detection.data.batches` makes it."""
     random = np.random.default_rng(1)
     image = random.normal(0, 0.3, (count, size, size, channels)).astype(np.float32)
     boxes, valid = np.zeros((count, most_blocks, 4), np.float32), np.zeros((count, most_blocks), np.float32)
@@ -73,14 +73,14 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", str(arguments.threads))
-    from pipeline.detect.keras_backend import keras_ready
+    from pipeline.detection.keras_backend import keras_ready
 
     keras_ready()
     import keras
     import tensorflow as tf
 
-    from pipeline.detect.config import load_train_config
-    from pipeline.detect.model import MaskRCNN
+    from pipeline.detection.config import load_train_config
+    from pipeline.detection.model import MaskRCNN
 
     tf.config.threading.set_intra_op_parallelism_threads(arguments.threads)
     tf.config.threading.set_inter_op_parallelism_threads(1)

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.detect.evaluate import Score, evaluate
-from pipeline.detect.run import BASELINE, LOWEST_SCORE, detect
+from pipeline.detection.evaluate import Score, evaluate
+from pipeline.detection.run import BASELINE, LOWEST_SCORE, detect
 from pipeline.formats.atomic import write_text
 from pipeline.formats.geotiff import read_tiff
 

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import load_config
 from pipeline.dataset.config import load_dataset_config
-from pipeline.detect.config import load_train_config
+from pipeline.detection.config import load_train_config
 from pipeline.formats.measurement import MeasurementConfig
 from scene.config import load_yaml, parse
 

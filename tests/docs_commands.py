@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cli.main import COMMANDS, command_parser
-from pipeline.compare.sensors_compared import contestants
+from pipeline.comparison.sensors_compared import contestants
 from pipeline.config.bundled import bundled_config, config_path
 from pipeline.config.overrides import Override, read_override
 from pipeline.config.presets import model_file, read_preset
 from pipeline.config.simulation import load_config
 from pipeline.dataset.config import load_dataset_config
-from pipeline.detect.config import load_train_config
+from pipeline.detection.config import load_train_config
 from scene.config import load_yaml
 
 ROOT = Path(__file__).parents[1]

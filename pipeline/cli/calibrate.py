@@ -36,10 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.calibrate.calibrate import calibrate
-    from pipeline.calibrate.inputs import config_of, sensor_of
-    from pipeline.calibrate.report import summary
-    from pipeline.calibrate.write import RECORD_FILE, write
+    from pipeline.calibration.calibrate import calibrate
+    from pipeline.calibration.inputs import config_of, sensor_of
+    from pipeline.calibration.report import summary
+    from pipeline.calibration.write import RECORD_FILE, write
     from pipeline.cli.simulate import new_folder
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.config.simulation import load_config

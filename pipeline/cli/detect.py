@@ -42,13 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.simulate import new_folder
-    from pipeline.detect.run import BASELINE, CONFIDENCES, checked_confidences, detect
+    from pipeline.detection.run import BASELINE, CONFIDENCES, checked_confidences, detect
     from pipeline.report.progress import shown_progress
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
     out = arguments.out or new_folder(Path("runs"), "detect")
     if arguments.model != BASELINE:
-        from pipeline.detect.keras_backend import keras_ready
+        from pipeline.detection.keras_backend import keras_ready
 
         keras_ready()
     with shown_progress(quiet=arguments.quiet) as progress:

@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.detect.run import CONFIDENCES, checked_confidences
-    from pipeline.detect.score_files import as_text, assess, write
+    from pipeline.detection.run import CONFIDENCES, checked_confidences
+    from pipeline.detection.score_files import as_text, assess, write
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
     assessment = assess(arguments.truth, arguments.predictions, arguments.by, arguments.iou, confidences)

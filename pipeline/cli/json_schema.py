@@ -9,7 +9,7 @@ from pydantic import BaseModel, RootModel
 
 from pipeline.config.simulation import SensorModel, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
-from pipeline.detect.config import TrainConfig
+from pipeline.detection.config import TrainConfig
 from pipeline.formats.measurement import MeasurementConfig
 from scene.errors import InputError, nearest
 from sensors.presets import ScannerPreset

@@ -33,9 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import bundled_config, config_path
-    from pipeline.detect.config import load_train_config
-    from pipeline.detect.data import CocoFolder
-    from pipeline.detect.keras_backend import keras_ready
+    from pipeline.detection.config import load_train_config
+    from pipeline.detection.data import CocoFolder
+    from pipeline.detection.keras_backend import keras_ready
     from pipeline.report.progress import shown_progress
 
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     for split in ("train", "val"):
         CocoFolder(arguments.data_set / split).check_images()  # a mistake there should not wait for TensorFlow
     keras_ready()
-    from pipeline.detect.training import train
+    from pipeline.detection.training import train
 
     arguments.kept = f"what was learned is in {arguments.out}; go on with --resume"
     with shown_progress(quiet=arguments.quiet) as progress:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.detect.data import CocoFolder
+from pipeline.detection.data import CocoFolder
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
 from pipeline.view.results import Item, Layer, Patch, Points, Window, centres, cut

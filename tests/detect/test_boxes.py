@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detect.boxes import anchors, clip, decode, encode, intersection_over_union, suppressed
-from pipeline.detect.roi_align import roi_align
+from pipeline.detection.boxes import anchors, clip, decode, encode, intersection_over_union, suppressed
+from pipeline.detection.roi_align import roi_align
 
 STRIDES = (4, 8, 16, 32, 64)
 

@@ -20,8 +20,8 @@ from test_fuzz import ODD, QUICK, answered, places
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
 from pipeline.dataset.loaders import Tiles
-from pipeline.detect.data import CocoFolder
-from pipeline.detect.score_files import assess
+from pipeline.detection.data import CocoFolder
+from pipeline.detection.score_files import assess
 from pipeline.formats.coco import read_coco, read_detections
 from pipeline.formats.coco_masks import run_lengths
 from pipeline.formats.geotiff import write_tiff

@@ -13,8 +13,8 @@ from test_model import SIDE, SMALL, eager, make_set
 
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
-from pipeline.detect.config import TrainConfig, TrainingConfig
-from pipeline.detect.data import CocoFolder, batches
+from pipeline.detection.config import TrainConfig, TrainingConfig
+from pipeline.detection.data import CocoFolder, batches
 from pipeline.formats import geotiff
 from pipeline.formats.geotiff import read_geotiff, read_tiff
 from scene.errors import InputError
@@ -85,7 +85,7 @@ def test_a_tile_that_is_cut_short_stops_a_training_before_it_begins(split, tmp_p
 @pytest.mark.slow
 def test_a_training_that_fails_in_its_first_epoch_leaves_nothing(tmp_path, eager):
     """Called as a function, which does not read every tile beforehand."""
-    from pipeline.detect.training import train
+    from pipeline.detection.training import train
 
     for name in ("train", "val"):
         make_set(tmp_path / "set" / name, 1, 5)

@@ -16,15 +16,15 @@ from pycocotools.coco import COCO
 from test_model import make_set
 
 from pipeline.cli.main import main
-from pipeline.detect import baseline, events, inference
-from pipeline.detect.config import DetectorConfig, NormalisationConfig, TrainingConfig
-from pipeline.detect.data import CocoFolder, batches, mirrored
-from pipeline.detect.detections import Detection, cropped, without_doubles
-from pipeline.detect.inference import paste, tile_places
-from pipeline.detect.keras_backend import stderr_dropped
-from pipeline.detect.normalisation import denormalised, nmad, normalised
-from pipeline.detect.run import detect, find_inputs
-from pipeline.detect.schedule import has_settled, learning_rate
+from pipeline.detection import baseline, events, inference
+from pipeline.detection.config import DetectorConfig, NormalisationConfig, TrainingConfig
+from pipeline.detection.data import CocoFolder, batches, mirrored
+from pipeline.detection.detections import Detection, cropped, without_doubles
+from pipeline.detection.inference import paste, tile_places
+from pipeline.detection.keras_backend import stderr_dropped
+from pipeline.detection.normalisation import denormalised, nmad, normalised
+from pipeline.detection.run import detect, find_inputs
+from pipeline.detection.schedule import has_settled, learning_rate
 from scene.errors import InputError
 from scene.grid import Grid
 
@@ -195,7 +195,7 @@ def test_training_stops_where_the_mean_slope_is_flat():
 
 def test_the_detector_does_without_the_ray_tracer_and_that_refuses_to_come_second():
     """Dr.Jit would take LLVM's symbols from TensorFlow and crash; the other way round both work."""
-    modules = "pipeline.detect.run, pipeline.detect.training, pipeline.detect.score_files"
+    modules = "pipeline.detection.run, pipeline.detection.training, pipeline.detection.score_files"
     script = f"""
 import sys, {modules}
 assert "drjit" not in sys.modules and "tensorflow" in sys.modules

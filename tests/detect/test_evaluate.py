@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from pipeline.change.annotate import run_length_encoding
-from pipeline.detect.evaluate import coco_metrics, evaluate, matches
-from pipeline.detect.score_files import as_text, assess, write
+from pipeline.detection.evaluate import coco_metrics, evaluate, matches
+from pipeline.detection.score_files import as_text, assess, write
 from scene.errors import InputError
 
 

@@ -12,16 +12,16 @@ import tensorflow as tf
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.change.annotate import run_length_encoding
-from pipeline.detect import weights
-from pipeline.detect.backbone import feature_pyramid
-from pipeline.detect.config import DetectorConfig, HeadConfig, TrainConfig, TrainingConfig, load_train_config
-from pipeline.detect.data import CocoFolder, network_input, window
-from pipeline.detect.evaluate import evaluate
-from pipeline.detect.inference import detect
-from pipeline.detect.model import LOSSES, MaskRCNN
-from pipeline.detect.operating_point import CONFIDENCE, set_operating_point
-from pipeline.detect.run import detect as run_detect
-from pipeline.detect.training import train
+from pipeline.detection import weights
+from pipeline.detection.backbone import feature_pyramid
+from pipeline.detection.config import DetectorConfig, HeadConfig, TrainConfig, TrainingConfig, load_train_config
+from pipeline.detection.data import CocoFolder, network_input, window
+from pipeline.detection.evaluate import evaluate
+from pipeline.detection.inference import detect
+from pipeline.detection.model import LOSSES, MaskRCNN
+from pipeline.detection.operating_point import CONFIDENCE, set_operating_point
+from pipeline.detection.run import detect as run_detect
+from pipeline.detection.training import train
 from pipeline.formats.geotiff import write_geotiff
 from scene.errors import InputError
 from scene.grid import Grid
@@ -188,7 +188,7 @@ def test_masks_have_the_size_of_the_config(size):
 @pytest.mark.parametrize(("name", "millions"), [("resnet50", 23.5), ("resnet101", 42.5)])
 def test_the_backbones_are_the_papers(name, millions):
     """Parameters of the convolutions of He et al. without the classifier; the first takes one channel in place of three."""
-    from pipeline.detect.backbone import feature_pyramid
+    from pipeline.detection.backbone import feature_pyramid
 
     model = feature_pyramid(name, 64, 1, 256)
     backbone = sum(

@@ -13,10 +13,10 @@ from pycocotools import mask as coco_mask
 from scipy import ndimage
 
 from pipeline.cli.main import main
-from pipeline.detect import inference, run
-from pipeline.detect.config import DetectorConfig, NormalisationConfig
-from pipeline.detect.detections import Detection
-from pipeline.detect.inference import tile_places
+from pipeline.detection import inference, run
+from pipeline.detection.config import DetectorConfig, NormalisationConfig
+from pipeline.detection.detections import Detection
+from pipeline.detection.inference import tile_places
 from pipeline.formats.geotiff import write_geotiff
 from scene.grid import Grid
 

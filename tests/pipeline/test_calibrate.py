@@ -13,15 +13,15 @@ import pytest
 import tifffile
 from scipy import stats
 
-from pipeline.calibrate.calibrate import calibrate_material
-from pipeline.calibrate.greedy import greedy
-from pipeline.calibrate.inputs import Material
-from pipeline.calibrate.maps import noise_map
-from pipeline.calibrate.parameters import Parameters, parameters
-from pipeline.calibrate.reobserve import Reobserver
-from pipeline.calibrate.search import Search
-from pipeline.calibrate.signature import Signature
-from pipeline.calibrate.windows import Windows, choose_windows, unchanged
+from pipeline.calibration.calibrate import calibrate_material
+from pipeline.calibration.greedy import greedy
+from pipeline.calibration.inputs import Material
+from pipeline.calibration.maps import noise_map
+from pipeline.calibration.parameters import Parameters, parameters
+from pipeline.calibration.reobserve import Reobserver
+from pipeline.calibration.search import Search
+from pipeline.calibration.signature import Signature
+from pipeline.calibration.windows import Windows, choose_windows, unchanged
 from pipeline.change.difference import raster_grid
 from pipeline.cli.main import main
 from pipeline.config.bundled import bundled_config

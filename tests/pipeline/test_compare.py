@@ -14,11 +14,11 @@ import pytest
 import yaml
 
 from pipeline.cli.main import main
-from pipeline.compare.assess import assess
-from pipeline.compare.comparison import compare_sensors
-from pipeline.compare.covariates import edge_distance
-from pipeline.compare.sensors_compared import contestants
-from pipeline.compare.trial import Trial, compare, rockfalls
+from pipeline.comparison.assess import assess
+from pipeline.comparison.comparison import compare_sensors
+from pipeline.comparison.covariates import edge_distance
+from pipeline.comparison.sensors_compared import contestants
+from pipeline.comparison.trial import Trial, compare, rockfalls
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.report.progress import Progress
 from scene.blocks import RockfallConfig

@@ -17,8 +17,8 @@ from pipeline.dataset.combine import merge_datasets, split_dataset
 from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.records import read_dataset_file, read_shard, write_dataset_file, write_shard
 from pipeline.dataset.run import Workers, make_dataset, verify_dataset
-from pipeline.detect.data import CocoFolder
-from pipeline.detect.run import find_inputs
+from pipeline.detection.data import CocoFolder
+from pipeline.detection.run import find_inputs
 from pipeline.formats.inside import inside
 from scene.errors import InputError
 

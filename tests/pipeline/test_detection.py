@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.compare.detection import (
+from pipeline.comparison.detection import (
     MeanTest,
     blocks_seen,
     false_alarms,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
 
-from pipeline.compare.detection_curve import DetectionCurve, detection_curve
+from pipeline.comparison.detection_curve import DetectionCurve, detection_curve
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 

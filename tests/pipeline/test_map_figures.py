@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from pipeline.compare import figures as comparison_figures
-from pipeline.compare.figures import MapPanel, side_by_side
+from pipeline.comparison import figures as comparison_figures
+from pipeline.comparison.figures import MapPanel, side_by_side
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report import figures as gap_figures

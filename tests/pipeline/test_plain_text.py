@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.detect.figures import write_overlay
+from pipeline.detection.figures import write_overlay
 from pipeline.report.figures import hillshade_figure, png_bytes
 from pipeline.report.pictures import png
 from pipeline.report.plain_text import power_of_ten, powers_of_ten

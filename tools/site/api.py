@@ -17,12 +17,12 @@ From the docstrings. What the commands do, a notebook can do: each command reads
 |---|---|
 | `simulate` | `pipeline.run.simulation.simulate` |
 | `inspect` | `pipeline.planning.inspect.inspect`, `write_plans` |
-| `compare` | `pipeline.compare.comparison.compare_sensors` |
+| `compare` | `pipeline.comparison.comparison.compare_sensors` |
 | `icp-study` | `pipeline.icp_study.study` |
-| `calibrate` | `pipeline.calibrate.calibrate.calibrate` |
+| `calibrate` | `pipeline.calibration.calibrate.calibrate` |
 | `dataset` | `pipeline.dataset.run.make_dataset`, `verify_dataset`; `pipeline.dataset.combine` |
 | `gap` | `pipeline.gap.naming.workflow.diagnose`; `pipeline.gap.survey.identifiability.identifiability` |
-| `train`, `detect`, `evaluate` | `pipeline.detect.run` |
+| `train`, `detect`, `evaluate` | `pipeline.detection.run` |
 
 A module's folder says what it knows: `scene` knows no sensor, `sensors` know the scene's ray caster, `pipeline` joins them.
 

@@ -1,0 +1,144 @@
+"""What a calibration starts from: measured difference maps, the ground that is stable, and the site that is to give the like."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.calibration.windows import Windows, choose_windows, unchanged
+from pipeline.config.simulation import SensorName, SimulationConfig
+from pipeline.formats.geotiff import read_geotiff
+from pipeline.formats.measurement import FILE, Measurement, read_measurement
+from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
+from pipeline.run.site import Site, prepare_site
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.model import StereoModel
+from sensors.stereo import StereoPair
+from sensors.tls import LaserScanner, Pattern
+
+BoolArray = NDArray[np.bool_]
+_REACH_PX = 2
+"""Pixels without a point of their own lie at most so far from one that has, where a cloud covers the ground."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """names: of the e maps; grid, maps: (e, h, w), m; stable: (h, w); drawn: whether the user drew it; site: what measured;
+    of_points: the maps are mean differences of points to the known surface, not of two surfaces."""
+
+    names: tuple[str, ...]
+    grid: Grid
+    maps: NDArray[np.float32]
+    stable: BoolArray
+    drawn: bool
+    site: Site
+    of_points: bool
+
+    def windows(self, config: SimulationConfig) -> Windows:
+        """The windows in which maps are compared."""
+        return choose_windows(self.stable, self.grid, config.calibration)
+
+    def on_stable(self, number: int) -> NDArray[np.floating]:
+        """(h, w) one map, NaN where it is not stable."""
+        return np.where(self.stable, self.maps[number], np.float32(np.nan))
+
+
+def config_of(paths: Sequence[Path]) -> Path | None:
+    """The run.json among the inputs' folders, which is the config of a simulated run; None where there is none."""
+    return next((path / "run.json" for path in paths if (path / "run.json").is_file()), None)
+
+
+def sensor_of(paths: Sequence[Path], config: SimulationConfig) -> SensorName:
+    """Which sensor measured. Raises InputError where neither the inputs nor the config say."""
+    for path in paths:
+        if not path.exists():
+            raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
+        if (path / FILE).is_file():
+            return read_measurement(path).sensor
+        if (path / "run.json").is_file():
+            named = json.loads((path / "run.json").read_text()).get("sensor")
+            if named in ("stereo", "tls"):
+                return named
+    names = config.sensor_names()
+    if len(names) == 1:
+        return names[0]
+    raise InputError("the maps may be of either sensor", where="calibrate", remedy="add --sensor stereo or --sensor tls")
+
+
+def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Material:
+    """Read the measured maps and find their stable ground. Raises InputError for maps that differ in their grids."""
+    measured, names = _maps(paths, config, random)
+    _check_noise(measured.maps, names)
+    of_points = bool(measured.points)
+    site = _measured_site(read_measurement(paths[0]), config) if of_points else prepare_site(config, sensor, random)
+    areas = config.calibration.stable_areas
+    drawn = area_mask(areas, measured.grid) if areas else measured.stable
+    stable = _covered(measured.maps, of_points) & (unchanged(list(measured.maps)) if drawn is None else drawn)
+    return Material(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points)
+
+
+def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) -> tuple[MeasuredMaps, tuple[str, ...]]:
+    """One folder, or map files; and the maps' names."""
+    if len(paths) == 1 and paths[0].is_dir():
+        found = read_measured(paths[0], config.difference, config.icp, random)
+        return found, tuple(f"epoch {number}" for number in range(1, len(found.maps) + 1))
+    for path in paths:
+        if path.suffix.lower() not in (".tif", ".tiff"):
+            raise InputError("is no difference map", where=str(path), allowed="one folder, or GeoTIFFs of one grid")
+    rasters, grids = zip(*map(read_geotiff, paths), strict=True)
+    for path, grid in zip(paths, grids, strict=True):
+        if grid != grids[0]:
+            raise InputError(f"{grid} is not {grids[0]} of {paths[0].name}", where=str(path), remedy="bring the maps to one grid")
+    return MeasuredMaps("maps", grids[0], np.stack(rasters), None), tuple(path.stem for path in paths)
+
+
+def _check_noise(maps: NDArray[np.floating], names: Sequence[str]) -> None:
+    """Maps without any noise are no measurement; one that is given twice would count as two and make the intervals too narrow."""
+    for number, (values, name) in enumerate(zip(maps, names, strict=True)):
+        known = values[~np.isnan(values)]
+        if known.size and np.ptp(known) == 0:
+            problem = f"shows the same difference, {known[0]:g} m, everywhere"
+            raise InputError(problem, where=name, remedy="give maps of measured differences, noise included")
+        for other, other_name in zip(maps[:number], names, strict=False):
+            if np.array_equal(values, other, equal_nan=True):
+                raise InputError(f"is the same map as {other_name}", where=name, remedy="give each epoch's map once")
+
+
+def _covered(maps: NDArray[np.floating], of_points: bool) -> BoolArray:
+    """(h, w) where every map has data; of points, where some are near in every map."""
+    known = ~np.isnan(maps)
+    if of_points:
+        from scipy import ndimage
+
+        known = np.stack([ndimage.binary_closing(each, iterations=_REACH_PX) | each for each in known])
+    return known.all(axis=0)
+
+
+def _measured_site(measurement: Measurement, config: SimulationConfig) -> Site:
+    """The instrument of a measurement in front of its reference surface."""
+    frame, mesh = measurement.frame, measurement.reference
+    model = measurement.model
+    if isinstance(model, StereoModel):
+        assert measurement.cameras is not None
+        pair = StereoPair(measurement.cameras, frame, model, config.depth_map)
+        eyes: dict[str, FloatArray] = {"cameras": frame.to_wall(measurement.cameras.left.position)}
+        return Site("measured", measurement.notes, mesh, frame, pair, eyes)
+    assert measurement.station is not None
+    position, rotation = measurement.station
+    if measurement.pattern is None:
+        world = frame.to_world(position), frame.rotation.T @ rotation
+        scanner = LaserScanner.aimed(world, frame, mesh.vertices, config.scanner, model)
+    else:
+        azimuth, zenith = measurement.pattern.azimuth_rad, measurement.pattern.zenith_rad
+        steps = config.scanner.model_copy(update={"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})  # of any size
+        pattern = Pattern.over(azimuth[:2], zenith[:2], steps)
+        scanner = LaserScanner(position, rotation, pattern, steps, model)
+    return Site("measured", measurement.notes, mesh, frame, scanner, {"scanner": position})

@@ -1,0 +1,135 @@
+"""The folder that `scarpsim calibrate` fills: calibrated.yaml, calibration.json, pictures and report.html."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.calibration.calibrate import Calibration
+from pipeline.calibration.maps import noise_map
+from pipeline.calibration.report import pictures, write_calibration_report
+from pipeline.config.simulation import SimulationConfig
+from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
+from pipeline.formats.geotiff import write_geotiff
+from pipeline.report.provenance import versions
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from scene.raycast import RayCaster
+from scene.yaml_text import yaml_line
+
+MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "report.html"
+
+
+def write(out: Path, config: SimulationConfig, result: Calibration, inputs: Sequence[Path]) -> Path:
+    """Write everything; returns the report's path. The folder appears when all of it is there; InputError where it is in use."""
+    with filling(out) as folder:
+        _write(folder, config, result, inputs)
+    return out / REPORT_FILE
+
+
+def _write(out: Path, config: SimulationConfig, result: Calibration, inputs: Sequence[Path]) -> None:
+    write_text(out / MODEL_FILE, model_yaml(result))
+    write_geotiff(out / "systematic.tif", result.systematic, result.material.grid, description="mean of the measured maps")
+    whole = None if result.material.of_points else _whole_map(config, result)
+    if whole is not None:
+        write_geotiff(out / "simulated.tif", whole, result.material.grid, description="simulated with the calibrated noise")
+    shown = pictures(result, whole)
+    for name, _, png in shown:
+        write_bytes(out / f"{name}.png", png)
+    record = {"schema": 1, **to_dict(result), "inputs": inputs, "seed": config.seed}
+    write_json(out / RECORD_FILE, record | {"config": config.model_dump(mode="json"), "versions": versions()})
+    write_calibration_report(out / REPORT_FILE, result, shown, config.model_dump(mode="json"))
+
+
+def _whole_map(config: SimulationConfig, result: Calibration) -> FloatArray:
+    """One map of the whole wall by the whole simulation, on the measured maps' grid, m; NaN where those have no data."""
+    site = result.simulated_site()
+    random = KeyedRandom(config.seed).child("calibrate", "whole")
+    values = noise_map(config, site, site, RayCaster(site.mesh), random, result.material.grid)
+    return np.where(np.isnan(result.material.maps[-1]), np.float32(np.nan), values)
+
+
+def model_yaml(result: Calibration) -> str:
+    """The calibrated sensor model as `simulate --set sensor=calibrated.yaml` reads it, each fitted value with its interval."""
+    found, names = result.found, result.parameters.names
+    share = result.confidence
+    lines = [f"# Calibrated on {len(result.epochs)} difference map(s) by scarpsim calibrate; intervals of {share:.0%}."]
+    for name, value, low, high in zip(names, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True):
+        lines.append(f"# {name}: {value:.4g} ({low:.4g} to {high:.4g})")
+    return "\n".join(lines) + "\n" + _yaml(_rounded(result.model.model_dump(mode="json")), 0)
+
+
+def _yaml(values: dict[str, Any], depth: int) -> str:
+    """Nested mappings as block YAML; anything else on one line."""
+    text = ""
+    for key, value in values.items():
+        if isinstance(value, dict) and value:
+            text += f"{'  ' * depth}{key}:\n{_yaml(value, depth + 1)}"
+        else:
+            text += f"{'  ' * depth}{key}: {yaml_line(value)}\n"
+    return text
+
+
+def _rounded(value: Any) -> Any:
+    """The same with numbers of six digits; spreads of mean 0 as the number alone."""
+    if isinstance(value, dict):
+        if set(value) == {"mean", "sigma"} and value["mean"] == 0:
+            return _rounded(value["sigma"])
+        return {key: _rounded(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(each) for each in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def to_dict(result: Calibration) -> dict[str, Any]:
+    """The result as calibration.json holds it."""
+    found, names = result.found, result.parameters.names
+    values = zip(names, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True)
+    scatter = np.sqrt(np.diag(found.surface.covariance))
+    expected = found.surface.mean(found.x)
+    return {
+        "sensor": result.sensor,
+        "parameters": {name: {"value": value, "low": low, "high": high} for name, value, low, high in values},
+        "confidence": result.confidence,
+        "correlation": {"names": names, "matrix": found.correlation},
+        "inseparable": [{"names": [first, second], "correlation": value} for first, second, value in result.inseparable()],
+        "orientation_patterns": None if result.patterns is None else result.patterns.to_dict(),
+        "cost": {"value": found.cost, "statistics": len(result.statistics), "p_value": found.misfit_p, "settled": found.settled},
+        "statistics": [
+            {"name": name, "measured": measured, "expected": mean, "log_sigma": sigma, "standardised": misfit}
+            for name, measured, mean, sigma, misfit in zip(
+                result.statistics, np.exp(result.observed), np.exp(expected), scatter, found.misfit, strict=True
+            )
+        ],
+        "epochs": [each.to_dict() for each in result.epochs],
+        "trend": {"median": result.median_trend.to_dict(), "standard_deviation": result.std_trend.to_dict()},
+        "stable": {
+            "drawn": result.material.drawn,
+            "share": float(np.mean(result.material.stable)),
+            "windows": len(result.windows.corner),
+            "window_px": result.windows.side,
+        },
+        "search": {
+            "simulated_maps": found.maps,
+            "observations_per_s": result.rate,
+            "cells_per_observation": result.cells,
+            "seconds": result.seconds,
+        },
+        "greedy": None if result.baseline is None else _baseline(result),
+    }
+
+
+def _baseline(result: Calibration) -> dict[str, Any]:
+    baseline = result.baseline
+    assert baseline is not None
+    return {
+        "parameters": dict(zip(result.parameters.names, np.exp(baseline.result.x), strict=True)),
+        "simulated_maps": baseline.result.tests,
+        "relative_error_of_std": baseline.result.relative_error,
+        "cost": baseline.cost,
+        "overtaken_after_maps": baseline.overtaken,
+        "cost_here": [{"simulated_maps": maps, "cost": cost} for maps, cost in baseline.costs],
+    }

@@ -1,0 +1,346 @@
+"""The figures of a comparison: noise, level of detection, blocks seen, completeness, of each sensor and of measured epochs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.difference import DifferenceStatistics, statistics
+from pipeline.comparison.detection import (
+    LEAST_CELL_PIXELS,
+    BlockSeen,
+    MeanTest,
+    blocks_seen,
+    false_alarms,
+    footprints,
+    level_of_detection,
+    wilson_interval,
+)
+from pipeline.comparison.detection_curve import DetectionCurve, detection_curve
+from pipeline.comparison.trial import Seen, Trial
+from pipeline.noise.measured import MeasuredMaps
+from pipeline.noise.statistics import (
+    Bin,
+    DensityHistogram,
+    Normality,
+    Tails,
+    binned,
+    histogram,
+    normality,
+    quantile_edges,
+    tails,
+    without_outliers,
+)
+from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
+from scene.grid import Grid
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+
+Raster = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+_CELL_M = 0.5
+"""Cells of the level of detection."""
+_MOST_BINNED = 4_000_000
+"""Differences that are sorted by a covariate; of more a regular part is taken."""
+_VARIOGRAM_MAPS = 4
+_EDGE_STEPS_PX = (0, 1, 2, 4, 8, 16, 32, 64)
+_SIZE_CLASSES = 8
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of a stack of difference maps over stable ground.
+
+    stable: pooled over the epochs; per_epoch; tails, normality, histogram: of all; variogram, model: of the differences within
+    five NMAD; effective: independent pixels of the first map's stable ground, of `pixels`; level: (h, w) level of detection, m.
+    """
+
+    stable: DifferenceStatistics
+    per_epoch: list[DifferenceStatistics]
+    tails: Tails
+    normality: Normality
+    histogram: DensityHistogram
+    variogram: Variogram
+    model: VariogramModel
+    effective: float
+    pixels: int
+    level: Raster
+
+    @property
+    def median_level_m(self) -> float | None:
+        """Median over the map of the level of detection of a pixel, m; None where there is none."""
+        known = self.level[~np.isnan(self.level)]
+        return float(np.median(known)) if known.size else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {
+            "stable": self.stable.to_dict(),
+            "per_epoch": [each.to_dict() for each in self.per_epoch],
+            "tails": self.tails.to_dict(),
+            "normality": self.normality.to_dict(),
+            "variogram": self.variogram.to_dict(),
+            "variogram_model": self.model.to_dict(),
+            "effective_sample_size": self.effective,
+            "pixels": self.pixels,
+            "level_of_detection_median_m": self.median_level_m,
+        }
+
+
+@dataclass(frozen=True)
+class SizeClass:
+    """Blocks whose size (or depth) lies in [low_m, high_m).
+
+    interval: 95 %, of the share seen; volume_error, volume_spread: median and NMAD of measured over true volume minus one, None
+    without blocks.
+    """
+
+    low_m: float
+    high_m: float
+    blocks: int
+    seen: int
+    interval: tuple[float, float]
+    volume_error: float | None
+    volume_spread: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON and CSV hold it."""
+        return {
+            "low_m": self.low_m,
+            "high_m": self.high_m,
+            "blocks": self.blocks,
+            "seen": self.seen,
+            "share_low": self.interval[0],
+            "share_high": self.interval[1],
+            "volume_error": self.volume_error,
+            "volume_spread": self.volume_spread,
+        }
+
+
+@dataclass(frozen=True)
+class Detection:
+    """The blocks and how many were seen.
+
+    by_size, by_depth: curves over the blocks in view, None for fewer than ten, and classes of them; table: shares seen of them,
+    (sizes, depths), NaN without blocks; alarms of trials: footprints on stable ground that were taken for blocks.
+    """
+
+    blocks: list[BlockSeen]
+    by_size: DetectionCurve | None
+    by_depth: DetectionCurve | None
+    size_classes: list[SizeClass]
+    depth_classes: list[SizeClass]
+    table: FloatArray
+    alarms: int
+    trials: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it; the blocks are in blocks.csv."""
+        return {
+            "blocks": len(self.blocks),
+            "in_view": sum(block.in_view for block in self.blocks),
+            "seen": sum(block.seen for block in self.blocks),
+            "by_size": None if self.by_size is None else self.by_size.to_dict(),
+            "by_depth": None if self.by_depth is None else self.by_depth.to_dict(),
+            "size_classes": [each.to_dict() for each in self.size_classes],
+            "depth_classes": [each.to_dict() for each in self.depth_classes],
+            "false_alarms": self.alarms,
+            "false_alarm_trials": self.trials,
+        }
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """All figures of one sensor. wall: errors everywhere, within the niches too; complete: share of the wall with data, mean over
+    the epochs; visible: share that the sensor can see; complete_of_visible; by: statistics against each covariate."""
+
+    name: str
+    sensor: str
+    noise: Noise
+    wall: DifferenceStatistics
+    by: dict[str, list[Bin]]
+    detection: Detection
+    visible: float
+    complete: float
+    complete_of_visible: float
+    points: int
+    scan_seconds: float | None
+    seconds: float
+    registration_rms_m: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return {
+            "name": self.name,
+            "sensor": self.sensor,
+            "noise": self.noise.to_dict(),
+            "wall": self.wall.to_dict(),
+            "by": {name: [each.to_dict() for each in bins] for name, bins in self.by.items()},
+            "detection": self.detection.to_dict(),
+            "visible": self.visible,
+            "complete": self.complete,
+            "complete_of_visible": self.complete_of_visible,
+            "points": self.points,
+            "scan_seconds": self.scan_seconds,
+            "seconds_per_epoch": self.seconds,
+            "registration_rms_m": self.registration_rms_m,
+        }
+
+
+def noise_of(stable: Raster, gsd_m: float, random: KeyedRandom) -> Noise:
+    """The noise of difference maps (e, h, w), m, NaN where not stable or without data."""
+    found = variogram(np.stack([without_outliers(each) for each in stable[:_VARIOGRAM_MAPS]]), gsd_m)
+    model = fit_variogram(found)
+    known = ~np.isnan(stable[0])
+    effective = effective_sample_size(model, known, gsd_m) if known.any() else 0.0
+    return Noise(
+        stable=statistics(stable),
+        per_epoch=[statistics(each) for each in stable],
+        tails=tails(stable),
+        normality=normality(stable[0], effective, random.child("normality")),
+        histogram=histogram(stable),
+        variogram=found,
+        model=model,
+        effective=effective,
+        pixels=int(np.count_nonzero(known)),
+        level=level_of_detection(stable, _cell_px(stable, gsd_m)),
+    )
+
+
+def _cell_px(stable: Raster, gsd_m: float) -> int:
+    """Side of the cells of the level of detection: half a metre, more where data is so sparse that few would fall into it."""
+    per_pixel = max(float(np.mean(~np.isnan(stable))) * len(stable), 1e-6)
+    enough = int(np.ceil(np.sqrt(2 * LEAST_CELL_PIXELS / per_pixel)))
+    return min(max(round(_CELL_M / gsd_m), enough), max(stable.shape[1:]))
+
+
+def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> Assessment:
+    """The figures of one sensor of a trial; `random` draws samples, footprints' places and resamples."""
+    gsd = trial.grid.gsd
+    random = random.child("compare", seen.contestant.name)
+    stable = np.where(np.stack([epoch.stable for epoch in trial.epochs]), seen.changes, np.nan).astype(np.float32)
+    errors = np.stack([change - epoch.change for change, epoch in zip(seen.changes, trial.epochs, strict=True)])
+    noise = noise_of(stable, gsd, random)
+    data, surface = ~np.isnan(seen.changes), trial.ground.found
+    in_view = seen.visible & surface
+    return Assessment(
+        name=seen.contestant.name,
+        sensor=seen.contestant.sensor,
+        noise=noise,
+        wall=statistics(errors),
+        by=_by_covariates(stable, trial, seen),
+        detection=_detection(trial, seen, stable, MeanTest(noise.model, noise.level, gsd), random),
+        visible=float(np.mean(in_view[surface])),
+        complete=float(np.mean(data[:, surface])),
+        complete_of_visible=float(np.mean(data[:, in_view])) if in_view.any() else 0.0,
+        points=seen.points[0],
+        scan_seconds=_scan_seconds(seen),
+        seconds=float(np.mean(seen.seconds)),
+        registration_rms_m=float(np.mean(seen.registration_rms_m)) if seen.registration_rms_m else None,
+    )
+
+
+def assess_measured(found: MeasuredMaps, random: KeyedRandom) -> Noise:
+    """The noise of measured epochs over the stable areas as drawn; where none are, over all but gross differences."""
+    stable = (
+        np.where(found.stable, found.maps, np.nan)
+        if found.stable is not None
+        else np.stack(list(map(without_outliers, found.maps)))
+    )
+    return noise_of(stable.astype(np.float32), found.grid.gsd, random.child("measured", found.name))
+
+
+def _scan_seconds(seen: Seen) -> float | None:
+    """How long the instrument measures, all stations together; None for cameras."""
+    looks = seen.reference.observations
+    if looks[0].pulse_interval_s is None:
+        return None
+    return float(sum(each.depth.size * (each.pulse_interval_s or 0.0) for each in looks))
+
+
+def _by_covariates(stable: Raster, trial: Trial, seen: Seen) -> dict[str, list[Bin]]:
+    """Statistics of the stable differences against what they may depend on."""
+    step = int(np.ceil(np.sqrt(stable.size / _MOST_BINNED)))
+    part = stable[:, ::step, ::step]
+
+    def against(covariate: NDArray[np.floating], edges: FloatArray | None = None) -> list[Bin]:
+        thinned = covariate[::step, ::step]
+        return binned(part, np.broadcast_to(thinned, part.shape), quantile_edges(thinned) if edges is None else edges)
+
+    edge_bins = np.array([*_EDGE_STEPS_PX, np.inf]) * trial.grid.gsd
+    incidence = np.radians([0, 10, 20, 30, 40, 50, 60, 70, 80, 90])
+    return {
+        "range_m": against(seen.range_m),
+        "incidence_rad": against(seen.incidence_rad, incidence),
+        "edge_m": against(trial.ground.edge_m, edge_bins),
+        "albedo": against(trial.ground.albedo),
+    }
+
+
+def _detection(trial: Trial, seen: Seen, stable: Raster, test: MeanTest, random: KeyedRandom) -> Detection:
+    blocks: list[BlockSeen] = []
+    alarms = trials = 0
+    for number, (epoch, change) in enumerate(zip(trial.epochs, seen.changes, strict=True)):
+        blocks += blocks_seen(epoch.number, change, epoch.block, epoch.change, epoch.records, seen.visible, test)
+        shapes = [shape for _, _, shape in footprints(epoch.block, epoch.change)]
+        found, of = false_alarms(stable[number], shapes, test, random.child("alarms", number))
+        alarms, trials = alarms + found, trials + of
+    shown = [block for block in blocks if block.in_view]
+    size, depth = (np.array([getattr(block, name) for block in shown]) for name in ("size_m", "depth_m"))
+    hit = np.array([block.seen for block in shown], dtype=bool)
+    return Detection(
+        blocks,
+        detection_curve(size, hit),
+        detection_curve(depth, hit),
+        size_classes(shown, size, class_edges(size)),
+        size_classes(shown, depth, class_edges(depth)),
+        _table(size, depth, hit),
+        alarms,
+        trials,
+    )
+
+
+def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
+    """Edges of classes of equal width in the logarithm over all the values."""
+    if len(values) == 0:
+        return np.array([0.01, 1.0])
+    low, high = float(values.min()), float(values.max())
+    return np.geomspace(low, max(high, low * 1.01) * (1 + 1e-9), classes + 1)
+
+
+def size_classes(blocks: list[BlockSeen], values: FloatArray, edges: FloatArray) -> list[SizeClass]:
+    """The blocks by classes of one of their measures, (k,), m."""
+    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    return [
+        _class(float(edges[i]), float(edges[i + 1]), [blocks[k] for k in np.flatnonzero(place == i)])
+        for i in range(len(edges) - 1)
+    ]
+
+
+def _class(low: float, high: float, blocks: list[BlockSeen]) -> SizeClass:
+    seen = sum(block.seen for block in blocks)
+    ratio = np.array([block.measured_volume_m3 / block.volume_m3 - 1 for block in blocks if block.volume_m3 > 0])
+    size = statistics(ratio)
+    error = (size.median, size.nmad) if size.count else (None, None)
+    return SizeClass(low, high, len(blocks), seen, wilson_interval(seen, len(blocks)), *error)
+
+
+def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
+    """(sizes, depths) share seen in each class of both, NaN without blocks."""
+    edges = class_edges(size), class_edges(depth)
+    count, _, _ = np.histogram2d(size, depth, edges)
+    seen, _, _ = np.histogram2d(size[hit], depth[hit], edges)
+    return np.divide(seen, count, out=np.full(count.shape, np.nan), where=count > 0)
+
+
+def shared_scale_m(noises: list[Noise]) -> float:
+    """The sigma of a colour scale for all: the largest NMAD over stable ground, so that nobody's noise saturates."""
+    return max((each.stable.nmad for each in noises if each.stable.count), default=1e-3) or 1e-3
+
+
+def grid_record(grid: Grid) -> dict[str, float]:
+    """Where the shared pixels lie, as JSON holds it."""
+    return {"x_min_m": grid.x_min, "y_max_m": grid.y_max, "gsd_m": grid.gsd, "width_px": grid.width, "height_px": grid.height}

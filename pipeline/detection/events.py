@@ -1,0 +1,86 @@
+"""Detections as people use them: a table of events with volumes in the wall's coordinates, a raster of masks, COCO files."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.annotate import BLOCK_CATEGORY
+from pipeline.detection.detections import Detection
+from pipeline.formats.atomic import write_json, write_text
+from scene.grid import Grid
+
+
+@dataclass(frozen=True)
+class Event:
+    """One rockfall. x_m, y_m: centre of its mask in the map's frame, the wall's; depth_m: largest; volume_m3: over the mask.
+
+    Depth and volume are those of the difference map, along the wall's normal; pixels without data count with the mean depth.
+    """
+
+    image: str
+    number: int
+    x_m: float
+    y_m: float
+    width_m: float
+    height_m: float
+    area_m2: float
+    depth_m: float
+    mean_depth_m: float
+    volume_m3: float
+    score: float
+
+
+def event(item: Detection, number: int, image: str, difference: NDArray[np.float32], grid: Grid) -> Event:
+    """The event behind a detection in the difference map (h, w), m."""
+    height, width = item.mask.shape
+    values = difference[item.row : item.row + height, item.column : item.column + width][item.mask]
+    known = values[np.isfinite(values)].astype(np.float64)
+    mean = float(known.mean()) if known.size else 0.0
+    rows, columns = np.nonzero(item.mask)
+    area = item.area_px * grid.gsd**2
+    return Event(
+        image=image,
+        number=number,
+        x_m=grid.x_min + (item.column + float(columns.mean()) + 0.5) * grid.gsd,
+        y_m=grid.y_max - (item.row + float(rows.mean()) + 0.5) * grid.gsd,
+        width_m=width * grid.gsd,
+        height_m=height * grid.gsd,
+        area_m2=area,
+        depth_m=float(known.max()) if known.size else 0.0,
+        mean_depth_m=mean,
+        volume_m3=mean * area,
+        score=item.score,
+    )
+
+
+def write_events(events: Sequence[Event], path: Path) -> None:
+    """A CSV table, one line per event, metres with 4 decimals."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(Event.__dataclass_fields__)
+    for item in events:
+        table.writerow([f"{value:.4f}" if isinstance(value, float) else value for value in asdict(item).values()])
+    write_text(path, text.getvalue())
+
+
+def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """(h, w) the number of the best detection at each pixel, counted from 1, NaN where there is none."""
+    result = np.full(shape, np.nan, np.float32)
+    for number, item in reversed(list(enumerate(found, start=1))):
+        height, width = item.mask.shape
+        view = result[item.row : item.row + height, item.column : item.column + width]
+        view[item.mask] = number
+    return result
+
+
+def write_coco(images: Sequence[dict[str, Any]], annotations: Sequence[dict[str, Any]], path: Path) -> None:
+    """Images and scored annotations as a COCO data set, which pycocotools loads; `annotations` alone is its result form."""
+    write_json(path, {"images": images, "annotations": annotations, "categories": [BLOCK_CATEGORY]})

@@ -1,0 +1,87 @@
+"""Detection in whole difference maps: tiles with overlap, and one answer at their seams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.detection.detections import Detection, cropped
+from pipeline.detection.normalisation import nmad, normalised
+from pipeline.detection.seams import Part, Tile, part, without_seams
+
+_BATCH = 4
+
+
+def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0.5) -> list[Detection]:
+    """The blocks in a difference map (h, w), m, NaN where there are no data, best first.
+
+    model: a MaskRCNN. Tiles overlap by a half of their side, so that every block of up to that size lies whole in one of them;
+    `seams` says what becomes of the blocks that a tile's inner border cuts.
+    """
+    size = model.size
+    noise = nmad(difference)
+    parts: list[Part] = []
+    tiles = [Tile(row, column, size, difference.shape) for row, column in tile_places(difference.shape, size)]
+    for first in range(0, len(tiles), _BATCH):
+        group = tiles[first : first + _BATCH]
+        images = [normalised(_pixels(difference, tile), model.config.normalisation, noise) for tile in group]
+        images += [images[0]] * (_BATCH - len(images))  # one shape, one compiled function
+        answers = model.predict_on_batch({"image": np.stack(images)})
+        for number, tile in enumerate(group):
+            answer = {name: values[number] for name, values in answers.items()}
+            parts += [part(item, tile) for item in _in_tile(answer, minimum_score, tile)]
+    return without_seams(parts)
+
+
+def tile_places(shape: tuple[int, ...], size: int) -> Iterator[tuple[int, int]]:
+    """(row, column) of tiles of side `size` that overlap by a half and end flush with the map where it is larger than a tile."""
+    rows, columns = (_starts(length, size) for length in shape)
+    return ((row, column) for row in rows for column in columns)
+
+
+def paste(probability: NDArray[np.float32], box: NDArray[np.float32], size: int) -> tuple[int, int, NDArray[np.bool_]]:
+    """Row, column and mask of the pixels of an image of side `size` whose centres have a probability above a half.
+
+    probability: (m, m) over the box (y0, x0, y1, x1), px; it is interpolated bilinearly between the centres of its cells.
+    """
+    y0, x0, y1, x1 = (float(value) for value in box)
+    top, left = max(int(np.floor(y0)), 0), max(int(np.floor(x0)), 0)
+    bottom, right = min(int(np.ceil(y1)), size), min(int(np.ceil(x1)), size)
+    cells = probability.shape[0]
+    rows = (np.arange(top, bottom, dtype=np.float32) + 0.5 - y0) / max(y1 - y0, 1e-6) * cells - 0.5
+    columns = (np.arange(left, right, dtype=np.float32) + 0.5 - x0) / max(x1 - x0, 1e-6) * cells - 0.5
+    if not len(rows) or not len(columns):
+        return top, left, np.zeros((0, 0), bool)
+    x, y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    values = cv2.remap(probability, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return top, left, values > 0.5
+
+
+def _starts(length: int, size: int) -> list[int]:
+    if length <= size:
+        return [0]
+    count = -(-(length - size) // (size // 2)) + 1
+    return [round(number * (length - size) / (count - 1)) for number in range(count)]
+
+
+def _pixels(difference: NDArray[np.float32], tile: Tile) -> NDArray[np.float32]:
+    """(size, size) what the tile shows, NaN beyond the map."""
+    cut = difference[tile.row : tile.row + tile.size, tile.column : tile.column + tile.size]
+    missing = [(0, tile.size - length) for length in cut.shape]
+    return np.pad(cut, missing, constant_values=np.nan)
+
+
+def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, tile: Tile) -> Iterator[Detection]:
+    """What the network found in the tile, in the map's frame."""
+    top, bottom, left, right = tile.bounds
+    for box, score, mask in zip(answer["boxes"], answer["scores"], answer["masks"], strict=True):
+        if score < minimum_score:
+            return
+        row, column, pixels = paste(mask, box, tile.size)
+        item = cropped(pixels[: max(bottom - top - row, 0), : max(right - left - column, 0)], row, column, float(score))
+        if item is not None:
+            yield item.moved(top, left)

@@ -1,0 +1,104 @@
+"""`scarpsim evaluate`: files in, tables out."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.detection.evaluate import CONFIDENCES, Overlap, Score, coco_metrics, evaluate
+from pipeline.formats.atomic import write_json, write_text
+from pipeline.formats.coco import read_coco, read_detections
+from scene.errors import InputError, nearest
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Scores of every group and pycocotools' figures over all images."""
+
+    scores: list[Score]
+    coco: dict[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON types."""
+        return {"scores": [score.to_dict() for score in self.scores], "coco": self.coco}
+
+
+def assess(
+    truth: Path,
+    predictions: Path,
+    keys: Sequence[str] = (),
+    kind: Overlap = "segm",
+    confidences: Sequence[float] = CONFIDENCES,
+) -> Assessment:
+    """Compare two COCO files; `keys` of the truth's images, such as noise or wall, make the groups.
+
+    kind: overlap of masks or of boxes; confidences: lowest scores that count, each a column of the tables.
+
+    Raises InputError for all that `read_coco` and `read_detections` do, and for keys that do not tell the images apart.
+    """
+    path = truth / "annotations.json" if truth.is_dir() else truth
+    reference = read_coco(path, masks=kind == "segm")
+    found = read_detections(predictions, reference, masks=kind == "segm")
+    groups = _groups(reference.images, keys, str(path))
+    scores = evaluate(reference.to_dict(), found, groups, confidences, kind=kind)
+    return Assessment(scores, coco_metrics(reference.to_dict(), found, kind))
+
+
+def as_text(assessment: Assessment) -> str:
+    """Tables in the form of the thesis's, one per group, and COCO's figures."""
+    lines = []
+    groups: dict[str, list[Score]] = {}
+    for score in assessment.scores:
+        groups.setdefault(score.group, []).append(score)
+    for group, scores in groups.items():
+        lines += ["", group, f"{'confidence':<12}" + "".join(f"{_probability(score.confidence):>9}" for score in scores)]
+        lines.append(f"{'IoU':<12}" + "".join(f"{score.iou:>9.2f}" for score in scores))
+        for title, name in (("TP", "true_positives"), ("FP", "false_positives"), ("FN", "false_negatives")):
+            lines.append(f"{title:<12}" + "".join(f"{getattr(score, name):>9}" for score in scores))
+        for title, name in (("precision", "precision"), ("recall", "recall"), ("F1", "f1"), ("area ratio", "area_ratio")):
+            lines.append(f"{title:<12}" + "".join(_cell(getattr(score, name)) for score in scores))
+    coco = "  ".join(f"{name} {value:.3f}" for name, value in assessment.coco.items() if value >= 0)
+    return "\n".join([*lines[1:], "", f"COCO: {coco}"])
+
+
+def write(assessment: Assessment, folder: Path) -> None:
+    """scores.json and scores.csv."""
+    write_json(folder / "scores.json", assessment.to_dict())
+    text = io.StringIO()
+    rows = [score.to_dict() for score in assessment.scores]
+    table = csv.DictWriter(text, rows[0], lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    write_text(folder / "scores.csv", text.getvalue())
+
+
+def _probability(value: float) -> str:
+    """With two decimals, or more where it has more."""
+    return max(f"{value:.2f}", f"{value:g}", key=len)
+
+
+def _cell(value: float) -> str:
+    return f"{'-':>9}" if np.isnan(value) else f"{100 * value:>7.1f} %"
+
+
+def _groups(images: Sequence[Mapping[str, Any]], keys: Sequence[str], where: str) -> dict[str, list[int]]:
+    groups: dict[str, list[int]] = {"all": [image["id"] for image in images]}
+    for key in keys:
+        known = [name for name in sorted(set.intersection(*map(set, images))) if all(_is_word(image[name]) for image in images)]
+        if key not in known:
+            problem = f"the images' '{key}' is no word or number" if any(key in image for image in images) else ""
+            problem = problem or f"the images have no '{key}'"
+            raise InputError(problem, where=where, allowed=", ".join(known), remedy=nearest(key, known) or "give another --by")
+        for value in sorted({image[key] for image in images}, key=str):
+            groups[f"{key} {value}"] = [image["id"] for image in images if image[key] == value]
+    return groups
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str | int | float | bool | None)

@@ -1,0 +1,172 @@
+"""Training: epochs of steps, validation, checkpoints, an early stop; it goes on after a kill as if nothing had been."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import keras
+import numpy as np
+
+from pipeline.detection import weights
+from pipeline.detection.config import TrainConfig
+from pipeline.detection.data import CocoFolder, batches
+from pipeline.detection.figures import write_loss_figure
+from pipeline.detection.model import LOSSES, MaskRCNN, total_loss
+from pipeline.detection.operating_point import set_operating_point
+from pipeline.detection.schedule import has_settled, learning_rate
+from pipeline.formats.atomic import write_json, writing
+from pipeline.report.progress import Progress
+from scene.errors import InputError
+
+CHECKPOINT, BEST = "checkpoint", "best"
+_STATE, _OPTIMIZER = "state.json", "optimizer.npz"
+
+
+@dataclass
+class History:
+    """Mean losses per epoch, by name; `loss` is their weighted sum."""
+
+    training: list[dict[str, float]] = field(default_factory=list)
+    validation: list[dict[str, float]] = field(default_factory=list)
+
+    @property
+    def total(self) -> list[float]:
+        """The validation loss of each epoch."""
+        return [losses["loss"] for losses in self.validation]
+
+
+def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = False, progress: Progress | None = None) -> History:
+    """Train a detector on DATA_SET/train, validate on DATA_SET/val; the best and the last go to out/best and out/checkpoint.
+
+    At the end the best one's scores are shifted as `set_operating_point` says.
+
+    With `resume` it goes on after the last whole epoch in `out`, to the same losses as without the interruption. Raises
+    InputError for a data set without these folders and for an `out` that holds another training.
+    """
+    progress = progress or Progress()
+    folders = CocoFolder(data_set / "train"), CocoFolder(data_set / "val")
+    training = config.training
+    with progress.stage("network"):
+        model = MaskRCNN(config.detector, training.crop_px, training.seed, training.loss_weights)
+        model.compile(optimizer=_optimizer(config), jit_compile=False)
+        model.optimizer.build(model.trainable_variables)
+        history = _begun(out, config, model, resume=resume)
+    steps = -(-len(folders[0]) // training.batch)
+    logged = _EventLog(out / "events")
+    epochs = {f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)}
+    progress.plan({**epochs, "scores": 0.3})
+    for epoch in range(len(history.training), training.epochs):
+        if has_settled(history.total, training):
+            break
+        with progress.stage(f"epoch {epoch + 1}"):
+            history.training.append(_learn(model, folders[0], config, epoch, steps, progress))
+            history.validation.append(_validate(model, folders[1], config))
+            logged.add(epoch, history)
+            _save(out, config, model, history)
+            write_loss_figure(history.training, history.validation, out / "losses.png")
+    with progress.stage("scores"):
+        set_operating_point(out / BEST, folders[1])
+    return history
+
+
+def _learn(
+    model: MaskRCNN, folder: CocoFolder, config: TrainConfig, epoch: int, steps: int, progress: Progress
+) -> dict[str, float]:
+    found = []
+    for step, batch in enumerate(batches(folder, config.detector, config.training, epoch, learning=True)):
+        model.optimizer.learning_rate = learning_rate(epoch * steps + step, config.training.epochs * steps, config.training)
+        found.append(model.train_on_batch(batch, return_dict=True))
+        progress.advance((step + 1) / (steps + 1))
+    return _mean(found, config)
+
+
+def _validate(model: MaskRCNN, folder: CocoFolder, config: TrainConfig) -> dict[str, float]:
+    found = []
+    for batch in batches(folder, config.detector, config.training, 0, learning=False):
+        model.reset_metrics()  # train_on_batch does so itself, test_on_batch does not
+        found.append(model.test_on_batch(batch, return_dict=True))
+    return _mean(found, config)
+
+
+def _mean(batch_losses: list[dict[str, Any]], config: TrainConfig) -> dict[str, float]:
+    found: dict[str, float] = {name: float(np.mean([losses[name] for losses in batch_losses])) for name in LOSSES}
+    return {"loss": total_loss(found, config.training.loss_weights), **found}
+
+
+def _optimizer(config: TrainConfig) -> keras.optimizers.Optimizer:
+    training = config.training
+    common = {
+        "learning_rate": training.learning_rate,
+        "weight_decay": training.weight_decay,
+        "global_clipnorm": training.clip_norm,
+    }
+    if training.optimizer == "sgd":
+        return keras.optimizers.SGD(momentum=0.9, **common)
+    return keras.optimizers.AdamW(**common)
+
+
+def _begun(out: Path, config: TrainConfig, model: MaskRCNN, *, resume: bool) -> History:
+    """The history in `out`, with model and optimizer as they were then; an empty one for a new training."""
+    path = out / CHECKPOINT / _STATE
+    if not path.is_file():
+        return History()
+    if not resume:
+        raise InputError(
+            "holds a training already", where=str(out), remedy="add --resume to go on with it, or choose another --out"
+        )
+    state = json.loads(path.read_text(encoding="utf-8"))
+    if state["config"] != config.model_dump(mode="json"):
+        raise InputError("holds a training with another config", where=str(out), remedy="use its config, or choose another --out")
+    model.load_weights(out / CHECKPOINT / state["weights"])
+    with np.load(out / CHECKPOINT / state["optimizer"]) as values:
+        for number, variable in enumerate(_further_state(model)):
+            variable.assign(values[str(number)])
+    return History(state["training"], state["validation"])
+
+
+def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> None:
+    """The state names the files of its epoch and is written last, so that a kill leaves the one before whole."""
+    folder, epoch = out / CHECKPOINT, len(history.training)
+    names = {"weights": f"epoch_{epoch:04d}.weights.h5", "optimizer": f"epoch_{epoch:04d}.{_OPTIMIZER}"}
+    weights.save_weights(model, folder / names["weights"])
+    with writing(folder / names["optimizer"]) as temporary:
+        values: dict[str, Any] = {str(n): np.asarray(variable) for n, variable in enumerate(_further_state(model))}
+        np.savez(temporary, **values)
+    if history.total[-1] == min(history.total):
+        weights.save(model, out / BEST)
+    state = {**names, "config": config.model_dump(mode="json"), "training": history.training, "validation": history.validation}
+    write_json(folder / _STATE, state)
+    for old in folder.glob("epoch_*"):
+        if old.name not in names.values():
+            old.unlink()
+
+
+def _further_state(model: MaskRCNN) -> list[Any]:
+    """What a training needs beside the weights to go on: the optimizer's variables and the place in the stream of samples."""
+    return [*model.optimizer.variables, model.samples.state]
+
+
+class _EventLog:
+    """The losses for TensorBoard, where TensorFlow is the backend."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._writers: dict[str, Any] = {}
+
+    def add(self, epoch: int, history: History) -> None:
+        """The last epoch's losses; the files are begun with the first, so that a training that fails before it leaves none."""
+        if keras.backend.backend() != "tensorflow":
+            return
+        import tensorflow as tf
+
+        if not self._writers:
+            names = ("training", "validation")
+            self._writers = {name: tf.summary.create_file_writer(str(self._folder / name)) for name in names}
+        for name, writer in self._writers.items():
+            with writer.as_default():
+                for loss, value in getattr(history, name)[-1].items():
+                    tf.summary.scalar(loss, value, step=epoch)
+            writer.flush()
