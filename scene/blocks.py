@@ -151,6 +151,18 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
     return _packed(solids, position)
 
 
+def given_blocks(position_m: FloatArray, size_m: FloatArray, rotation_rad: FloatArray, shape: str, subdivisions: int) -> Blocks:
+    """Regular blocks at given places, wall frame. position_m, size_m, rotation_rad (about x, then y, then z): (k, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    unit, faces = _primitive(shape, subdivisions)
+    found = [
+        _Solid(shape, size, Rotation.from_euler("xyz", turn).apply(unit * size), faces)
+        for size, turn in zip(size_m, rotation_rad, strict=True)
+    ]
+    return _packed(found, position_m)
+
+
 class _Search:
     """Rejection sampling of positions. boxes: (k, 2, 2) what is placed so far in x and y, NaN where not."""
 

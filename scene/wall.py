@@ -16,11 +16,13 @@ from scene.procedural import ProceduralWall
 
 @dataclass(frozen=True)
 class Wall:
-    """A rock wall. mesh: world frame, m, float64; repairs: what was mended in it, in words with counts; name: for reports."""
+    """A rock wall. mesh: world frame, m, float64; repairs: what was mended in it, in words with counts; name: for reports; file:
+    where it was read from, for errors."""
 
     mesh: TriangleMesh
     repairs: tuple[str, ...]
     name: str
+    file: str = ""
 
 
 def _kind(values: Any) -> str:
@@ -43,4 +45,4 @@ def build_wall(config: ProceduralWall | ImportedWall, random: KeyedRandom) -> Wa
     if isinstance(config, ProceduralWall):
         return Wall(config.mesh(random), (), config.style)
     mesh, repairs = config.load()
-    return Wall(mesh, repairs, config.mesh.stem)
+    return Wall(mesh, repairs, config.mesh.stem, str(config.mesh))

@@ -40,10 +40,9 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.calibration.inputs import config_of, sensor_of
     from pipeline.calibration.report import summary
     from pipeline.calibration.write import RECORD_FILE, write
-    from pipeline.cli.simulate import new_folder
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.config.simulation import load_config
-    from pipeline.formats.atomic import empty_folder
+    from pipeline.formats.atomic import empty_folder, new_folder
     from pipeline.report.progress import shown_progress
 
     given = config_path("sites", arguments.config) if arguments.config else config_of(arguments.measured)

@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.cli.simulate import new_folder
     from pipeline.detection.run import BASELINE, CONFIDENCES, checked_confidences, detect
+    from pipeline.formats.atomic import new_folder
     from pipeline.report.progress import shown_progress
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)

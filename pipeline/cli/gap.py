@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.cli.simulate import new_folder
+    from pipeline.formats.atomic import new_folder
 
     out = arguments.out or new_folder(Path("runs"), "gap")
     return _identifiability(arguments, out) if arguments.identifiability else _diagnosis(arguments, out)

@@ -40,10 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.cli.simulate import new_folder
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
-    from pipeline.formats.atomic import empty_folder
+    from pipeline.formats.atomic import empty_folder, new_folder
     from pipeline.icp_study.report import summary, write_icp_study
     from pipeline.icp_study.study import simulated_surfaces, study, surfaces_of_run
     from pipeline.registration.register import IcpConfig

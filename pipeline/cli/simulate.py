@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from datetime import datetime
 from pathlib import Path
 
 from pipeline.cli.answer import Answer, recorded
@@ -40,27 +39,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     if arguments.resume and not arguments.out:
         raise InputError("needs the folder to go on with", where="--resume", remedy="add --out DIR")
-    out = arguments.out or new_folder(Path("runs"), arguments.sensor)
     if arguments.threads:
         _use_threads(arguments.threads)
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.config.simulation import load_config
+    from pipeline.formats.atomic import new_folder
     from pipeline.report.progress import shown_progress
     from pipeline.run import simulation as pipeline_run
 
+    out = arguments.out or new_folder(Path("runs"), arguments.sensor)
     path = config_path("sites", arguments.config) if arguments.config else bundled_config("", "demo")
     config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)
     arguments.kept = f"what was finished is in {out} and usable; go on with --resume --out {out}"
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = pipeline_run.simulate(config, arguments.sensor, out, resume=arguments.resume, progress=progress)
     return Answer(f"report: {summary.report}", recorded(summary.report, "run.json"))
-
-
-def new_folder(parent: Path, name: str) -> Path:
-    """A path under `parent` that is not there yet, called after `name` and the time."""
-    stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
-    names = (stem if number == 1 else f"{stem}_{number}" for number in range(1, 1000))
-    return next(parent / free for free in names if not (parent / free).exists())
 
 
 def _use_threads(count: int) -> None:

@@ -50,8 +50,8 @@ def _write(out: Path, comparison: Comparison) -> None:
     write_csv(out / "by_covariate.csv", _covariate_rows(found))
     write_csv(out / "detection.csv", _class_rows(found))
     write_csv(out / "blocks.csv", ({"sensor": each.name, **b.to_dict()} for each in found for b in each.detection.blocks))
-    pictures = _pictures(comparison)
-    for name, png in pictures.items():
+    shown = pictures(comparison)
+    for name, png in shown.items():
         write_bytes(out / name, png)
     record = {
         "schema": 1,
@@ -72,7 +72,7 @@ def _write(out: Path, comparison: Comparison) -> None:
         answers=[answer(each) for each in found],
         names=list(comparison.noises()),
         rows=_rows(comparison, sizes),
-        pictures=pictures,
+        pictures=shown,
         epoch=_shown(trial),
         measured=[maps for maps, _ in comparison.measured],
         config=yaml.safe_dump(comparison.config, sort_keys=False, allow_unicode=True),
@@ -163,7 +163,8 @@ def _shown(trial: Trial) -> int:
     return trial.epochs[len(trial.epochs) // 2].number
 
 
-def _pictures(comparison: Comparison) -> dict[str, bytes]:
+def pictures(comparison: Comparison) -> dict[str, bytes]:
+    """The report's pictures as PNG, by the names of their files."""
     trial, found, noises = comparison.trial, comparison.found, comparison.noises()
     number = _shown(trial)
     epoch = trial.epochs[number - 1]

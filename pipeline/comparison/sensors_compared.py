@@ -6,14 +6,18 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from pipeline.config.bundled import bundled_config, configs_folder
+from pipeline.config.overrides import Override
 from pipeline.config.presets import is_path
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from scene.config import load_yaml, parse
 from scene.errors import InputError, nearest
 
+Given = str | tuple[str, SimulationConfig]
+"""What is compared: a name, or a config with the word that it goes by."""
+Overrides = Sequence[str | Override]
 _SCENE = ("seed", "wall", "rockfall", "wetness", "texture", "illumination", "difference")
 """What all share: taken from the first."""
 _KINDS = ("", "sites", "scanners", "noise")
@@ -36,13 +40,14 @@ class Contestant:
 
 
 def contestants(
-    names: Sequence[str], overrides: Sequence[str] = (), seed: int | None = None, *, own_step: bool = False
+    names: Sequence[Given], overrides: Overrides = (), seed: int | None = None, *, own_step: bool = False
 ) -> list[Contestant]:
     """The sensors that `names` stand for, in their order; a config with both sensors gives two.
 
-    A name is a config file, a run's folder or its run.json, a sensor model's file (sensor: tls ...), or a bundled name: a site,
-    a scanner preset (riegl_vz400i) or a noise model (glendale_high). Presets and models go into the first config's set-up, into
-    the demo's where they are first themselves. Scanner presets scan with that config's angular step, so that the instruments are
+    A name is a config with the word that it goes by, to which overrides and seed are applied already, a config file,
+    a run's folder or its run.json, a sensor model's file (sensor: tls ...), or a bundled name: a site, a scanner preset
+    (riegl_vz400i) or a noise model (glendale_high). Presets and models go into the first config's set-up, into the demo's
+    where they are first themselves. Scanner presets scan with that config's angular step, so that the instruments are
     compared and not the time that they are given; own_step: with the preset's own, or the default's where it has none.
     overrides: `--set` of every config. Raises InputError for an unknown name, with the nearest one, for one that is given twice,
     and for whatever is wrong in a file.
@@ -60,10 +65,12 @@ def contestants(
     return list(_with_own_names(placed))
 
 
-def _check_given_once(names: Sequence[str]) -> None:
+def _check_given_once(names: Sequence[Given]) -> None:
     """A sensor beside itself says nothing: the same epochs, to the byte."""
     given: dict[Path, str] = {}
     for name in names:
+        if not isinstance(name, str):
+            continue
         path = Path(name) / "run.json" if Path(name).is_dir() else Path(name)
         file = (path if path.exists() or is_path(name) else _bundled(name)).resolve()
         if file in given:
@@ -73,8 +80,10 @@ def _check_given_once(names: Sequence[str]) -> None:
         given[file] = name
 
 
-def _is_part(name: str) -> bool:
+def _is_part(name: Given) -> TypeGuard[str]:
     """Whether a name stands for a scanner or a model alone, that needs a config around it."""
+    if not isinstance(name, str):
+        return False
     if Path(name).is_dir():
         return False
     if Path(name).is_file():
@@ -93,8 +102,10 @@ def _bundled(name: str) -> Path:
     return path
 
 
-def _whole(name: str, overrides: Sequence[str], seed: int | None) -> list[Contestant]:
-    """The sensors of a config file, a run or a bundled config."""
+def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[Contestant]:
+    """The sensors of a config, a config file, a run or a bundled config."""
+    if not isinstance(name, str):
+        return _each_sensor(*name, name[1].sensor_names())
     path = Path(name)
     if path.is_dir():
         path = path / "run.json"
@@ -108,7 +119,11 @@ def _whole(name: str, overrides: Sequence[str], seed: int | None) -> list[Contes
         recorded = json.loads(path.read_text(encoding="utf-8")).get("sensor")
         sensors = (recorded,) if recorded in ("stereo", "tls") else sensors[:1]
     stem = path.parent.name if path.name == "run.json" else path.stem
-    return [Contestant(f"{stem}_{sensor}" if len(sensors) > 1 else stem, sensor, config) for sensor in sensors]
+    return _each_sensor(stem, config, sensors)
+
+
+def _each_sensor(name: str, config: SimulationConfig, sensors: Sequence[SensorName]) -> list[Contestant]:
+    return [Contestant(f"{name}_{sensor}" if len(sensors) > 1 else name, sensor, config) for sensor in sensors]
 
 
 def _part(name: str, base: SimulationConfig, *, own_step: bool) -> list[Contestant]:

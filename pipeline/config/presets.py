@@ -37,9 +37,9 @@ def model_file(name: str) -> Path:
     return Path(name) if is_path(name) else bundled_config("noise", name)
 
 
-def spelled_out(overrides: Sequence[str]) -> list[Override]:
+def spelled_out(overrides: Sequence[str | Override]) -> list[Override]:
     """The overrides, with `scanner=NAME` as `scanner.preset=NAME`: another instrument keeps the pattern that is scanned."""
-    found = [read_override(text) for text in overrides]
+    found = [read_override(each) if isinstance(each, str) else each for each in overrides]
     return [
         replace(each, path=("scanner", "preset")) if each.path == ("scanner",) and isinstance(each.value, str) else each
         for each in found

@@ -15,7 +15,7 @@ from pipeline.change.m3c2 import M3c2Config
 from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
-from pipeline.config.overrides import apply_overrides
+from pipeline.config.overrides import Override, apply_overrides
 from pipeline.config.presets import is_path, model_file, spelled_out, with_preset, without_what_a_preset_sets
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import PairConfig, read_cameras_yaml
@@ -190,7 +190,7 @@ class SimulationConfig(Config):
         return self.cameras.place(target) if isinstance(self.cameras, RigConfig) else self.cameras.pair()
 
 
-def load_config(path: Path, overrides: Sequence[str], sensor: SensorName | None, seed: int | None) -> SimulationConfig:
+def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None) -> SimulationConfig:
     """Read a config file, apply `--set` overrides and the seed.
 
     Paths in the file are relative to its folder, those of overrides to the working folder; both become absolute.
@@ -200,7 +200,14 @@ def load_config(path: Path, overrides: Sequence[str], sensor: SensorName | None,
     says of the instrument (pipeline/config/presets.py). Raises InputError for whatever is wrong, and where the config's only
     models are of another sensor than `sensor` (None: any).
     """
-    values, own = load_yaml(path), {}
+    return resolved(load_yaml(path), overrides, sensor, seed, path)
+
+
+def resolved(
+    values: Any, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None, path: Path
+) -> SimulationConfig:
+    """`load_config` of values that are read already; path: of the file that they come from, or as which they are named."""
+    own: dict[str, Any] = {}
     values = {} if values is None else values
     if not isinstance(values, dict):
         raise InputError("is not a mapping of keys", where=str(path), remedy="write `key: value` lines; see `scarpsim init`")

@@ -11,7 +11,7 @@ from pydantic import Field, StringConstraints, ValidationError, field_validator,
 from pipeline.change.annotate import AnnotationConfig
 from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
-from pipeline.config.overrides import apply_overrides
+from pipeline.config.overrides import Override, apply_overrides
 from pipeline.config.presets import is_path, model_file
 from pipeline.config.simulation import SensorModel, SensorName, SimulationConfig, load_config
 from scene.blocks import RockfallConfig
@@ -153,12 +153,16 @@ def _scales(model: ScaledModel, walls: Sequence[str], key: str) -> None:
             raise ValueError(f"{key} takes {name} out of its bounds on the wall {wall}: {wrong['msg']}") from None
 
 
-def load_dataset_config(path: Path, overrides: Sequence[str] = (), seed: int | None = None) -> DatasetConfig:
+def load_dataset_config(path: Path, overrides: Sequence[str | Override] = (), seed: int | None = None) -> DatasetConfig:
     """Read a data set's config and resolve what it names: sites, sensor models. Paths are relative to the file's folder.
 
     The dataset.json of a finished set is a config too: that set again, to the byte. Raises InputError for whatever is wrong.
     """
-    values = load_yaml(path)
+    return dataset_config(load_yaml(path), overrides, seed, path)
+
+
+def dataset_config(values: Any, overrides: Sequence[str | Override], seed: int | None, path: Path) -> DatasetConfig:
+    """`load_dataset_config` of values that are read already; path: of their file, or what errors call them."""
     if not isinstance(values, dict):
         raise InputError("is not a mapping of keys", where=str(path), remedy="start from configs/datasets/small.yaml")
     if "sources" in values and "fingerprint" in values:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,13 @@ def write_events(events: Sequence[Event], path: Path) -> None:
     for item in events:
         table.writerow([f"{value:.4f}" if isinstance(value, float) else value for value in asdict(item).values()])
     write_text(path, text.getvalue())
+
+
+def read_events(path: Path) -> list[Event]:
+    """A table that `write_events` wrote."""
+    types = {field.name: {"str": str, "int": int}.get(str(field.type), float) for field in fields(Event)}
+    with path.open(encoding="utf-8", newline="") as file:
+        return [Event(**{name: types[name](value) for name, value in row.items()}) for row in csv.DictReader(file)]
 
 
 def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[np.float32]:

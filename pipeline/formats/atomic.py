@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,13 @@ def to_disk(path: Path) -> None:
             raise
     finally:
         os.close(file)
+
+
+def new_folder(parent: Path, name: str) -> Path:
+    """A path under `parent` that is not there yet, called after `name` and the time."""
+    stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
+    names = (stem if number == 1 else f"{stem}_{number}" for number in range(1, 1000))
+    return next(parent / free for free in names if not (parent / free).exists())
 
 
 def empty_folder(out: Path) -> Path:

@@ -42,6 +42,12 @@ def write_geotiff(
     _write(path, raster, description, _georeference(grid), with_mask=with_mask)
 
 
+def wall_frame_wkt() -> str:
+    """The coordinate system of the GeoTIFFs as GDAL reads it: local, metres."""
+    axes = 'AXIS["Easting",EAST],AXIS["Northing",NORTH]'
+    return f'LOCAL_CS["{_CITATION}",UNIT["metre",1,AUTHORITY["EPSG","{_METRE}"]],{axes}]'
+
+
 def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = "") -> None:
     """Write an image (h, w), such as a depth map, m, as float32 without a place in the world."""
     _write(path, image, description, [(_NODATA, _ASCII, 0, "nan", False)])

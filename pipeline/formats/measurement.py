@@ -173,10 +173,26 @@ class Measurement:
 
 def read_model(path: Path) -> TlsModel | StereoModel:
     """A file model.yaml. Raises InputError with the key that is wrong."""
-    values = load_yaml(path)
+    return sensor_model(load_yaml(path), str(path))
+
+
+def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
+    """The sensor model that a mapping of keys describes; where: what errors call it."""
     if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
-        raise InputError("names no sensor", where=str(path), allowed="sensor: tls, sensor: stereo")
-    return parse(_ModelFile, {"sensor": values}, str(path)).sensor
+        raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo")
+    return parse(_ModelFile, {"sensor": values}, where).sensor
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a measurement is made of. reference: world frame; notes: on it; points: clouds by their files' names, an epoch each,
+    in the frame that the config says; cameras: world frame, stereo only."""
+
+    reference: TriangleMesh
+    points: dict[str, PointCloud]
+    model: TlsModel | StereoModel
+    cameras: CameraPair | None = None
+    notes: tuple[str, ...] = ()
 
 
 def read_measurement(folder: Path) -> Measurement:
@@ -186,36 +202,49 @@ def read_measurement(folder: Path) -> Measurement:
         raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
     config, base = parse(MeasurementConfig, load_yaml(path), str(path)), path.parent
     model = read_model(base / config.model)
-    if model.sensor != config.sensor:
-        raise InputError(f"model is of sensor {model.sensor}, the measurement of {config.sensor}", where=str(path))
+    _check_sensor(config, model, str(path))
     cameras = _cameras(config, base, str(path))
-    file = base / config.reference
-    mesh, notes = read_reference(file)
-    viewpoints = _viewpoints(config, cameras, str(path))
-    check_near(mesh.vertices, viewpoints, str(file))
+    mesh, notes = read_reference(base / config.reference)
+    points = {str(base / name): read_points(base / name) for name in _files(config)}
+    return assembled(config, Material(mesh, points, model, cameras, notes), str(base / config.reference), str(path))
+
+
+def assembled(config: MeasurementConfig, material: Material, reference: str, where: str) -> Measurement:
+    """A measurement out of what is in memory; its paths are not read. reference, where: what errors call mesh and config.
+
+    Raises InputError for whatever does not fit together.
+    """
+    mesh, model, cameras = material.reference, material.model, material.cameras
+    _check_sensor(config, model, where)
+    viewpoints = _viewpoints(config, cameras, where)
+    check_near(mesh.vertices, viewpoints, reference)
     frame = WallFrame.fit(mesh.vertices, np.mean([*viewpoints.values()], axis=0))
-    reference = mesh.with_vertices(frame.to_wall(mesh.vertices))
-    reference, words = facing(reference, [frame.to_wall(position) for position in viewpoints.values()], str(file))
-    clouds = [finite(read_points(base / name), str(base / name)) for name in _files(config)]
-    said = [(config.reference, (*notes, words))]
-    for name, each in zip(_files(config), clouds, strict=True):
-        said.append((name, _rounding(each.points, config, model, cameras, str(base / name))))
+    local = mesh.with_vertices(frame.to_wall(mesh.vertices))
+    local, words = facing(local, [frame.to_wall(position) for position in viewpoints.values()], reference)
+    clouds = [finite(cloud, name) for name, cloud in material.points.items()]
+    said = [(reference, (*material.notes, words))]
+    for name, each in zip(material.points, clouds, strict=True):
+        said.append((name, _rounding(each.points, config, model, cameras, name)))
     cloud = _joined(clouds)
-    station = _station(config, frame)
     found = Measurement(
         sensor=config.sensor,
         cloud=_in_wall_frame(cloud, config.frame, config.scanner, frame),
-        reference=reference,
+        reference=local,
         frame=frame,
         model=model,
         pattern=config.pattern,
-        station=station,
+        station=_station(config, frame),
         cameras=cameras,
         stable_areas=config.stable_areas,
-        notes=tuple(f"{name.name}: {note}" for name, texts in said for note in texts if note),
+        notes=tuple(f"{Path(name).name}: {note}" for name, texts in said for note in texts if note),
     )
-    _check(found, cloud, config, str(path))
+    _check(found, cloud, config, where)
     return found
+
+
+def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, where: str) -> None:
+    if model.sensor != config.sensor:
+        raise InputError(f"model is of sensor {model.sensor}, the measurement of {config.sensor}", where=where)
 
 
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
@@ -242,7 +271,11 @@ def _cameras(config: MeasurementConfig, base: Path, where: str) -> CameraPair | 
         return None
     if config.cameras is None:
         raise InputError("a stereo measurement needs `cameras`", where=where, remedy="name cameras.yaml or a Metashape XML")
-    file = base / config.cameras
+    return nominal_pair(base / config.cameras)
+
+
+def nominal_pair(file: Path) -> CameraPair:
+    """The cameras of a file, world frame: cameras.yaml, or another one with two oriented cameras."""
     found = read_oriented(file)
     return read_cameras_yaml(file) if found is None else stereo_pair(found, None, None, str(file))
 

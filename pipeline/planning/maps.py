@@ -38,6 +38,11 @@ class PlanMap:
     unit: str = ""
     factor: float = 1.0
 
+    @property
+    def si_unit(self) -> str:
+        """The unit of the values, told by the name's end."""
+        return next((unit for unit in ("m", "rad") if self.name.endswith(f"_{unit}")), "1")
+
     def summary(self, middle: BoolArray) -> dict[str, float | None]:
         """Median in the middle of the wall, and median and 5 and 95 % quantiles over all of it, SI; None where there are none."""
         values, centre = self.values[np.isfinite(self.values)], self.values[middle & np.isfinite(self.values)]

@@ -118,9 +118,13 @@ def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:
     return [_NOTHING if value is None else f"{value * found.factor:.4g}" for value in figures.values()]
 
 
+def map_picture(plan: Plan, found: PlanMap) -> bytes:
+    """PNG of a map in the unit in which people read it."""
+    return map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, found.unit or "ratio", found.title)
+
+
 def _picture(plan: Plan, found: PlanMap) -> _Picture:
-    unit = found.unit or "ratio"
-    png = map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, unit, found.title)
+    png = map_picture(plan, found)
     none = found.name == "smallest_block_m"
     return _Picture(found.title, png, "not seen, or no block is, however large" if none else "not seen")
 

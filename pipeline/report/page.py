@@ -25,7 +25,13 @@ def template(name: str) -> jinja2.Template:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters |= {"mm": millimetres, "numbers": _numbers, "volume": _volume, "percent": percent, "picture": _picture}
+    environment.filters |= {
+        "mm": millimetres,
+        "numbers": _numbers,
+        "volume": _volume,
+        "percent": percent,
+        "picture": picture_source,
+    }
     return environment.get_template(name)
 
 
@@ -54,7 +60,8 @@ def true_minus(value: float, digits: int) -> str:
     return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}" if round(value, digits) else "")
 
 
-def _picture(png: bytes) -> str:
+def picture_source(png: bytes) -> str:
+    """A picture as the source of an <img>, inside the page."""
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 

@@ -37,18 +37,20 @@ class Site:
     further_stations: tuple[LaserScanner, ...] = ()
 
 
-def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Site:
+def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom, given: Wall | None = None) -> Site:
     """Build the wall, place the sensor and fit the wall's frame, whose z axis points to the sensor.
 
+    given: a wall that takes the place of the config's.
     Raises InputError for a wall that cannot be used and a sensor that cannot be placed.
     """
-    wall = build_wall(config.wall, random.child("wall"))
+    wall = given or build_wall(config.wall, random.child("wall"))
+    foreign = given is not None or isinstance(config.wall, ImportedWall)
     target = Target(wall.mesh)
     if sensor == "stereo":
         cameras = config.camera_pair(target)
         frame = WallFrame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
         positions = {f"cameras, {side}": getattr(cameras, side).position for side in ("left", "right")}
-        mesh, repairs = _faced(config, wall, frame, positions)
+        mesh, repairs = _faced(wall, frame, positions, foreign=foreign)
         pair = _stereo(config, cameras, frame, random)
         eyes = {name: frame.to_wall(position) for name, position in positions.items()}
         return Site(wall.name, repairs, mesh, frame, pair, eyes)
@@ -57,7 +59,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
     frame = WallFrame.fit(wall.mesh.vertices, poses[0][0])
     positions = {f"station, number {number}": position for number, (position, _) in enumerate(poses, start=1)}
     positions = positions if len(poses) > 1 else {"station": poses[0][0]}
-    mesh, repairs = _faced(config, wall, frame, positions)
+    mesh, repairs = _faced(wall, frame, positions, foreign=foreign)
     instrument = config.scanner, config.tls_model(), config.products.truth_channels
     scanners = [
         LaserScanner.aimed(pose, frame, mesh.vertices, *instrument, station.pose_sigma)
@@ -68,14 +70,17 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
 
 
 def _faced(
-    config: SimulationConfig, wall: Wall, frame: WallFrame, positions: Mapping[str, FloatArray]
+    wall: Wall, frame: WallFrame, positions: Mapping[str, FloatArray], *, foreign: bool
 ) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """The wall in its frame, one from a file wound as the sensors see it, and what was mended in it. positions: world frame."""
+    """The wall in its frame, one that others made (foreign) wound as the sensors see it, and what was mended in it.
+
+    positions: world frame.
+    """
     check_near(wall.mesh.vertices, positions, wall.name)
     mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
-    if not isinstance(config.wall, ImportedWall):
+    if not foreign:
         return mesh, wall.repairs
-    mesh, words = facing(mesh, [frame.to_wall(position) for position in positions.values()], str(config.wall.mesh))
+    mesh, words = facing(mesh, [frame.to_wall(position) for position in positions.values()], wall.file or wall.name)
     return mesh, (*wall.repairs, *([words] if words else []))
 
 

@@ -20,10 +20,10 @@ import pytest
 from pipeline.cli import main as cli
 from pipeline.cli.answer import as_json
 from pipeline.cli.json_schema import json_schema
-from pipeline.cli.simulate import new_folder
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import load_config
 from pipeline.dataset.config import load_dataset_config
+from pipeline.formats.atomic import new_folder
 from scene.config import load_yaml
 from scene.errors import InputError
 

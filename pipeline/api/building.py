@@ -1,0 +1,137 @@
+"""Building blocks: a wall, blocks, a sensor of one's own, and what becomes of an observation; each one call on arrays.
+
+Everything after `stage` is in the wall frame: x along the wall, y up the wall, z towards the sensor, m.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipeline.api.configs import ConfigLike, configure, one_sensor
+from pipeline.api.maps import DIFFERENCE, data_array
+from pipeline.api.meshes import Mesh
+from pipeline.change import difference as rasters
+from pipeline.config.simulation import SensorName
+from pipeline.registration import register as icp
+from pipeline.run.site import Site, prepare_site
+from pipeline.surface.mesh import SurfaceConfig, mesh_observation
+from scene import blocks as solids
+from scene import carve as carving
+from scene.config import parse
+from scene.errors import InputError
+from scene.imported import ImportedWall
+from scene.keyed_random import KeyedRandom
+from scene.mesh import TriangleMesh
+from scene.procedural import ProceduralWall
+from scene.raycast import RayCaster
+from scene.wall import Wall
+from sensors.observation import Observation, Sensor
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def make_wall(seed: int = 1, **keys: Any) -> Mesh:
+    """A wall made by rule, world frame. keys: a config's of `wall`: style="glendale", width_m, height_m, resolution_m, ..."""
+    return Mesh.of(parse(ProceduralWall, keys, "make_wall").mesh(KeyedRandom(seed)))
+
+
+def open_wall(path: Path | str, **keys: Any) -> Mesh:
+    """A wall from a mesh file, mended as a simulation mends it, world frame, m. keys: unit, flipped, albedo."""
+    return Mesh.of(parse(ImportedWall, {"mesh": str(path), **keys}, "open_wall").load()[0])
+
+
+def stage(
+    wall: TriangleMesh | None = None,
+    sensor: SensorName | None = None,
+    config: ConfigLike = None,
+    *,
+    seed: int | None = None,
+    model: Any = None,
+    **overrides: Any,
+) -> Site:
+    """A wall (world frame; none: the config's) in its frame with a sensor before it: `.mesh`, `.frame`, `.sensor`, `.viewpoints`.
+
+    The wall frame's z axis points to the sensor, which the config places; config, model, overrides: as `configure` takes them.
+    """
+    resolved = configure(config, sensor, seed=seed, model=model, **overrides)
+    given = None if wall is None else Wall(wall, (), "wall")
+    return prepare_site(resolved, one_sensor(resolved, sensor), KeyedRandom(resolved.seed), given)
+
+
+def make_blocks(
+    centres: ArrayLike,
+    sizes: ArrayLike,
+    *,
+    rotations_rad: ArrayLike | None = None,
+    shape: Literal["cube", "sphere"] = "cube",
+    subdivisions: int = 2,
+) -> solids.Blocks:
+    """Blocks where and as large as they are wanted, wall frame, m; their labels count from 1.
+
+    centres: (k, 3); sizes: (k, 3) lengths of the axes, or (k,) of all three; rotations_rad: (k, 3) about x, then y, then z.
+    """
+    place = _table(centres, "centres")
+    size = np.asarray(sizes, dtype=np.float64)
+    size = _table(np.repeat(size[:, None], 3, axis=1) if size.ndim == 1 else size, "sizes", len(place))
+    turn = np.zeros_like(place) if rotations_rad is None else _table(rotations_rad, "rotations_rad", len(place))
+    if not (size > 0).all():
+        raise InputError(f"holds {size.min():g} m", where="sizes", allowed="above 0")
+    return solids.given_blocks(place, size, turn, shape, subdivisions)
+
+
+def place_blocks(mesh: TriangleMesh, seed: int = 1, **keys: Any) -> solids.Blocks:
+    """Blocks drawn at random on a wall, wall frame. keys: those of a config's `rockfall`: count, shape, size_m, ..."""
+    config = parse(solids.RockfallConfig, keys, "place_blocks")
+    return solids.place_blocks(config, mesh, KeyedRandom(seed).child("blocks"))
+
+
+def carve(mesh: TriangleMesh, blocks: solids.Blocks) -> carving.Carved:
+    """The wall without its blocks: `.mesh`, whose faces know their block, and `.removed_volume_m3`, (k,)."""
+    return carving.carve(mesh, blocks)
+
+
+def observe(mesh: TriangleMesh, sensor: Sensor, seed: int = 1) -> Observation:
+    """One look of a sensor, `stage(...).sensor` or one's own, at a mesh in its frame; the same seed gives the same bytes."""
+    return sensor.observe(RayCaster(mesh), KeyedRandom(seed))
+
+
+def reconstruct(observation: Observation, **keys: Any) -> Mesh:
+    """The surface through the points of an observation's grid. keys: those of a config's `surface`: method, depth_step_m, ..."""
+    return Mesh.of(mesh_observation(observation, parse(SurfaceConfig, keys, "reconstruct")))
+
+
+def register(moving: Any, reference: Any, seed: int = 1, **keys: Any) -> icp.Registration:
+    """ICP of one surface to another: `.rotation` (3, 3), `.translation` (3,) m, `.apply(points)`, `.rms_m`.
+
+    moving: a mesh or (n, 3) points; reference: a mesh, or (n, 3) points with method="point_to_point". keys: those of `icp`.
+    """
+    normals = reference.vertex_normals() if isinstance(reference, TriangleMesh) else None
+    config = parse(icp.IcpConfig, keys, "register")
+    return icp.register(_vertices(moving, "moving"), _vertices(reference, "reference"), normals, config, KeyedRandom(seed))
+
+
+def difference(reference: TriangleMesh, epoch: TriangleMesh, gsd_m: float = 0.02) -> xarray.DataArray:
+    """(y, x) reference minus epoch along z, m, missing rock positive, NaN without data; coordinate `block`: epoch's labels."""
+    grid = rasters.raster_grid(reference.bounds, parse(rasters.DifferenceConfig, {"gsd_m": gsd_m}, "difference"))
+    before, after = rasters.surface_raster(reference, grid), rasters.surface_raster(epoch, grid)
+    change = data_array(rasters.difference(before, after), grid, "difference", DIFFERENCE)
+    return change.assign_coords(block=(("y", "x"), after.block))
+
+
+def _vertices(given: Any, name: str) -> Any:
+    return given.vertices if isinstance(given, TriangleMesh) else _table(given, name)
+
+
+def _table(values: ArrayLike, name: str, rows: int | None = None) -> Any:
+    """(n, 3) float64, finite."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or (rows is not None and len(array) != rows):
+        raise InputError(f"have the shape {array.shape}", where=name, allowed=f"({'n' if rows is None else rows}, 3)")
+    if not np.isfinite(array).all():
+        raise InputError("are not all finite", where=name)
+    return array

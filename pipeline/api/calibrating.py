@@ -1,0 +1,100 @@
+"""`calibrate`: noise parameters fitted to measured epochs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.api.configs import ConfigLike, Show, configure, paths
+from pipeline.api.maps import data_array
+from pipeline.api.pictures import Picture, html_table, pick
+from pipeline.api.tables import frame_of
+from pipeline.calibration import calibrate as fitting
+from pipeline.calibration.inputs import config_of, sensor_of
+from pipeline.calibration.report import pictures, summary, warnings
+from pipeline.calibration.write import write
+from pipeline.config.simulation import SensorName
+from pipeline.report.notebook_progress import python_progress
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+
+def calibrate(
+    measured: Any,
+    config: ConfigLike = None,
+    sensor: SensorName | None = None,
+    *,
+    greedy: bool = False,
+    out: Path | str | None = None,
+    seed: int | None = None,
+    model: Any = None,
+    progress: Show = "auto",
+    **overrides: Any,
+) -> Calibration:
+    """Fit the noise of a sensor's model to measured epochs; the same as `scarpsim calibrate`.
+
+    measured: a folder with measurement.yaml or with difference maps, GeoTIFFs, or a run. config: the site, none: that of a run
+    among `measured`, else the demo's; model, overrides: as `configure` takes them. greedy: the thesis's search too, for
+    comparison. out: a folder for report and files, none: nothing is written.
+    """
+    inputs = paths(measured)
+    given = config_of(inputs) if config is None else config
+    resolved = configure(given, sensor, seed=seed, model=model, **overrides)
+    which = sensor or sensor_of(inputs, resolved)
+    with python_progress(progress) as shown:
+        result = Calibration(fitting.calibrate(resolved, which, inputs, shown, with_greedy=greedy), tuple(inputs))
+        if out is not None:
+            result.write(out)
+    return result
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Fitted noise. figures: everything, as `pipeline.calibration` has it; inputs: what it was fitted to."""
+
+    figures: fitting.Calibration
+    inputs: tuple[Path, ...]
+
+    @property
+    def model(self) -> Any:
+        """The sensor model with the fitted noise: `simulate(config, model=found.model)`."""
+        return self.figures.model
+
+    @property
+    def parameters(self) -> pandas.DataFrame:
+        """value, low and high (of the confidence interval) of each parameter, in the unit of its name."""
+        found = self.figures.found
+        values = {name: np.exp(each) for name, each in (("value", found.x), ("low", found.low), ("high", found.high))}
+        return frame_of(values, self.figures.parameters.names, "parameter")
+
+    @property
+    def systematic(self) -> xarray.DataArray:
+        """(y, x) the mean of the measured maps, m."""
+        return data_array(self.figures.systematic, self.figures.material.grid, "systematic", "mean of the measured maps")
+
+    @property
+    def warnings(self) -> list[str]:
+        """What has to be known before the values are used."""
+        return warnings(self.figures)
+
+    def summary(self) -> str:
+        """The result in a few lines of text."""
+        return summary(self.figures)
+
+    def plot(self, kind: str = "windows") -> Picture:
+        """A picture of the report: windows, measured, systematic, distribution, statistics, epochs."""
+        return Picture(pick({name: png for name, _, png in pictures(self.figures, None)}, kind, "plot"))
+
+    def write(self, out: Path | str) -> Path:
+        """Write the folder that `scarpsim calibrate` fills; returns its report.html. InputError where it is in use."""
+        return write(Path(out), self.figures.config, self.figures, self.inputs)
+
+    def _repr_html_(self) -> str:
+        table = self.parameters
+        rows = {name: f"{row.value:.4g} ({row.low:.4g} to {row.high:.4g})" for name, row in table.iterrows()}
+        return html_table("Calibrated noise", rows | {"note": " ".join(self.warnings) or "none"}, self.plot())

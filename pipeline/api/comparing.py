@@ -1,0 +1,144 @@
+"""`compare`: several sensors in front of one wall."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.api.configs import Show, configure, keywords, paths
+from pipeline.api.maps import DIFFERENCE, data_array, dataset
+from pipeline.api.pictures import Picture, html_table, pick
+from pipeline.api.tables import frame
+from pipeline.comparison.assess import Assessment
+from pipeline.comparison.comparison import Comparison as Figures
+from pipeline.comparison.comparison import compare_sensors
+from pipeline.comparison.report import answer, pictures, summary, write_comparison
+from pipeline.comparison.sensors_compared import Given, contestants
+from pipeline.config.simulation import SimulationConfig
+from pipeline.report.notebook_progress import python_progress
+from scene.errors import InputError, nearest
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+
+def compare(
+    *sensors: Any,
+    epochs: int = 6,
+    sizes_m: tuple[float, float] | None = (0.05, 0.8),
+    measured: Sequence[Path | str] = (),
+    own_step: bool = False,
+    out: Path | str | None = None,
+    seed: int | None = None,
+    progress: Show = "auto",
+    **overrides: Any,
+) -> Comparison:
+    """Compare sensors on the first one's wall and the same blocks; the same as `scarpsim compare`.
+
+    sensors: configs, their files or values, runs, bundled sites, scanners ("riegl_vz400i"), noise models, or a mapping of names
+    to them; a config with both sensors gives two. sizes_m: of the blocks in the first and the last epoch, None: the config's.
+    measured: folders of measured epochs to put beside. own_step: presets scan with their own angular step. out: a
+    folder for report and files, none: nothing is written. overrides: of every config, as `configure` takes them.
+    """
+    given = _given(sensors, seed, overrides)
+    found = contestants(given, keywords(overrides), seed, own_step=own_step)
+    with python_progress(progress) as shown:
+        result = Comparison(compare_sensors(found, paths(list(measured)), epochs, sizes_m, shown))
+        if out is not None:
+            result.write(out)
+    return result
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Sensors compared. figures: everything, as `pipeline.comparison` has it."""
+
+    figures: Figures
+
+    @property
+    def names(self) -> list[str]:
+        """Of the sensors, in their order."""
+        return [each.name for each in self.figures.found]
+
+    @property
+    def table(self) -> pandas.DataFrame:
+        """A row for each sensor, by name: noise, level of detection, smallest block, completeness; SI."""
+        return frame(map(_row, self.figures.found)).set_index("name")
+
+    @property
+    def blocks(self) -> pandas.DataFrame:
+        """A row for each block and sensor: its size, whether it was in view and seen, true and measured volume; SI."""
+        found = self.figures.found
+        return frame({"sensor": each.name, **block.to_dict()} for each in found for block in each.detection.blocks)
+
+    def differences(self, sensor: str) -> xarray.DataArray:
+        """(epoch, y, x) difference maps of a sensor by its name, m."""
+        trial = self.figures.trial
+        if sensor not in self.names:
+            raise InputError(
+                f"there is no '{sensor}'", where="compare", allowed=", ".join(self.names), remedy=nearest(sensor, self.names)
+            )
+        changes = trial.seen[self.names.index(sensor)].changes
+        return data_array(changes, trial.grid, "difference", DIFFERENCE)
+
+    @property
+    def level_of_detection(self) -> xarray.Dataset:
+        """The 95 % level of detection of a pixel, m, a map for each sensor."""
+        grid = self.figures.trial.grid
+        return dataset({
+            each.name: data_array(each.noise.level, grid, each.name, "95 % level of detection") for each in self.figures.found
+        })  # fmt: skip
+
+    def summary(self) -> str:
+        """The main figures as lines of text."""
+        return summary(self.figures)
+
+    def plot(self, kind: str = "maps") -> Picture:
+        """A picture of the report: maps, level_of_detection, noise, by_covariate, detection, size_and_depth."""
+        drawn = pictures(self.figures)
+        return Picture(pick({name.removesuffix(".png"): png for name, png in drawn.items()}, kind, "plot"))
+
+    def write(self, out: Path | str) -> Path:
+        """Write the folder that `scarpsim compare` fills; returns its report.html. InputError where it is in use."""
+        return write_comparison(Path(out), self.figures)
+
+    def _repr_html_(self) -> str:
+        return html_table("Sensors compared", {each.name: answer(each) for each in self.figures.found}, self.plot())
+
+
+def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any]) -> list[Given]:
+    """What is to be compared as `contestants` takes it: names of files and presets, and configs with a name."""
+    if not sensors:
+        raise InputError("names no sensor", where="compare", remedy='compare("glendale", "riegl_vz400i")')
+    only = sensors[0]
+    if len(sensors) == 1 and isinstance(only, Mapping) and not set(only) & set(SimulationConfig.model_fields):
+        named = [(str(name), each) for name, each in only.items()]
+    else:
+        named = [("site", each) for each in sensors]
+    return [
+        (name, configure(each, seed=seed, **overrides)) if isinstance(each, SimulationConfig | Mapping) else str(paths(each)[0])
+        for name, each in named
+    ]
+
+
+def _row(found: Assessment) -> dict[str, Any]:
+    curve, blocks = found.detection.by_size, found.detection.blocks
+    return {
+        "name": found.name,
+        "sensor": found.sensor,
+        "points": found.points,
+        "nmad_m": found.noise.stable.nmad,
+        "median_m": found.noise.stable.median,
+        "rmse_m": found.noise.stable.rmse,
+        "level_of_detection_m": found.noise.median_level_m,
+        "smallest_block_m": None if curve is None else curve.smallest_95_m,
+        "blocks_in_view": sum(block.in_view for block in blocks),
+        "blocks_seen": sum(block.seen for block in blocks),
+        "visible": found.visible,
+        "complete": found.complete,
+        "scan_s": found.scan_seconds,
+        "registration_rms_m": found.registration_rms_m,
+    }

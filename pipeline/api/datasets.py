@@ -1,0 +1,97 @@
+"""`make_dataset`: labelled tiles of difference maps."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.api.configs import Show, keywords, plain
+from pipeline.api.pictures import Picture, html_table, pick
+from pipeline.api.tables import frame
+from pipeline.config.bundled import config_path
+from pipeline.dataset import run
+from pipeline.dataset.config import DatasetConfig, dataset_config, load_dataset_config
+from pipeline.dataset.loaders import Tiles
+from pipeline.dataset.plan import SPLITS
+from pipeline.dataset.records import read_dataset_file
+from pipeline.formats.coco import read_coco
+from pipeline.report.notebook_progress import python_progress
+
+if TYPE_CHECKING:
+    import pandas
+
+DatasetLike = DatasetConfig | Mapping[str, Any] | str | os.PathLike[str]
+"""A data set's config, its values, a file, or a bundled name such as "small"."""
+
+
+def make_dataset(
+    config: DatasetLike,
+    out: Path | str,
+    *,
+    workers: int = 0,
+    scheduler: str = "",
+    seed: int | None = None,
+    progress: Show = "auto",
+    **overrides: Any,
+) -> DataSet:
+    """Make a set of annotated tiles, or what is missing of it; the same as `scarpsim dataset`.
+
+    config: a DatasetConfig, a mapping of its keys, a YAML file or a bundled name; a wall may be a SimulationConfig. out: the
+    set's folder; workers: local processes, 0: this one; scheduler: of Dask, instead. overrides: as `configure` has them.
+    """
+    changes = keywords(overrides)
+    if isinstance(config, DatasetConfig | Mapping):
+        resolved = dataset_config(plain(config), changes, seed, Path("config"))
+    else:
+        resolved = load_dataset_config(config_path("datasets", Path(config)), changes, seed)
+    with python_progress(progress) as shown:
+        made = run.make_dataset(resolved, Path(out), run.Workers(workers, scheduler), progress=shown)
+    return DataSet(made.folder)
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set by its folder."""
+
+    folder: Path
+
+    @property
+    def splits(self) -> list[str]:
+        """Those that the set has, of train, val and test."""
+        return [name for name in SPLITS if (self.folder / name / "annotations.json").is_file()]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """dataset.json: configs, versions, whether it is complete."""
+        return read_dataset_file(self.folder)
+
+    def tiles(self, split: str = "train", **filters: str) -> Tiles:
+        """The tiles of a split as arrays; filters: sensor, wall, noise, size_class."""
+        return Tiles(self.folder / pick({name: name for name in self.splits}, split, str(self.folder)), **filters)
+
+    @property
+    def table(self) -> pandas.DataFrame:
+        """A row for each tile: split, file_name, sensor, wall, noise, size_class, blocks, ..."""
+        rows = []
+        for split in self.splits:
+            content = read_coco(self.folder / split / "annotations.json")
+            counts: dict[Any, int] = {}
+            for each in content.annotations:
+                counts[each["image_id"]] = counts.get(each["image_id"], 0) + 1
+            rows += [{"split": split, **image, "blocks": counts.get(image["id"], 0)} for image in content.images]
+        return frame(rows)
+
+    def plot(self, kind: str | None = None) -> Picture:
+        """A picture of the set's card."""
+        drawn = {path.stem: path for path in sorted((self.folder / "card").glob("*.png"))}
+        return Picture(pick(drawn, kind, str(self.folder)).read_bytes())
+
+    def _repr_html_(self) -> str:
+        table = self.table
+        rows = {
+            name: f"{len(part):,} tiles with {part['blocks'].sum():,} blocks" for name, part in table.groupby("split", sort=False)
+        }
+        return html_table(f"Data set {self.folder}", {**rows, "card": self.folder / "README.md"})

@@ -1,0 +1,74 @@
+"""Rasters over the wall as xarray.DataArray with coordinates, units and the coordinate system of the wall frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.api.extras import library
+from pipeline.formats.geotiff import wall_frame_wkt
+from scene.errors import InputError
+from scene.frame import WallFrame
+from scene.grid import Grid
+
+if TYPE_CHECKING:
+    import xarray
+
+DIFFERENCE = "reference minus epoch; missing rock positive"
+_SPREAD = 1e-6
+"""Share of a pixel by which the steps of a map's coordinates may differ."""
+
+
+def data_array(
+    values: NDArray[Any], grid: Grid, name: str, long_name: str, *, units: str = "m", frame: WallFrame | None = None
+) -> xarray.DataArray:
+    """A raster (h, w), or several (e, h, w) of epochs 1 to e, of `grid` as a DataArray.
+
+    x, y: the pixels' centres, wall frame, m; `rio.crs`: the wall frame, a local system, as the GeoTIFFs have it. frame: then
+    `matrix_world_to_wall`, (4, 4) by rows, stands in the attributes.
+    """
+    xarray = library("xarray")
+    library("rioxarray")  # gives DataArrays their `.rio`
+    x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
+    y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
+    coordinates: dict[str, Any] = {
+        "y": ("y", y, {"units": "m", "long_name": "up the wall"}),
+        "x": ("x", x, {"units": "m", "long_name": "along the wall"}),
+    }
+    dimensions: tuple[str, ...] = ("y", "x")
+    if values.ndim == 3:
+        dimensions = ("epoch", *dimensions)
+        coordinates["epoch"] = ("epoch", np.arange(1, len(values) + 1), {"long_name": "epoch, 0 is the reference"})
+    attributes: dict[str, Any] = {"units": units, "long_name": long_name, "gsd_m": grid.gsd}
+    if frame is not None:
+        attributes["matrix_world_to_wall"] = frame.matrix.ravel().tolist()
+    array = xarray.DataArray(values, coordinates, dimensions, name, attributes)
+    return array.rio.write_crs(wall_frame_wkt()).rio.write_nodata(np.nan)
+
+
+def dataset(rasters: Mapping[str, xarray.DataArray]) -> xarray.Dataset:
+    """Rasters of one grid by name."""
+    return library("xarray").Dataset(dict(rasters))
+
+
+def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
+    """(h, w) float32 values of a DataArray and the grid of its coordinates, row 0 at the largest y.
+
+    Raises InputError where it has other dimensions than y and x, or pixels that are not square.
+    """
+    if set(array.dims) != {"y", "x"}:
+        raise InputError(f"has the dimensions {', '.join(map(str, array.dims))}", where=where, allowed="y, x")
+    array = array.sortby("y", ascending=False).sortby("x").transpose("y", "x")
+    x, y = (np.asarray(array[name], dtype=np.float64) for name in ("x", "y"))
+    if min(len(x), len(y)) < 2:
+        raise InputError(f"has {len(y)} x {len(x)} pixels", where=where, allowed="2 x 2 and more")
+    steps = np.concatenate([np.diff(x), -np.diff(y)])
+    gsd = float(np.median(steps))
+    if not (gsd > 0 and np.ptp(steps) <= _SPREAD * gsd):
+        problem = f"pixels of {steps.min():g} to {steps.max():g} m"
+        raise InputError(problem, where=where, allowed="square pixels of one size", remedy="resample it with array.interp")
+    grid = Grid(float(x[0] - gsd / 2), float(y[0] + gsd / 2), gsd, len(x), len(y))
+    return np.asarray(array.values, dtype=np.float32), grid

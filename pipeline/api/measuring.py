@@ -1,0 +1,258 @@
+"""`measure` and `diagnose`: what was measured, and what its model does not explain."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from pipeline.api.configs import Show, plain
+from pipeline.api.pictures import Picture, html_table, pick
+from pipeline.api.points import Points, scatter
+from pipeline.api.tables import boxes, frame, spread_out
+from pipeline.config.presets import model_file
+from pipeline.formats.measurement import (
+    Material,
+    MeasurementConfig,
+    assembled,
+    nominal_pair,
+    read_measurement,
+    read_model,
+    sensor_model,
+)
+from pipeline.formats.measurement import Measurement as Measured
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points import read_points
+from pipeline.gap.naming import workflow
+from pipeline.gap.report import figures, report
+from pipeline.report.notebook_progress import python_progress
+from scene.config import parse
+from scene.errors import InputError
+from scene.imported import read_reference
+from scene.mesh import TriangleMesh
+from sensors.camera import CameraPair
+
+if TYPE_CHECKING:
+    import geopandas
+    import pandas
+
+_SCALE_SIGMAS = 6.0
+
+
+def measure(
+    folder: Path | str | None = None,
+    *,
+    sensor: Literal["tls", "stereo"] = "tls",
+    reference: Any = None,
+    points: Any = None,
+    model: Any = None,
+    cameras: Any = None,
+    **keys: Any,
+) -> Measurement:
+    """A measurement: a folder with measurement.yaml, or the parts of one.
+
+    reference: the known surface, world frame: a mesh or its file; points: (n, 3) array, `Points`, a file, or a list of these, an
+    epoch each; model: what is believed of the sensor: a model, its keys, a file, a bundled name; None: the default one; cameras:
+    nominal pair or its file (stereo). keys: those of measurement.yaml beyond: frame ("world", of the points, or "scanner"),
+    scanner={"position_m": ..., "rotation": ...}, pattern, stable_areas. Raises InputError for whatever does not fit together.
+    """
+    if folder is not None:
+        return Measurement(read_measurement(Path(folder)))
+    if reference is None or points is None:
+        raise InputError("needs a folder, or reference and points", where="measure")
+    values = {"sensor": sensor, "reference": "reference", "points": "points", "model": "model", **plain(keys)}
+    config = parse(MeasurementConfig, values, "measure")
+    pair = nominal_pair(Path(cameras)) if isinstance(cameras, str | os.PathLike) else cameras
+    if sensor == "stereo" and not isinstance(pair, CameraPair):
+        raise InputError("a stereo measurement needs `cameras`", where="measure", allowed="a CameraPair or a file")
+    mesh, notes = (reference, ()) if isinstance(reference, TriangleMesh) else read_reference(Path(reference))
+    material = Material(mesh, _clouds(points), _model(model, sensor), pair if sensor == "stereo" else None, notes)
+    return Measurement(assembled(config, material, "reference", "measure"))
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What was measured, with what predicts it. held: everything, as `pipeline.formats.measurement` has it."""
+
+    held: Measured
+
+    @property
+    def sensor(self) -> str:
+        """stereo or tls."""
+        return self.held.sensor
+
+    @property
+    def model(self) -> Any:
+        """What is believed of the sensor."""
+        return self.held.model
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What should be said of the files."""
+        return self.held.notes
+
+    @property
+    def points(self) -> Points:
+        """The measured points, wall frame."""
+        return Points.of(self.held.cloud)
+
+    def plot(self) -> Picture:
+        """The points over the wall, coloured by their height over it."""
+        return self.points.plot("z")
+
+    def _repr_html_(self) -> str:
+        held = self.held
+        rows = {"sensor": held.sensor, "points": f"{len(held.cloud.points):,}", "epochs": int(held.epochs.max(initial=0)) + 1}
+        return html_table("Measurement", rows | {"notes": "; ".join(held.notes) or "none"}, self.plot())
+
+
+def diagnose(
+    measurement: Measurement | Path | str, *, seed: int = 1, out: Path | str | None = None, progress: Show = "auto"
+) -> Diagnosis:
+    """Find where a measurement and its model disagree, name the effect, add it, measure the gap again; as `scarpsim gap`.
+
+    measurement: as `measure` gives it, or its folder; seed: of the null distributions; out: a folder for report and files, none:
+    nothing is written.
+    """
+    measured = measurement if isinstance(measurement, Measurement) else measure(measurement)
+    steps = iter(workflow.STEPS)
+    with python_progress(progress) as shown, ExitStack() as stage:
+
+        def begin_next(_done: str = "") -> None:
+            stage.close()
+            step = next(steps, None)
+            if step is not None:
+                stage.enter_context(shown.stage(step))
+
+        shown.plan(workflow.STEPS)
+        begin_next()
+        result = Diagnosis(workflow.diagnose(measured.held, seed, begin_next), measured)
+    if out is not None:
+        result.write(out)
+    return result
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found. found: everything, as `pipeline.gap` has it; measurement: of what."""
+
+    found: workflow.Diagnosis
+    measurement: Measurement
+
+    @property
+    def verdict(self) -> str:
+        """named, several, ambiguous, unknown, no_gap or insufficient_data."""
+        return self.found.verdict
+
+    @property
+    def effects(self) -> pandas.DataFrame:
+        """A row for each parameter of each named effect: value, std, kind, what it cannot be told from, p_value; SI."""
+        rows = []
+        for each in self.found.effects:
+            held = each.to_dict()
+            shared = {name: held[name] for name in ("kind", "cannot_be_told_from", "split_by", "p_value")}
+            rows += [{"effect": each.name, "parameter": name, **value, **shared} for name, value in held["parameters"].items()]
+        columns = ("effect", "parameter", "value", "std", "kind", "cannot_be_told_from", "split_by", "p_value")
+        return frame(rows, columns)
+
+    @property
+    def changes(self) -> geopandas.GeoDataFrame:
+        """Regions where the scene itself moved: volume_m3, offset_m, place; geometry: the rectangle around, wall frame."""
+        rows, bounds = [], []
+        for each in self.found.changes:
+            world = self.measurement.held.frame.to_world(each.corners.mean(axis=0))
+            rows.append({"volume_m3": each.volume_m3, "offset_m": each.offset_m, **spread_out("world", world.tolist())})
+            bounds.append([*each.bounds[0, :2], *each.bounds[1, :2]])
+        return boxes(rows, bounds, ("volume_m3", "offset_m", "world_x_m", "world_y_m", "world_z_m"))
+
+    @property
+    def residuals(self) -> Points:
+        """The points that were compared, wall frame, with before_m, after_m (measured minus predicted depth) and held_out."""
+        found, cloud = self.found, self.measurement.held.cloud
+        depth, index = found.residuals.depth_m, found.residuals.index
+        channels = {"before_m": found.before * depth, "after_m": found.after * depth, "held_out": found.held_out}
+        return Points.of(PointCloud(cloud.points[index], extra=channels))
+
+    @property
+    def model_after(self) -> Any:
+        """The sensor model with the named effects: `simulate(config, model=found.model_after)`."""
+        return self.found.model_after
+
+    @property
+    def gap(self) -> dict[str, Any] | None:
+        """before, after, floor, unit, closed, ... on held-out points; None where it was not measured."""
+        return self.found.gap.to_dict() if self.found.gap else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """gap.json."""
+        return report.to_dict(self.found, self.measurement.held)
+
+    def summary(self) -> str:
+        """The verdict in some lines of text."""
+        return report.summary(self.found)
+
+    def plot(self, kind: str = "maps") -> Picture:
+        """A picture of the report: maps, profiles, gap, identifiability; or `before`, `after`: residuals over the wall."""
+        if kind in ("before", "after"):
+            points = self.residuals
+            scale = 1.4826 * float(np.median(np.abs(points["after_m"] - np.median(points["after_m"]))))
+            return scatter(points.xyz[:, :2], points[f"{kind}_m"], f"residual {kind}, m", max(_SCALE_SIGMAS * scale, 1e-6))
+        return Picture(pick(self._drawn(), kind, "plot")())
+
+    def _drawn(self) -> dict[str, Callable[[], bytes]]:
+        """The report's pictures that there are of this diagnosis."""
+        found, table = self.found, self.found.identifiability
+        drawn: dict[str, Callable[[], bytes]] = {}
+        if len(found.residuals):
+            drawn |= {"maps": lambda: figures.maps_figure(found), "profiles": lambda: figures.profiles_figure(found)}
+        if found.gap is not None:
+            drawn["gap"] = partial(figures.gap_figure, found.gap)
+        if table["names"]:
+            cosines, survival = (np.array(table[name], dtype=np.float64) for name in ("cosines", "survival"))
+            drawn["identifiability"] = lambda: figures.matrix_figure(table["names"], np.abs(cosines), survival)
+        return drawn
+
+    def write(self, out: Path | str) -> Path:
+        """Write the files of `scarpsim gap`; returns report.html."""
+        return report.write(Path(out), self.found, self.measurement.held)
+
+    def _repr_html_(self) -> str:
+        rows = {str(number): line for number, line in enumerate(self.summary().splitlines(), start=1)}
+        return html_table(f"Diagnosis: {self.verdict}", rows, self.plot() if len(self.found.residuals) else None)
+
+
+def _clouds(points: Any) -> dict[str, PointCloud]:
+    """Point clouds by what errors call them."""
+    several = points if isinstance(points, list | tuple) else [points]
+    if not several:
+        raise InputError("names no points", where="measure")
+    found = {}
+    for number, each in enumerate(several, start=1):
+        if isinstance(each, str | os.PathLike):
+            found[str(each)] = read_points(Path(each))
+            continue
+        name = f"points {number}" if len(several) > 1 else "points"
+        if isinstance(each, PointCloud):
+            found[name] = each
+            continue
+        if isinstance(each, Points):
+            found[name] = each.cloud()
+            continue
+        array = np.asarray(each, dtype=np.float64)
+        if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+            raise InputError(f"have the shape {array.shape}", where=name, allowed="(n, 3)")
+        found[name] = PointCloud(array)
+    return found
+
+
+def _model(model: Any, sensor: str) -> Any:
+    if isinstance(model, str | os.PathLike):
+        return read_model(model_file(os.fspath(model)))
+    values = plain(model) if model is not None else {}
+    return sensor_model({"sensor": sensor, **values} if isinstance(values, Mapping) else values, "model")

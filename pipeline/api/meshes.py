@@ -1,0 +1,89 @@
+"""Meshes with the ways that people take them on: pictures, files, other libraries."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipeline.api.extras import library
+from pipeline.api.pictures import Picture, html_table
+from pipeline.formats.ply import read_ply, write_ply
+from scene.errors import InputError
+from scene.mesh import TriangleMesh
+
+
+class Mesh(TriangleMesh):
+    """Triangles with shared vertices, counter-clockwise seen from the sensors' side.
+
+    vertices: (n, 3) float64, m; faces: (m, 3) int32; vertex_albedo: (n,) float32 in [0, 1]; vertex_block, face_block: (n,), (m,)
+    int32, the block whose removal made it, 0 elsewhere; each of the last three may be None.
+    """
+
+    @classmethod
+    def of(cls, mesh: TriangleMesh) -> Self:
+        return cls(mesh.vertices, mesh.faces, mesh.vertex_albedo, mesh.vertex_block, mesh.face_block)
+
+    @classmethod
+    def from_arrays(cls, vertices: ArrayLike, faces: ArrayLike) -> Self:
+        """vertices: (n, 3), m; faces: (m, 3) indices. Raises InputError for other shapes and for indices beyond the vertices."""
+        corners, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+        for name, array in (("vertices", corners), ("faces", triangles)):
+            if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+                raise InputError(f"have the shape {array.shape}", where=name, allowed="(n, 3)")
+        if triangles.dtype.kind not in "iu" or triangles.min() < 0 or triangles.max() >= len(corners):
+            raise InputError("are no indices of the vertices", where="faces", allowed=f"0 to {len(corners) - 1}")
+        if not np.isfinite(corners).all():
+            raise InputError("are not all finite", where="vertices")
+        return cls(corners, triangles.astype(np.int32))
+
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """A PLY file, as `save` writes it; unlike `open_wall` nothing is mended."""
+        return cls.of(read_ply(Path(path)))
+
+    def save(self, path: Path | str) -> Path:
+        """Write a PLY file; returns its path."""
+        write_ply(Path(path), self)
+        return Path(path)
+
+    def to_trimesh(self) -> Any:
+        """A trimesh.Trimesh."""
+        return library("trimesh").Trimesh(self.vertices, self.faces, process=False)
+
+    def to_open3d(self) -> Any:
+        """An open3d.geometry.TriangleMesh."""
+        open3d = library("open3d")
+        vertices = open3d.utility.Vector3dVector(self.vertices)
+        return open3d.geometry.TriangleMesh(vertices, open3d.utility.Vector3iVector(self.faces))
+
+    def to_pyvista(self) -> Any:
+        """A pyvista.PolyData with blocks and albedo, where the mesh has them."""
+        faces = np.concatenate([np.full((len(self.faces), 1), 3, self.faces.dtype), self.faces], axis=1)
+        made = library("pyvista").PolyData(self.vertices, faces.ravel())
+        if self.vertex_albedo is not None:
+            made.point_data["albedo"] = self.vertex_albedo
+        if self.face_block is not None:
+            made.cell_data["block"] = self.face_block
+        return made
+
+    def plot(self, gsd_m: float | None = None) -> Picture:
+        """A hillshade, looked at along the normal of the mean plane; gsd_m: side of a pixel, none: for 100,000 of them."""
+        from pipeline.precision.surface import wall_raster
+        from pipeline.report.figures import hillshade_figure
+        from scene.frame import WallFrame
+        from scene.mesh import area_normals
+        from scene.raycast import RayCaster
+
+        outward = area_normals(self.corners()).sum(axis=0)
+        frame = WallFrame.fit(self.vertices, self.vertices.mean(axis=0) + outward)
+        raster = wall_raster(RayCaster(self.with_vertices(frame.to_wall(self.vertices))), gsd_m)
+        return Picture(hillshade_figure(raster.image(raster.places.points[:, 2]), raster.grid))
+
+    def _repr_html_(self) -> str:
+        extent = " x ".join(f"{length:.2f}" for length in self.bounds[1] - self.bounds[0])
+        return html_table(
+            "Mesh", {"vertices": f"{len(self.vertices):,}", "triangles": f"{len(self.faces):,}", "extent, m": extent}
+        )

@@ -1,0 +1,67 @@
+"""Pictures and tables as notebooks show them."""
+
+from __future__ import annotations
+
+import html
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.formats.atomic import write_bytes
+from pipeline.report.page import picture_source
+from scene.errors import InputError, nearest
+
+_THUMBNAIL_PX = 640
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as the reports have it. png: its bytes; a notebook shows it."""
+
+    png: bytes
+
+    def save(self, path: Path | str) -> Path:
+        """Write the PNG file; returns its path."""
+        write_bytes(Path(path), self.png)
+        return Path(path)
+
+    def _repr_png_(self) -> bytes:
+        return self.png
+
+    def small(self) -> bytes:
+        """PNG of the picture, not wider than a table."""
+        from PIL import Image
+
+        with Image.open(io.BytesIO(self.png)) as picture:
+            picture.thumbnail((_THUMBNAIL_PX, _THUMBNAIL_PX))
+            buffer = io.BytesIO()
+            picture.convert("RGB").quantize(64).save(buffer, "PNG", optimize=True)
+        return buffer.getvalue()
+
+
+def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
+    """The picture called `kind`, or the first; raises InputError with the names that there are."""
+    if not pictures:
+        raise InputError("there is no picture of it", where=where)
+    if kind is None:
+        return next(iter(pictures.values()))
+    if kind not in pictures:
+        raise InputError(
+            f"there is no picture '{kind}'", where=where, allowed=", ".join(pictures), remedy=nearest(kind, pictures)
+        )
+    return pictures[kind]
+
+
+def html_table(title: str, rows: Mapping[str, Any], picture: Picture | None = None) -> str:
+    """A heading, a table of two columns and a small picture, for `_repr_html_`."""
+    lines = "".join(
+        f"<tr><th style='text-align:left'>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows.items()
+    )
+    shown = "" if picture is None else f"<img src='{picture_source(picture.small())}' alt='{_text(title)}'>"
+    return f"<div><strong>{_text(title)}</strong><table>{lines}</table>{shown}</div>"
+
+
+def _text(value: Any) -> str:
+    return html.escape(str(value))

@@ -1,0 +1,118 @@
+"""Points as a structured array that goes over to the libraries that people look at points with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.api.extras import library
+from pipeline.api.pictures import Picture, html_table
+from pipeline.formats.laz import EXACT_INTENSITY
+from pipeline.formats.ply import write_ply_points
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.xyz import write_xyz
+from pipeline.run.products import write_cloud
+from scene.errors import InputError
+from scene.mesh import FloatArray
+
+_MOST_DRAWN = 100_000
+_AXES = ("x", "y", "z")
+
+
+class Points(np.ndarray[Any, Any]):
+    """(n,) structured array of points: x, y, z (float64, m), then what was recorded or is known of each.
+
+    `points["x"]` is an array, `points[points["intensity"] > 0.5]` are points again.
+    """
+
+    @classmethod
+    def of(cls, cloud: PointCloud) -> Self:
+        """The points of a cloud, in its frame; its channels keep their types."""
+        channels = {name: cloud.points[:, axis] for axis, name in enumerate(_AXES)}
+        optional = {"intensity": cloud.intensity, "gps_time": cloud.gps_time}
+        channels |= {name: np.asarray(values) for name, values in (optional | cloud.extra).items() if values is not None}
+        table = np.empty(len(cloud.points), dtype=[(name, values.dtype) for name, values in channels.items()])
+        for name, values in channels.items():
+            table[name] = values
+        return table.view(cls)
+
+    def __getitem__(self, key: Any) -> Any:
+        found = super().__getitem__(key)
+        return found if getattr(found, "dtype", None) is not None and found.dtype.names else np.asarray(found)[()]
+
+    @property
+    def xyz(self) -> FloatArray:
+        """(n, 3) coordinates, m."""
+        return np.stack([self[name] for name in _AXES], axis=-1)
+
+    def cloud(self) -> PointCloud:
+        """The same as files are written from."""
+        further = {name: self[name] for name in self.dtype.names or () if name not in _AXES}
+        intensity = further.pop("intensity", further.pop(EXACT_INTENSITY, None))
+        return PointCloud(self.xyz, intensity, further.pop("gps_time", None), further)
+
+    def save(self, path: Path | str) -> Path:
+        """Write .laz, .las, .ply or .xyz; returns the path. Raises InputError for another suffix."""
+        path, cloud = Path(path), self.cloud()
+        if path.suffix in (".laz", ".las"):
+            write_cloud(path, cloud)
+        elif path.suffix == ".ply":
+            write_ply_points(path, cloud)
+        elif path.suffix in (".xyz", ".txt"):
+            write_xyz(path, cloud)
+        else:
+            raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".laz .las .ply .xyz")
+        return path
+
+    def to_open3d(self) -> Any:
+        """An open3d.geometry.PointCloud, grey by intensity where there is one."""
+        geometry, utility = library("open3d").geometry, library("open3d").utility
+        cloud = geometry.PointCloud(utility.Vector3dVector(self.xyz))
+        if "intensity" in (self.dtype.names or ()):
+            grey = np.clip(np.asarray(self["intensity"], dtype=np.float64), 0, 1)
+            cloud.colors = utility.Vector3dVector(np.repeat(grey[:, None], 3, axis=1))
+        return cloud
+
+    def to_pyvista(self) -> Any:
+        """A pyvista.PolyData with the channels as point data."""
+        cloud = library("pyvista").PolyData(self.xyz)
+        for name in self.dtype.names or ():
+            if name not in _AXES:
+                cloud.point_data[name] = np.ascontiguousarray(self[name])
+        return cloud
+
+    def plot(self, channel: str = "z") -> Picture:
+        """The points over x and y, coloured by a channel; of many a regular part."""
+        if channel not in (self.dtype.names or ()):
+            raise InputError(f"no channel '{channel}'", where="points", allowed=", ".join(self.dtype.names or ()))
+        return scatter(self.xyz[:, :2], np.asarray(self[channel], dtype=np.float64), channel)
+
+    def _repr_html_(self) -> str:
+        if not self.dtype.names or self.ndim != 1:
+            return f"<pre>{self!r}</pre>"
+        return html_table(f"{len(self):,} points", {name: _range(self[name]) for name in self.dtype.names})
+
+
+def scatter(at: NDArray[Any], values: NDArray[Any], label: str, limit: float | None = None) -> Picture:
+    """Points (n, 2), m, coloured by values (n,); limit: of a scale on both sides of zero, red above."""
+    from matplotlib.figure import Figure
+
+    from pipeline.report.figures import COLOURS, DPI, SEQUENTIAL, dress, png_bytes
+
+    step = max(1, -(-len(at) // _MOST_DRAWN))
+    figure = Figure(figsize=(9.6, 5.4), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    scale = {"cmap": SEQUENTIAL} if limit is None else {"cmap": COLOURS, "vmin": -limit, "vmax": limit}
+    drawn: Any = axes.scatter(*at[::step].T, c=values[::step], s=1.5, linewidths=0, **scale)
+    axes.set_aspect("equal")
+    dress(axes, "x, m", "y, m")
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
+    return Picture(png_bytes(figure))
+
+
+def _range(values: NDArray[Any]) -> str:
+    known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    return f"{known.min():.6g} to {known.max():.6g}" if len(known) else "none"

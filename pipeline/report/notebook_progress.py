@@ -1,0 +1,68 @@
+"""Progress as a bar in a notebook."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Self
+
+from pipeline.report.progress import Progress, shown_progress
+
+_BAR = '<progress value="{share:.3f}" max="1" style="width: 20em"></progress> {percent} %, {time}: {stage}'
+
+
+class NotebookProgress(Progress):
+    """An HTML bar, drawn again whenever a stage begins or says how far it is; it vanishes at the end."""
+
+    def __init__(self, display: Any) -> None:
+        """display: IPython's, or what has its arguments."""
+        super().__init__()
+        self._display, self._handle, self._shown = display, None, ""
+
+    def __enter__(self) -> Self:
+        self._handle = self._display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._show("")
+
+    def plan(self, weights: Mapping[str, float]) -> None:
+        super().plan(weights)
+        self._draw()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Self]:
+        with super().stage(name):
+            self._draw()
+            yield self
+
+    def advance(self, fraction: float) -> None:
+        super().advance(fraction)
+        self._draw()
+
+    def _draw(self) -> None:
+        self._show(_BAR.format(share=self.share, percent=int(100 * self.share), time=self.time, stage=self.current))
+
+    def _show(self, html: str) -> None:
+        if self._handle is not None and html != self._shown:
+            self._handle.update({"text/html": html, "text/plain": ""}, raw=True)
+            self._shown = html
+
+
+def python_progress(show: bool | str = "auto") -> Progress:
+    """The progress of a call from Python. show: "auto", a bar in a notebook and on a terminal, nothing elsewhere; or a choice."""
+    if show is False:
+        return Progress()
+    if in_notebook():
+        from IPython.display import display
+
+        return NotebookProgress(display)
+    return shown_progress(quiet=show == "auto" and not sys.stderr.isatty())
+
+
+def in_notebook() -> bool:
+    """Whether the code runs in a notebook's kernel."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    return shell is not None and hasattr(shell, "kernel")
