@@ -1,10 +1,11 @@
 # `make demo` and `make test` work from an empty clone on a bare Debian or Ubuntu with Python 3.11 to 3.13; see tools/setup.sh.
 BIN := .venv/bin
 
-.PHONY: help setup demo test docs format benchmarks
+.PHONY: help setup setup-all demo test docs format benchmarks
 
 help:
-	@echo 'make setup       the environment and the system libraries (seconds when they are there)'
+	@echo 'make setup       what the program runs on: environment and system libraries (seconds when they are there)'
+	@echo 'make setup-all   what tests, documentation and benchmarks need too; the targets below do it themselves'
 	@echo 'make demo        simulate both sensors on the demo wall, into a new folder under runs/'
 	@echo 'make test        lint, types and tests'
 	@echo 'make docs        the documentation site, in site/index.html'
@@ -14,25 +15,28 @@ help:
 setup:
 	@sh tools/setup.sh
 
+setup-all:
+	@sh tools/setup.sh all
+
 demo: setup
 	@out=runs/demo_$$(date +%Y%m%d_%H%M%S) && \
 	$(BIN)/simulate --sensor stereo --out $$out/stereo && \
 	$(BIN)/simulate --sensor tls --out $$out/tls && \
 	printf '\nThe reports:\n  %s\n  %s\n' "$$PWD/$$out/stereo/report.html" "$$PWD/$$out/tls/report.html"
 
-test: setup
+test: setup-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/pytest -n 2
 
-docs: setup
+docs: setup-all
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@printf 'The site: %s\n' "$$PWD/site/index.html"
 
-format: setup
+format: setup-all
 	$(BIN)/ruff check --fix-only -q .
 	$(BIN)/ruff format .
 
-benchmarks: setup
+benchmarks: setup-all
 	@for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done

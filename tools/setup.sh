@@ -1,5 +1,7 @@
 #!/bin/sh
-# Makes everything the project needs on a bare Debian or Ubuntu: uv, the environment in .venv, the system libraries.
+# Makes what the project needs on a bare Debian or Ubuntu: uv, the environment in .venv, the system libraries.
+#   tools/setup.sh        what the program runs on
+#   tools/setup.sh all    what tests, documentation and benchmarks need too
 # Does only what is not done yet, so that running it again takes a second. Registries are those that pip, uv and apt are
 # configured for on this machine.
 set -eu
@@ -55,6 +57,12 @@ install_uv() {
     "$python" -m pip --version >/dev/null 2>&1 && "$python" -m pip install -q --target .uv uv
 }
 
+case "${1:-}" in
+    "") groups=--no-default-groups extras="" ;;
+    all) groups="" extras=poisson ;;
+    *) fail "got '$1'; allowed: nothing, all" ;;
+esac
+
 python=$(find_python)
 
 uv=uv
@@ -68,10 +76,12 @@ if ! uv_is_recent "$uv"; then
 fi
 
 # dataset: `scarpsim dataset --workers`. --inexact keeps extras added by hand, such as `uv sync --extra detect --inexact`.
-"$uv" sync --quiet --locked --inexact --extra dataset --python "$python" || fail "the environment could not be made from uv.lock"
+# shellcheck disable=SC2086  # no word where it is empty
+"$uv" sync --quiet --locked --inexact $groups --extra dataset --python "$python" || fail "the environment could not be made from uv.lock"
 
 # -P: the script's folder stays off the path, where modules have names of the standard library's.
-missing_packages() { "$python" -P pipeline/cli/system_libraries.py || fail "the check of the system libraries failed"; }
+# shellcheck disable=SC2086
+missing_packages() { "$python" -P pipeline/cli/system_libraries.py $extras || fail "the check of the system libraries failed"; }
 
 missing=$(missing_packages)
 if [ -n "$missing" ]; then

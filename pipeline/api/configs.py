@@ -34,6 +34,7 @@ def configure(
     of the command line, with two underscores for the dot: rockfall__count=5, wall={"mesh": "wall.ply"}. Raises InputError for
     whatever is wrong.
     """
+    check_sensor(sensor)
     changes = keywords({**({} if model is None else {"sensor": model}), **overrides})
     if isinstance(config, SimulationConfig):
         return resolved(config.model_dump(mode="json"), changes, sensor, seed, Path("config"))
@@ -43,11 +44,15 @@ def configure(
     return load_config(path / "run.json" if path.is_dir() else path, changes, sensor, seed)
 
 
+def check_sensor(sensor: str | None) -> None:
+    """Raise InputError for a word that names no sensor."""
+    if sensor not in (None, "stereo", "tls"):
+        raise InputError(f"got {sensor!r:.80}", where="sensor", allowed="'stereo', 'tls'")
+
+
 def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorName:
     """The sensor that is meant: the one named, or the only one that the config has a model of."""
     if sensor is not None:
-        if sensor not in ("stereo", "tls"):
-            raise InputError(f"got {sensor!r:.80}", where="sensor", allowed="'stereo', 'tls'")
         return sensor
     names = config.sensor_names()
     if len(names) > 1:

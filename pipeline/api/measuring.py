@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.api.configs import Show, plain
 from pipeline.api.pictures import Picture, html_table, pick
 from pipeline.api.points import Points, scatter
+from pipeline.api.runs import Run
 from pipeline.api.tables import boxes, frame, spread_out
 from pipeline.config.presets import model_file
 from pipeline.formats.measurement import (
@@ -32,11 +33,17 @@ from pipeline.formats.points import read_points
 from pipeline.gap.naming import workflow
 from pipeline.gap.report import figures, report
 from pipeline.report.notebook_progress import python_progress
+from pipeline.run.site import prepare_site
 from scene.config import parse
 from scene.errors import InputError
 from scene.imported import read_reference
+from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 from sensors.camera import CameraPair
+from sensors.exchanged import pair_of
+from sensors.stereo import StereoPair
+from sensors.stereo_matched import MatchedStereoPair
+from sensors.tls import LaserScanner
 
 if TYPE_CHECKING:
     import geopandas
@@ -46,7 +53,7 @@ _SCALE_SIGMAS = 6.0
 
 
 def measure(
-    folder: Path | str | None = None,
+    given: Run | Path | str | None = None,
     *,
     sensor: Literal["tls", "stereo"] = "tls",
     reference: Any = None,
@@ -55,15 +62,18 @@ def measure(
     cameras: Any = None,
     **keys: Any,
 ) -> Measurement:
-    """A measurement: a folder with measurement.yaml, or the parts of one.
+    """A measurement: a folder with measurement.yaml, the parts of one, or what a run's sensor saw of the untouched wall.
 
-    reference: the known surface, world frame: a mesh or its file; points: (n, 3) array, `Points`, a file, or a list of these, an
-    epoch each; model: what is believed of the sensor: a model, its keys, a file, a bundled name; None: the default one; cameras:
-    nominal pair or its file (stereo). keys: those of measurement.yaml beyond: frame ("world", of the points, or "scanner"),
+    given: a folder; or a run, of which `model` may be believed something else than what it was made with. reference: the known
+    surface, world frame: a mesh or its file; points: (n, 3) array, `Points`, a file, or a list of these, an epoch each; model:
+    what is believed of the sensor: a model, its keys, a file, a bundled name; None: the default one; cameras: nominal pair or
+    its file (stereo). keys: those of measurement.yaml beyond: frame ("world", of the points, or "scanner"),
     scanner={"position_m": ..., "rotation": ...}, pattern, stable_areas. Raises InputError for whatever does not fit together.
     """
-    if folder is not None:
-        return Measurement(read_measurement(Path(folder)))
+    if isinstance(given, Run):
+        return _of_run(given, model)
+    if given is not None:
+        return Measurement(read_measurement(Path(given)))
     if reference is None or points is None:
         raise InputError("needs a folder, or reference and points", where="measure")
     values = {"sensor": sensor, "reference": "reference", "points": "points", "model": "model", **plain(keys)}
@@ -225,6 +235,23 @@ class Diagnosis:
     def _repr_html_(self) -> str:
         rows = {str(number): line for number, line in enumerate(self.summary().splitlines(), start=1)}
         return html_table(f"Diagnosis: {self.verdict}", rows, self.plot() if len(self.found.residuals) else None)
+
+
+def _of_run(run: Run, model: Any) -> Measurement:
+    """The reference epoch of a run as a measurement of its wall."""
+    site = prepare_site(run.config, run.sensor, KeyedRandom(run.config.seed))
+    if site.further_stations:
+        raise InputError("has several stations", where=str(run.folder), remedy="give reference, points and scanner of one")
+    world = site.mesh.with_vertices(site.frame.to_world(site.mesh.vertices))
+    cloud = run[0].points.cloud()
+    points = replace(cloud, points=site.frame.to_world(cloud.points), extra={})
+    if isinstance(site.sensor, StereoPair | MatchedStereoPair):
+        believed, cameras = model or run.config.stereo_model(), pair_of(site.sensor).cameras
+        return measure(sensor="stereo", reference=world, points=points, model=believed, cameras=cameras)
+    assert isinstance(site.sensor, LaserScanner)  # there is no other sensor of a run
+    position, rotation = site.frame.to_world(site.sensor.position), site.frame.rotation.T @ site.sensor.rotation
+    scanner, believed = {"position_m": position, "rotation": rotation}, model or run.config.tls_model()
+    return measure(sensor="tls", reference=world, points=points, model=believed, scanner=scanner)
 
 
 def _clouds(points: Any) -> dict[str, PointCloud]:

@@ -94,9 +94,9 @@ class Run:
         return load_config(self.folder / RUN_FILE, [], None, None)
 
     @property
-    def sensor(self) -> str:
+    def sensor(self) -> SensorName:
         """stereo or tls."""
-        return str(self.record["sensor"])
+        return "stereo" if self.record["sensor"] == "stereo" else "tls"
 
     @property
     def report(self) -> Path:

@@ -29,11 +29,22 @@ EXAMPLE = """  scarpsim doctor
 _SETUP = "run `make setup` in the checkout, or install scarpsim again"
 _MEMORY_GIB, _DISK_GIB = 2.0, 1.0
 """What the demo needs, with room to spare."""
+EXTRAS = {
+    "colmap": ("surfaces by COLMAP from depth maps", "0.1 GB"),
+    "crs": ("projected coordinate systems in Metashape's files", "30 MB"),
+    "dataset": ("data sets by several workers", "30 MB"),
+    "detect": ("the detector, by TensorFlow", "2.0 GB"),
+    "m3c2": ("M3C2 distances", "0.1 GB"),
+    "notebook": ("xarray, GeoPandas, PyVista: the types of the Python interface", "0.9 GB"),
+    "poisson": ("Poisson surfaces, by Open3D", "1.0 GB"),
+}
+"""What each extra is for, and what it takes on the disk with what it needs beyond the program's set, November 2026."""
+_NEEDS_LIBRARIES = {"poisson": "open3d"}
+"""The package whose presence says that an extra's system libraries are wanted."""
 _IMPORTS = {
     "laspy": "laspy",
     "manifold3d": "manifold3d",
     "mitsuba": "mitsuba",
-    "open3d": "open3d",
     "opencv-contrib-python-headless": "cv2",
     "pycocotools": "pycocotools.mask",
     "pyyaml": "yaml",
@@ -65,7 +76,7 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def examine() -> list[Finding]:
     """Every finding; a probe that fails is itself a finding."""
-    probes: tuple[Callable[[], Iterator[Finding]], ...] = (_python, _packages, _libraries, _backend, _machine, _caches)
+    probes: tuple[Callable[[], Iterator[Finding]], ...] = (_python, _packages, _extras, _libraries, _backend, _machine, _caches)
     return [finding for probe in probes for finding in _guarded(probe)]
 
 
@@ -101,6 +112,33 @@ def _packages() -> Iterator[Finding]:
     for requirement in map(Requirement, metadata.requires("scarpsim") or []):
         if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
             yield _package(requirement)
+    yield Finding("all packages", None, f"{sum(map(_megabytes, metadata.distributions())):,.0f} MB")
+
+
+def _extras() -> Iterator[Finding]:
+    """Which of the extras are there; what is not installed is no problem."""
+    from packaging.requirements import Requirement
+
+    wanted = [Requirement(text) for text in metadata.requires("scarpsim") or []]
+    for extra, (purpose, size) in EXTRAS.items():
+        marked = [each for each in wanted if each.marker and "extra" in str(each.marker)]
+        names = [each.name for each in marked if each.marker and each.marker.evaluate({"extra": extra})]
+        absent = [name for name in names if not _is_installed(name)]
+        found = f"{purpose}; " + (f"not installed: {', '.join(absent)}, {size} with what they need" if absent else "installed")
+        yield Finding(f"extra {extra}", None, found, f"pip install 'scarpsim[{extra}]'" if absent else "")
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def _megabytes(distribution: metadata.Distribution) -> float:
+    """What a distribution takes on the disk, by its own record."""
+    return sum(file.size or 0 for file in distribution.files or ()) / 1e6
 
 
 def _package(requirement: Requirement) -> Finding:
@@ -114,13 +152,15 @@ def _package(requirement: Requirement) -> Finding:
     except Exception as error:  # compiled packages fail in many ways, each worth reading
         return Finding(name, False, f"{version} does not load: {_brief(error)}", "see the system libraries below")
     fits = version in wanted
-    return Finding(name, fits, version, "" if fits else f"wanted {wanted}; {_SETUP}")
+    found = f"{version}, {_megabytes(metadata.distribution(name)):.0f} MB"
+    return Finding(name, fits, found, "" if fits else f"wanted {wanted}; {_SETUP}")
 
 
 def _libraries() -> Iterator[Finding]:
-    missing = system_libraries.missing()
+    extras = [extra for extra, package in _NEEDS_LIBRARIES.items() if _is_installed(package)]
+    missing = system_libraries.missing(extras)
     for library in system_libraries.LIBRARIES:
-        if library.soname != system_libraries.LLVM:  # asked of Dr.Jit itself below
+        if library.extra in ("", *extras) and library.soname != system_libraries.LLVM:  # asked of Dr.Jit itself below
             absent = library in missing
             yield Finding(library.soname, not absent, f"for {library.needed_by}", _apt_line(missing) if absent else "")
 

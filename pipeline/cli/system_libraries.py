@@ -1,6 +1,7 @@
 """The system libraries that PyPI's packages do not bring along, and which of them this machine lacks.
 
-Standard library only: `tools/setup.sh` runs this file before any package is there, `scarpsim doctor` imports it.
+Standard library only: `tools/setup.sh` runs this file before any package is there, with the extras that it installs as arguments;
+`scarpsim doctor` imports it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import os
 import re
 import shutil
 import subprocess
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,11 +23,13 @@ _LLVM_RELEASES = range(22, 13, -1)
 
 @dataclass(frozen=True)
 class SystemLibrary:
-    """A shared library: what the loader looks for, Debian's and Ubuntu's package, and who needs it."""
+    """A shared library: what the loader looks for, Debian's and Ubuntu's package, and who needs it; extra: the extra of that,
+    without which nobody does."""
 
     soname: str
     package: str
     needed_by: str
+    extra: str = ""
 
     @property
     def present(self) -> bool:
@@ -36,18 +41,18 @@ LIBRARIES = (
     SystemLibrary("libstdc++.so.6", "libstdc++6", "every compiled package"),
     SystemLibrary("libz.so.1", "zlib1g", "OpenCV, Mitsuba"),
     SystemLibrary("libatomic.so.1", "libatomic1", "Dr.Jit"),
-    SystemLibrary("libusb-1.0.so.0", "libusb-1.0-0", "Open3D"),
-    SystemLibrary("libudev.so.1", "libudev1", "Open3D"),
-    SystemLibrary("libX11.so.6", "libx11-6", "Open3D"),
-    SystemLibrary("libGL.so.1", "libgl1", "Open3D"),
-    SystemLibrary("libEGL.so.1", "libegl1", "Open3D"),
+    SystemLibrary("libusb-1.0.so.0", "libusb-1.0-0", "Open3D", "poisson"),
+    SystemLibrary("libudev.so.1", "libudev1", "Open3D", "poisson"),
+    SystemLibrary("libX11.so.6", "libx11-6", "Open3D", "poisson"),
+    SystemLibrary("libGL.so.1", "libgl1", "Open3D", "poisson"),
+    SystemLibrary("libEGL.so.1", "libegl1", "Open3D", "poisson"),
     SystemLibrary(LLVM, "libllvm", "Dr.Jit on the CPU"),
 )
 
 
-def missing() -> list[SystemLibrary]:
-    """The libraries that this machine lacks."""
-    return [library for library in LIBRARIES if not library.present]
+def missing(extras: Sequence[str] = ()) -> list[SystemLibrary]:
+    """The libraries that this machine lacks for the program and some of its extras."""
+    return [library for library in LIBRARIES if library.extra in ("", *extras) and not library.present]
 
 
 def packages(libraries: list[SystemLibrary]) -> list[str]:
@@ -81,4 +86,4 @@ def _llvm_package() -> str:
 
 
 if __name__ == "__main__":
-    print(" ".join(packages(missing())))
+    print(" ".join(packages(missing(sys.argv[1:]))))

@@ -254,7 +254,11 @@ def _ends(missing: BoolArray, axis: int) -> tuple[IntArray, IntArray]:
 
 def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[FloatArray, IntArray]:
     """Open3D's reconstruction, with normals that look to the viewpoint; returns vertices and faces."""
-    import open3d  # takes seconds to load and is needed here only
+    try:
+        import open3d  # takes seconds to load and is needed here only
+    except ImportError as error:
+        remedy = "uv sync --extra poisson in a checkout, or pip install 'scarpsim[poisson]'"
+        raise InputError(f"poisson needs Open3D, which does not load ({error})", where="surface.method", remedy=remedy) from None
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from importlib import metadata
@@ -19,9 +20,11 @@ def test_this_machine_is_ready(capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(capsys.readouterr().out)
     found = {finding["name"]: finding for finding in told["findings"]}
     assert told["ready"] is True
-    assert found["numpy"]["found"] == metadata.version("numpy")
+    assert re.fullmatch(rf"{metadata.version('numpy')}, \d\d MB", found["numpy"]["found"])
+    assert found["extra poisson"]["found"].endswith("installed")
+    assert re.fullmatch(r"[\d,]+ MB", found["all packages"]["found"])
     assert found["Mitsuba variant"]["found"].split()[0] in ("llvm_ad_mono", "cuda_ad_mono")
-    assert {"Python", "open3d", "CPU threads", "memory", "disk space here", "compiled kernels", "CUDA device"} <= set(found)
+    assert {"Python", "mitsuba", "CPU threads", "memory", "disk space here", "compiled kernels", "CUDA device"} <= set(found)
 
 
 def test_missing_things_are_told_with_their_remedy(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -38,6 +41,25 @@ def test_missing_things_are_told_with_their_remedy(monkeypatch: pytest.MonkeyPat
     assert "wanted >=1000" in lines["numpy"]
     assert "does not load: ModuleNotFoundError" in lines["rich"]
     assert "ModuleNotFoundError" in lines["machine"]
+
+
+def test_an_extra_that_is_not_there_is_no_problem_and_says_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda _: ["nonesuch>=3; extra == 'detect'", "numpy; extra == 'crs'"])
+    found = {finding.name: finding for finding in doctor._extras()}
+    assert found["extra detect"].ok is None
+    assert "not installed: nonesuch, 2.0 GB" in found["extra detect"].found
+    assert found["extra detect"].remedy == "pip install 'scarpsim[detect]'"
+    assert found["extra crs"].found.endswith("installed")
+    assert not found["extra crs"].remedy
+
+
+def test_the_libraries_of_an_extra_are_wanted_with_it_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    absent = system_libraries.SystemLibrary("libnonesuch.so.7", "libnonesuch7", "Open3D", "poisson")
+    monkeypatch.setattr(system_libraries, "LIBRARIES", (absent,))
+    assert system_libraries.missing() == []
+    assert system_libraries.missing(["poisson"]) == [absent]
+    monkeypatch.setattr(doctor, "_is_installed", lambda _: False)
+    assert list(doctor._libraries()) == []
 
 
 def test_a_probe_that_fails_is_a_finding() -> None:

@@ -11,18 +11,9 @@ _LEFT_OUT = ("pipeline/cli",)
 """Folders with a page of their own elsewhere."""
 _INTRODUCTION = """# API
 
-From the docstrings. What the commands do, a notebook can do: each command reads a config and calls one function.
-
-| command | function |
-|---|---|
-| `simulate` | `pipeline.run.simulation.simulate` |
-| `inspect` | `pipeline.planning.inspect.inspect`, `write_plans` |
-| `compare` | `pipeline.comparison.comparison.compare_sensors` |
-| `icp-study` | `pipeline.icp_study.study` |
-| `calibrate` | `pipeline.calibration.calibrate.calibrate` |
-| `dataset` | `pipeline.dataset.run.make_dataset`, `verify_dataset`; `pipeline.dataset.combine` |
-| `gap` | `pipeline.gap.naming.workflow.diagnose`; `pipeline.gap.survey.identifiability.identifiability` |
-| `train`, `detect`, `evaluate` | `pipeline.detection.run` |
+From the docstrings. What is public, and stays, is listed in [From Python](../python.md): `from pipeline import simulate, plan,
+compare, calibrate, measure, diagnose, make_dataset, detect, open_run`, and the building blocks ([pipeline.api](pipeline.api.md)).
+The other modules are the program's own and may change.
 
 A module's folder says what it knows: `scene` knows no sensor, `sensors` know the scene's ray caster, `pipeline` joins them.
 

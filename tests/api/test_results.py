@@ -1,0 +1,204 @@
+"""What the functions of the Python interface return: values, coordinates, units, types."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import numpy as np
+import pytest
+import rasterio
+import rioxarray
+import xarray
+
+from pipeline import Mesh, Points, Run, SimulationConfig, configure, detect, open_run, plan, simulate
+from pipeline.api.maps import raster_of
+from pipeline.formats.geotiff import read_geotiff
+from pipeline.formats.laz import read_laz
+from scene import InputError
+
+TINY: dict[str, Any] = {
+    "wall": {"style": "pilkington", "width_m": 6.0, "height_m": 4.0, "resolution_m": 0.1},
+    "rockfall__count": 3,
+    "station__distance_m": 20.0,
+    "scanner__azimuth_step_rad": 0.002,
+    "scanner__zenith_step_rad": 0.002,
+    "difference__gsd_m": 0.05,
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return simulate(None, "tls", out=tmp_path_factory.mktemp("runs") / "tiny", seed=4, progress=False, **TINY)
+
+
+def test_a_difference_map_lies_where_the_geotiff_does(run: Run) -> None:
+    found, file = run[1].difference, run.folder / "difference_001.tif"
+    with rioxarray.open_rasterio(file) as raster, rasterio.open(file) as plain:
+        assert np.array_equal(found.values, raster.squeeze("band").values, equal_nan=True)
+        assert np.allclose(found.rio.bounds(), plain.bounds)
+        assert found.rio.crs == plain.crs
+    assert found.dims == ("y", "x")
+    assert found.attrs["units"] == found.x.attrs["units"] == "m"
+    assert run.differences.sel(epoch=1).drop_vars("epoch").equals(found)
+    matrix = np.reshape(found.attrs["matrix_world_to_wall"], (4, 4))
+    assert np.allclose(matrix @ [1, 2, 3, 1], [*run.frame.to_wall(np.array([1.0, 2.0, 3.0])), 1])
+
+
+def test_a_map_goes_to_a_raster_and_back(run: Run) -> None:
+    values, grid = raster_of(run[1].difference.isel(y=slice(None, None, -1)), "map")
+    expected, place = read_geotiff(run.folder / "difference_001.tif")
+    assert np.array_equal(values, expected, equal_nan=True)
+    assert (grid.width, grid.height) == (place.width, place.height)
+    assert np.allclose((grid.x_min, grid.y_max, grid.gsd), (place.x_min, place.y_max, place.gsd))
+
+
+@pytest.mark.parametrize(
+    ("array", "problem"),
+    [
+        (xarray.DataArray(np.zeros((2, 2, 2)), dims=("epoch", "y", "x")), "dimensions"),
+        (xarray.DataArray(np.zeros((2, 2)), coords={"y": [0.0, 1.0], "x": [0.0, 2.0]}, dims=("y", "x")), "1 to 2 m"),
+        (xarray.DataArray(np.zeros((1, 2)), coords={"y": [0.0], "x": [0.0, 2.0]}, dims=("y", "x")), "1 x 2 pixels"),
+    ],
+)
+def test_what_is_no_map(array: xarray.DataArray, problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        raster_of(array, "map")
+
+
+def test_blocks_are_what_the_files_say(run: Run) -> None:
+    found, held = run.blocks, json.loads((run.folder / "epoch_001" / "blocks.json").read_text())
+    assert isinstance(found, geopandas.GeoDataFrame)
+    assert found.crs == run[1].difference.rio.crs
+    assert found.block.tolist() == [each["label"] for each in held]
+    assert found.volume_m3.tolist() == [each["volume_m3"] for each in held]
+    x0, y0, _, x1, y1, _ = held[0]["bbox_m"]
+    assert found.geometry[0].bounds == (x0, y0, x1, y1)
+    assert [found.world_x_m[0], found.world_y_m[0], found.world_z_m[0]] == held[0]["world_position_m"]
+    annotated = {each["block"] for each in run.annotations["annotations"]}
+    assert set(found.block[found.annotated]) == annotated
+
+
+def test_points_are_the_files_and_go_to_others(run: Run, tmp_path: Path) -> None:
+    found, held = run[1].points, read_laz(run.folder / "epoch_001" / "points.laz")
+    assert np.array_equal(found.xyz, held.points)
+    assert np.array_equal(found["block"], held.extra["block"])
+    assert type(found["x"]) is np.ndarray
+    assert isinstance(found[found["block"] == 0], Points)
+    assert np.array_equal(np.asarray(found.to_open3d().points), held.points)
+    assert np.array_equal(found.to_pyvista().point_data["block"], held.extra["block"])
+    again = read_laz(found.save(tmp_path / "again.laz"))
+    assert np.abs(again.points - held.points).max() < 1e-6
+    with pytest.raises(InputError, match=r"allowed: \.laz"):
+        found.save(tmp_path / "points.dwg")
+
+
+def test_meshes_go_to_others(run: Run, tmp_path: Path) -> None:
+    truth = run[1].truth
+    for other in (truth.to_trimesh().vertices, np.asarray(truth.to_open3d().vertices), truth.to_pyvista().points):
+        assert np.allclose(other, truth.vertices, atol=1e-5)
+    assert np.array_equal(truth.to_pyvista().cell_data["block"], truth.face_block)
+    assert np.array_equal(Mesh.read(truth.save(tmp_path / "mesh.ply")).faces, truth.faces)
+    with pytest.raises(InputError, match="no indices"):
+        Mesh.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 3]])
+
+
+def test_everything_with_a_picture_shows_it(run: Run, tmp_path: Path) -> None:
+    pictures = [run.plot(), run.plot("histogram"), run[0].plot(), run[1].points.plot("intensity"), run[1].surface.plot(0.1)]
+    for number, each in enumerate(pictures):
+        assert each._repr_png_().startswith(b"\x89PNG")
+        assert each.save(tmp_path / f"{number}.png").stat().st_size > 1000
+    for shown in (run, run[1], run[1].points, run[1].surface):
+        assert "<table>" in shown._repr_html_()
+    with pytest.raises(InputError, match="allowed: difference"):
+        run.plot("diference")
+
+
+def test_an_opened_run_is_the_same(run: Run, tmp_path: Path) -> None:
+    found = open_run(str(run.folder))
+    assert found.config == run.config
+    assert found.sensor == "tls"
+    assert len(found) == 2
+    assert found.statistics.nmad_m[0] == run.record["epochs"][1]["statistics"]["outside_blocks"]["nmad_m"]
+    with pytest.raises(InputError, match=r"holds no run\.json"):
+        open_run(tmp_path)
+    with pytest.raises(IndexError, match="0, the reference, to 1"):
+        run[2]
+
+
+def test_detections_of_a_run_and_of_its_map_are_the_same(run: Run, tmp_path: Path) -> None:
+    of_run = detect(run, "baseline", confidence=0.5, out=tmp_path / "found", progress=False)
+    of_map = detect([run[1].difference], "baseline", confidence=0.5, progress=False)
+    assert len(of_run) > 0
+    numbers = [events.drop(columns=["image", "geometry"]) for events in (of_run.events, of_map.events)]
+    assert np.allclose(*numbers, rtol=0, atol=1e-9)
+    assert of_run.volume_m3 == pytest.approx(of_run.events.volume_m3.sum())
+    assert of_map.plot().png.startswith(b"\x89PNG")
+    with pytest.raises(InputError, match="allowed"):
+        detect(run, "baseline", confidence=1.5)
+
+
+def test_a_plan_says_where_which_block_is_seen(tmp_path: Path) -> None:
+    found = plan(None, "tls", out=tmp_path / "plan", planning__gsd_m=0.2, **TINY)[0]
+    maps = found.maps
+    assert maps.smallest_block_m.attrs["units"] == "m"
+    assert maps.incidence_rad.attrs["units"] == "rad"
+    assert 0 < found.table.loc["smallest_block_m", "middle"] < 0.5
+    assert found.table.loc["range_m", "median"] == pytest.approx(20, abs=2)
+    assert (tmp_path / "plan" / "report.html").is_file()
+    assert "smallest block" in found._repr_html_()
+
+
+def test_configs_by_object_mapping_file_and_keyword_are_one(run: Run, tmp_path: Path) -> None:
+    config = configure(None, seed=4, **TINY)
+    assert config == run.config
+    assert configure(config) == config
+    assert configure(config.model_dump(mode="json")) == config
+    assert configure(run.folder) == config
+    assert isinstance(config, SimulationConfig)
+    assert configure(config, rockfall__count=9).rockfall.count == 9
+    assert configure("glendale", scanner="riegl_vz400i").scanner.name
+    model = configure(model="glendale_high").stereo_model()
+    assert model != configure().stereo_model()
+    assert configure(model=model).stereo_model() == model
+
+
+@pytest.mark.parametrize(
+    ("call", "problem"),
+    [
+        (lambda: configure(rockfall__cuont=5), "did you mean 'count'"),
+        (lambda: configure("glendal"), "did you mean 'glendale'"),
+        (lambda: simulate(), "the config has both; give sensor='tls'"),
+        (lambda: simulate(sensor="radar"), "allowed: 'stereo', 'tls'"),
+        (lambda: simulate(wall={"mesh": Path("nothing.ply")}, sensor="tls"), "nothing.ply"),
+    ],
+)
+def test_mistakes_are_said_in_one_line(call: Any, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=problem) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_library_names_its_extra(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    monkeypatch.setitem(sys.modules, "rioxarray", None)
+    with pytest.raises(InputError, match=r"pip install 'scarpsim\[notebook\]'"):
+        _ = run[1].difference
+
+
+def test_importing_costs_nothing_and_rooms_do_not_hide_functions() -> None:
+    program = (
+        "import sys, pipeline, scene, sensors\n"
+        "loaded = {'numpy', 'mitsuba', 'xarray', 'pydantic', 'matplotlib'} & set(sys.modules)\n"
+        "from pipeline import compare, calibrate, detect, open_run\n"
+        "import pipeline.comparison.report, pipeline.detection.run, pipeline.calibration.calibrate\n"
+        "from pipeline import compare, calibrate, detect\n"
+        "heavy = {'xarray', 'geopandas', 'pyvista', 'open3d', 'tensorflow', 'IPython'} & set(sys.modules)\n"
+        "print(loaded, heavy, callable(compare), callable(calibrate), callable(detect))"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert shown.strip() == "set() set() True True True"
