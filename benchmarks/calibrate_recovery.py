@@ -96,8 +96,8 @@ def table(found: list[dict[str, Any]]) -> list[str]:
         held = int(np.count_nonzero((low <= true) & (true <= high)))
         error, half = np.sqrt(np.mean(np.log(value / true) ** 2)), np.median(np.log(high / low)) / 2
         share = binomtest(held, len(found)).proportion_ci()
-        holds = f"{held}, {held / len(found):.0%} ({share.low:.0%} to {share.high:.0%})"
-        rows.append(f"| {name} | {holds} | {error:.1%} | {half:.1%} |")
+        holds = f"{held}, {100 * (held / len(found)):.0f} % ({100 * share.low:.0f} % to {100 * share.high:.0f} %)"
+        rows.append(f"| {name} | {holds} | {100 * error:.1f} % | {100 * half:.1f} % |")
     return rows
 
 

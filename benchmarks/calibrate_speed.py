@@ -45,7 +45,7 @@ def main() -> None:
     one, bare = medians(lambda: simulator.heights(model, KeyedRandom(0)), cast)
     whole = medians(lambda: noise_map(config, site, site, simulator.caster, KeyedRandom(0)), rounds=1)[0]
     print(f"{len(simulator.cells):,} cells, {windows.stable.sum():,} pixels: {1 / one:.1f} observations/s")
-    print(f"bare cast of as many rays {1e3 * bare:.1f} ms: {bare / one:.1%} of an observation")
+    print(f"bare cast of as many rays {1e3 * bare:.1f} ms: {100 * (bare / one):.1f} % of an observation")
     print(f"a whole map takes {whole:.1f} s, {whole / (2 * one):.0f} times two observations in windows")
 
 

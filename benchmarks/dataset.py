@@ -118,7 +118,7 @@ def print_stages(made: Sequence[dict[str, Any]]) -> None:
     seconds = stage_seconds(made)
     print("| stage | share of the time |\n|---|---|")
     for name, value in sorted(seconds.items(), key=lambda item: -item[1]):
-        print(f"| {name} | {value / sum(seconds.values()):.0%} |")
+        print(f"| {name} | {100 * (value / sum(seconds.values())):.0f} % |")
 
 
 def compare_workers(rounds: int) -> None:

@@ -64,7 +64,7 @@ def row(arguments: argparse.Namespace, sensor: str, direction: str) -> str:
     ratio, found = np.median(distance[inside] / core[inside]), np.mean(distance[inside] > level[inside])
     return (
         f"| {sensor}, {direction} | {raster.nmad * 1e3:.1f} mm | {cloud.nmad * 1e3:.1f} mm "
-        f"| {apart.median * 1e3:+.2f}, {apart.nmad * 1e3:.1f} mm | {beyond:.1%} | {ratio:.3f} | {found:.0%} |"
+        f"| {apart.median * 1e3:+.2f}, {apart.nmad * 1e3:.1f} mm | {100 * beyond:.1f} % | {ratio:.3f} | {100 * found:.0f} % |"
     )
 
 

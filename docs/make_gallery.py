@@ -183,7 +183,8 @@ def _figures(comparison: Comparison) -> str:
     spread = 1.4826 * np.median(np.abs(values - median))
     return (
         f"Mean {values.mean():.2f} mm, StD {values.std():.2f} mm, NMAD {spread:.2f} mm;"
-        f" {comparison.lost.sum() / cells:.2%} of the cells are lost, {comparison.gained.sum() / cells:.2%} are gained."
+        f" {100 * comparison.lost.sum() / cells:.2f} % of the cells are lost,"
+        f" {100 * comparison.gained.sum() / cells:.2f} % are gained."
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field as Key
@@ -11,6 +11,7 @@ from pydantic import Field as Key
 from scene.config import Config
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, IntArray, TriangleMesh
+from scene.plug_ins import plugged
 from scene.rock import BlockRule, Blocks, Field, Fractal, Noise, Notches, Size, Table, partings, ramp_knots
 
 _ROWS_AT_ONCE = 64
@@ -63,7 +64,7 @@ class Site:
     band: Band | None = None
 
 
-SITES = {
+OWN_SITES = {
     "glendale": Site(
         width_m=70.0,
         height_m=45.0,
@@ -174,13 +175,19 @@ SITES = {
     ),
 }
 
+PLUG_INS = "scarpsim.wall_styles"
+"""The group of entry points by which other packages add styles, each a `Site`."""
+SITES = OWN_SITES | plugged(PLUG_INS, "a scene.procedural.Site", lambda value: isinstance(value, Site), OWN_SITES)
+if TYPE_CHECKING:
+    Style = str
+else:
+    Style = Literal[tuple(SITES)]
+
 
 class ProceduralWall(Config):
     """A wall made by rule: the same style and seed give the same rock at every resolution."""
 
-    style: Literal["glendale", "bulga", "bismantova", "pilkington"] = Key(
-        "glendale", description="the site whose rock it resembles"
-    )
+    style: Style = Key("glendale", description="the site whose rock it resembles")
     width_m: float | None = Key(None, ge=0.5, le=200.0, description="along the wall, m; the site's own if not given")
     height_m: float | None = Key(None, ge=0.5, le=200.0, description="up the slope, m; the site's own if not given")
     resolution_m: float = Key(0.05, ge=0.005, le=1.0, description="distance between vertices in the wall plane, m")

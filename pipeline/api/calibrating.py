@@ -53,7 +53,7 @@ def calibrate(
     return result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration:
     """Fitted noise. figures: everything, as `pipeline.calibration` has it; inputs: what it was fitted to."""
 
@@ -93,6 +93,9 @@ class Calibration:
     def write(self, out: Path | str) -> Path:
         """Write the folder that `scarpsim calibrate` fills; returns its report.html. InputError where it is in use."""
         return write(Path(out), self.figures.config, self.figures, self.inputs)
+
+    def __repr__(self) -> str:
+        return f"<Calibration of a {self.figures.sensor} sensor: {', '.join(self.figures.parameters.names)}>"
 
     def _repr_html_(self) -> str:
         table = self.parameters

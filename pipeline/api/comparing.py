@@ -52,7 +52,7 @@ def compare(
     return result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """Sensors compared. figures: everything, as `pipeline.comparison` has it."""
 
@@ -104,6 +104,9 @@ class Comparison:
     def write(self, out: Path | str) -> Path:
         """Write the folder that `scarpsim compare` fills; returns its report.html. InputError where it is in use."""
         return write_comparison(Path(out), self.figures)
+
+    def __repr__(self) -> str:
+        return f"<Comparison of {', '.join(self.names)}>"
 
     def _repr_html_(self) -> str:
         return html_table("Sensors compared", {each.name: answer(each) for each in self.figures.found}, self.plot())

@@ -52,7 +52,7 @@ def make_dataset(
     return DataSet(made.folder)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DataSet:
     """A data set by its folder."""
 
@@ -88,6 +88,9 @@ class DataSet:
         """A picture of the set's card."""
         drawn = {path.stem: path for path in sorted((self.folder / "card").glob("*.png"))}
         return Picture(pick(drawn, kind, str(self.folder)).read_bytes())
+
+    def __repr__(self) -> str:
+        return f"<DataSet {self.folder}: {', '.join(self.splits)}>"
 
     def _repr_html_(self) -> str:
         table = self.table

@@ -56,7 +56,7 @@ def detect(
     return Detections(folder, tuple(found), min(confidences), kept)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Detections:
     """What was found. folder: of the files; found: the events with a score of `confidence` and more, best first in each map."""
 
@@ -90,6 +90,9 @@ class Detections:
     def summary(self) -> str:
         """One line."""
         return f"{len(self)} blocks with a score of {self.confidence:g} or more, {self.volume_m3:.3g} m3"
+
+    def __repr__(self) -> str:
+        return f"<Detections: {self.summary()}>"
 
     def _repr_html_(self) -> str:
         rows = {f"{each.image}, {each.number}": f"{each.volume_m3:.3g} m3, score {each.score:.2f}" for each in self.found[:10]}

@@ -86,7 +86,7 @@ def measure(
     return Measurement(assembled(config, material, "reference", "measure"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measurement:
     """What was measured, with what predicts it. held: everything, as `pipeline.formats.measurement` has it."""
 
@@ -115,6 +115,9 @@ class Measurement:
     def plot(self) -> Picture:
         """The points over the wall, coloured by their height over it."""
         return self.points.plot("z")
+
+    def __repr__(self) -> str:
+        return f"<Measurement: {self.sensor}, {len(self.held.cloud.points):,} points>"
 
     def _repr_html_(self) -> str:
         held = self.held
@@ -148,7 +151,7 @@ def diagnose(
     return result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """What was found. found: everything, as `pipeline.gap` has it; measurement: of what."""
 
@@ -231,6 +234,9 @@ class Diagnosis:
     def write(self, out: Path | str) -> Path:
         """Write the files of `scarpsim gap`; returns report.html."""
         return report.write(Path(out), self.found, self.measurement.held)
+
+    def __repr__(self) -> str:
+        return f"<Diagnosis: {self.verdict}, {len(self.found.effects)} effects>"
 
     def _repr_html_(self) -> str:
         rows = {str(number): line for number, line in enumerate(self.summary().splitlines(), start=1)}

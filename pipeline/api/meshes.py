@@ -82,6 +82,9 @@ class Mesh(TriangleMesh):
         raster = wall_raster(RayCaster(self.with_vertices(frame.to_wall(self.vertices))), gsd_m)
         return Picture(hillshade_figure(raster.image(raster.places.points[:, 2]), raster.grid))
 
+    def __repr__(self) -> str:
+        return f"<Mesh: {len(self.vertices):,} vertices, {len(self.faces):,} triangles>"
+
     def _repr_html_(self) -> str:
         extent = " x ".join(f"{length:.2f}" for length in self.bounds[1] - self.bounds[0])
         return html_table(

@@ -16,7 +16,7 @@ from scene.errors import InputError, nearest
 _THUMBNAIL_PX = 640
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Picture:
     """A picture as the reports have it. png: its bytes; a notebook shows it."""
 
@@ -26,6 +26,9 @@ class Picture:
         """Write the PNG file; returns its path."""
         write_bytes(Path(path), self.png)
         return Path(path)
+
+    def __repr__(self) -> str:
+        return f"<Picture: PNG of {len(self.png):,} bytes>"
 
     def _repr_png_(self) -> bytes:
         return self.png

@@ -43,7 +43,7 @@ def plan(
     return result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SensorPlan:
     """What one sensor promises. promise: everything, as `pipeline.planning` has it."""
 
@@ -78,11 +78,14 @@ class SensorPlan:
         chosen = pick({each.name: each for each in self.promise.maps}, kind, "plot")
         return Picture(map_picture(self.promise, chosen))
 
+    def __repr__(self) -> str:
+        return f"<SensorPlan: {answer(self.promise)}>"
+
     def _repr_html_(self) -> str:
         return html_table(answer(self.promise), self.figures, self.plot())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Plans:
     """The plans of a config's sensors; of several stations first all together, then each."""
 
@@ -109,6 +112,9 @@ class Plans:
     def write(self, out: Path | str) -> Path:
         """Write the folder that `scarpsim inspect` fills; returns its report.html. InputError where it is in use."""
         return write_plans(Path(out), self.config, [each.promise for each in self.plans])
+
+    def __repr__(self) -> str:
+        return f"<Plans: {', '.join(each.promise.instrument for each in self)}>"
 
     def _repr_html_(self) -> str:
         return "".join(each._repr_html_() for each in self.plans)

@@ -71,7 +71,7 @@ def open_run(folder: Path | str) -> Run:
     return run
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Run:
     """A run's folder, read when it is asked for. `run[0]` is the reference, `run[1]` the first epoch after rocks fell."""
 
@@ -148,6 +148,9 @@ class Run:
         """A picture of the report, of an epoch: difference, hillshade, histogram, icp or m3c2."""
         return self[epoch].plot(kind)
 
+    def __repr__(self) -> str:
+        return f"<Run {self.folder}: {self.sensor}, {len(self.epochs)} epochs>"
+
     def _repr_html_(self) -> str:
         rows: dict[str, Any] = {"sensor": self.sensor, "seed": self.record["seed"], "epochs": len(self.epochs)}
         rows |= {f"epoch {each.number}": each.summary() for each in self.epochs[:5]}
@@ -155,7 +158,7 @@ class Run:
         return html_table(f"Run {self.folder}", {**rows, "report": self.report}, picture)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Epoch:
     """One epoch of a run, wall frame; of number 0, the reference, there is no difference."""
 
@@ -239,6 +242,9 @@ class Epoch:
         if not path.is_file():
             raise InputError(f"the run did not write {name}.ply", where=str(self.folder), remedy="see `products` in the config")
         return Mesh.read(path)
+
+    def __repr__(self) -> str:
+        return f"<Epoch {self.number} of {self.run!r}>"
 
     def _repr_html_(self) -> str:
         title = f"Epoch {self.number} of {self.run.folder}"

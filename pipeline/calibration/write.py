@@ -56,7 +56,7 @@ def model_yaml(result: Calibration) -> str:
     """The calibrated sensor model as `simulate --set sensor=calibrated.yaml` reads it, each fitted value with its interval."""
     found, names = result.found, result.parameters.names
     share = result.confidence
-    lines = [f"# Calibrated on {len(result.epochs)} difference map(s) by scarpsim calibrate; intervals of {share:.0%}."]
+    lines = [f"# Calibrated on {len(result.epochs)} difference map(s) by scarpsim calibrate; intervals of {100 * share:.0f} %."]
     for name, value, low, high in zip(names, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True):
         lines.append(f"# {name}: {value:.4g} ({low:.4g} to {high:.4g})")
     return "\n".join(lines) + "\n" + _yaml(_rounded(result.model.model_dump(mode="json")), 0)

@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.cli.train import load_keras
     from pipeline.detection.run import BASELINE, CONFIDENCES, checked_confidences, detect
     from pipeline.formats.atomic import new_folder
     from pipeline.report.progress import shown_progress
@@ -48,9 +49,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
     out = arguments.out or new_folder(Path("runs"), "detect")
     if arguments.model != BASELINE:
-        from pipeline.detection.keras_backend import keras_ready
-
-        keras_ready()
+        load_keras(quiet=arguments.quiet)
     with shown_progress(quiet=arguments.quiet) as progress:
         found = detect(arguments.model, arguments.inputs, out, confidences, not arguments.no_pictures, progress)
     volume = sum(item.volume_m3 for item in found)

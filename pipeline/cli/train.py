@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from pipeline.cli.answer import Answer
@@ -35,7 +36,6 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detection.config import load_train_config
     from pipeline.detection.data import CocoFolder
-    from pipeline.detection.keras_backend import keras_ready
     from pipeline.report.progress import shown_progress
 
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     config = load_train_config(path, overrides)
     for split in ("train", "val"):
         CocoFolder(arguments.data_set / split).check_images()  # a mistake there should not wait for TensorFlow
-    keras_ready()
+    load_keras(quiet=arguments.quiet)
     from pipeline.detection.training import train
 
     arguments.kept = f"what was learned is in {arguments.out}; go on with --resume"
@@ -54,3 +54,13 @@ def run(arguments: argparse.Namespace) -> Answer:
     told = f"{count} epoch{'s' if count > 1 else ''}, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
     document = {"folder": str(arguments.out), "model": str(model), "epochs": count}
     return Answer(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})
+
+
+def load_keras(*, quiet: bool) -> None:
+    """Import Keras and its backend, and say before that this is what takes so long."""
+    from pipeline.detection.keras_backend import check_installed, keras_ready
+
+    backend = check_installed()
+    if not quiet:
+        print(f"loading {backend}, ten seconds and more", file=sys.stderr, flush=True)
+    keras_ready()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from pipeline.config.bundled import bundled_config, configs_folder
+from pipeline.config.bundled import bundled_config, named_configs
 from pipeline.config.overrides import Override
 from pipeline.config.presets import is_path
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
@@ -89,17 +89,22 @@ def _is_part(name: Given) -> TypeGuard[str]:
     if Path(name).is_file():
         values = load_yaml(Path(name))
         return isinstance(values, dict) and values.get("sensor") in ("stereo", "tls")
-    return not is_path(name) and _bundled(name).parent.name in ("scanners", "noise")
+    return not is_path(name) and _kind(name) in ("scanners", "noise")
 
 
 def _bundled(name: str) -> Path:
-    folders = [configs_folder() / kind for kind in _KINDS]
-    path = next((folder / f"{name}.yaml" for folder in folders if (folder / f"{name}.yaml").is_file()), None)
-    if path is None:
-        known = sorted(found.stem for folder in folders for found in folder.glob("*.yaml"))
+    return bundled_config(_kind(name), name)
+
+
+def _kind(name: str) -> str:
+    """The kind of bundled config that has this name; raises InputError with the nearest one where none has."""
+    named = {kind: named_configs(kind) for kind in _KINDS}
+    kind = next((kind for kind, found in named.items() if name in found), None)
+    if kind is None:
+        known = sorted(each for found in named.values() for each in found)
         hint = nearest(name, known)
         raise InputError(f"there is no file and no preset '{name}'", where="CONFIG", allowed=", ".join(known), remedy=hint)
-    return path
+    return kind
 
 
 def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[Contestant]:
@@ -128,14 +133,15 @@ def _each_sensor(name: str, config: SimulationConfig, sensors: Sequence[SensorNa
 
 def _part(name: str, base: SimulationConfig, *, own_step: bool) -> list[Contestant]:
     """A scanner preset, with or without its own angular step, or a sensor model in the set-up of `base`."""
-    path = Path(name) if Path(name).is_file() else _bundled(name)
+    is_file = Path(name).is_file()
+    path = Path(name) if is_file else _bundled(name)
     values: dict[str, Any] = base.model_dump(mode="json")
-    if path.parent.name == "scanners":
+    if not is_file and _kind(name) == "scanners":
         step = {} if own_step else {key: values["scanner"][key] for key in ("azimuth_step_rad", "zenith_step_rad")}
         config = parse(SimulationConfig, values | {"scanner": {"preset": str(path), **step}, "sensor": []}, name)
     else:
         config = parse(SimulationConfig, values | {"sensor": [load_yaml(path)]}, name)
-    return [Contestant(path.stem, config.sensor[0].sensor, config)]
+    return [Contestant(path.stem if is_file else name, config.sensor[0].sensor, config)]
 
 
 def _with_own_names(found: Sequence[Contestant]) -> Iterator[Contestant]:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from scene.errors import InputError, nearest
+from scene.plug_ins import plugged
 
+PLUG_INS = {"scanners": "scarpsim.scanners", "noise": "scarpsim.noise", "sites": "scarpsim.sites"}
+"""The groups of entry points by which other packages name configs of a kind, each the path of a YAML file."""
 _PLACES = (Path(__file__).parents[1] / "configs", Path(__file__).parents[2] / "configs")
 
 
@@ -17,16 +20,25 @@ def configs_folder() -> Path:
     raise InputError("the bundled configs are missing", where=str(_PLACES[0]), remedy="install scarpsim again")
 
 
+def named_configs(kind: str) -> dict[str, Path]:
+    """The files of a kind's configs by name: those that come with the program, and those of other packages (PLUG_INS)."""
+    own = {path.stem: path for path in sorted((configs_folder() / kind).glob("*.yaml"))}
+    if kind not in PLUG_INS:
+        return own
+    needs = "the path of a YAML file, as text or Path"
+    further = plugged(PLUG_INS[kind], needs, lambda value: isinstance(value, str | Path) and Path(value).is_file(), own)
+    return own | {name: Path(path) for name, path in further.items()}
+
+
 def bundled_config(kind: str, name: str) -> Path:
     """The file of the bundled config `name` of a `kind` (a subfolder, such as "sites"; "" for the top, as of demo.yaml).
 
     Raises InputError with the nearest name where there is none of that name.
     """
-    folder = configs_folder() / kind
-    path = folder / f"{name}.yaml"
-    if path.is_file() and path.parent == folder:
-        return path
-    known = sorted(found.stem for found in folder.glob("*.yaml"))
+    named = named_configs(kind)
+    if name in named:
+        return named[name]
+    known = sorted(named)
     raise InputError(
         f"there is no '{name}'", where=f"configs/{kind}".rstrip("/"), allowed=", ".join(known), remedy=nearest(name, known)
     )

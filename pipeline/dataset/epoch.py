@@ -122,9 +122,10 @@ def no_tile(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np.float
     cut = [tile for tile in tiles(values, blank, grid, every) if where.holds(tile.column, every.size_px)]
     best, whole = max(tile.valid_share for tile in cut), np.count_nonzero(np.isfinite(values)) / values.size
     return InputError(
-        f"no tile has enough data: the fullest of {len(cut)} has it in {best:.0%} of its pixels, the whole map in {whole:.0%}",
+        f"no tile has enough data: the fullest of {len(cut)} has it in {100 * best:.0f} % of its pixels, "
+        f"the whole map in {100 * whole:.0f} %",
         where=epoch.name,
-        allowed=f"{config.tiles.minimum_valid_share:.0%} (tiles.minimum_valid_share)",
+        allowed=f"{100 * config.tiles.minimum_valid_share:.0f} % (tiles.minimum_valid_share)",
         remedy="let the sensor see more of the wall (place, field of view), use a coarser difference.gsd_m, or lower the share",
     )
 

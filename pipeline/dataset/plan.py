@@ -138,14 +138,14 @@ def check_filled(split: Split, where: Region, grid: Grid, config: TileConfig) ->
     tile = f"a tile of {config.size_px} px {{}}, and tiles.minimum_valid_share is {config.minimum_valid_share:g}"
     if whole < config.minimum_valid_share:
         raise InputError(
-            f"{wall}, which fill {tile.format(f'to {whole:.0%} at most')}",
+            f"{wall}, which fill {tile.format(f'to {100 * whole:.0f} % at most')}",
             where="tiles",
             remedy="use smaller tiles (tiles.size_px), a finer difference.gsd_m or a larger wall",
         )
     columns = f"{max(min(where.end, grid.width) - where.first, 0):.0f} px"
     part = "the validation region" if split == "val" else f"what the validation region leaves to {split}"
     raise InputError(
-        f"{wall}, and {part} is {columns} wide: it fills {tile.format(f'to {filled:.0%} at most')}",
+        f"{wall}, and {part} is {columns} wide: it fills {tile.format(f'to {100 * filled:.0f} % at most')}",
         where="validation_region",
         remedy="change the share, or use smaller tiles (tiles.size_px), a finer difference.gsd_m or a longer wall",
     )

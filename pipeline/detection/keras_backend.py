@@ -21,18 +21,24 @@ def keras_ready() -> None:
     TensorFlow writes some lines to stderr while it is imported, whatever the level of its log. They are dropped, and the level
     is set to errors alone, unless TF_CPP_MIN_LOG_LEVEL is set: with 0 there TensorFlow says everything.
     """
-    backend = os.environ.setdefault("KERAS_BACKEND", "tensorflow")
-    missing = [name for name in ("keras", _MODULES.get(backend, backend)) if importlib.util.find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"{' and '.join(missing)} is not installed",
-            where="the detector",
-            remedy="install the extra: uv sync --extra detect (in a checkout), or pip install 'scarpsim[detect]'",
-        )
+    check_installed()
     if "TF_CPP_MIN_LOG_LEVEL" not in os.environ:
         os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
         with stderr_dropped():
             importlib.import_module("keras")
+
+
+def check_installed() -> str:
+    """The library that Keras computes with; raises InputError where it, or Keras, is not installed."""
+    backend = os.environ.setdefault("KERAS_BACKEND", "tensorflow")
+    missing = [name for name in ("keras", _MODULES.get(backend, backend)) if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not installed",
+            where="the detector",
+            remedy="install the extra: uv sync --extra detect (in a checkout), or pip install 'scarpsim[detect]'",
+        )
+    return backend
 
 
 @contextmanager

@@ -11,7 +11,10 @@ from pipeline.formats.ply import read_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
+from scene.plug_ins import plugged
 
+PLUG_INS = "scarpsim.readers"
+"""The group of entry points by which other packages add readers: named like the suffix, without its dot."""
 SUFFIXES = (".laz", ".las", ".ply", ".e57", ".xyz", ".txt")
 
 
@@ -49,7 +52,15 @@ def _read(path: Path) -> PointCloud:
             return read_xyz(path)
         case ".e57":
             return _read_e57(path)
-    raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=" ".join(SUFFIXES))
+    further = plugged(PLUG_INS, "a function of a path that returns a PointCloud", callable, [each[1:] for each in SUFFIXES])
+    reader = further.get(path.suffix.lower()[1:])
+    if reader is None:
+        allowed = " ".join([*SUFFIXES, *(f".{name}" for name in further)])
+        raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=allowed)
+    cloud = reader(path)
+    if not isinstance(cloud, PointCloud):
+        raise InputError(f"reading it gave a {type(cloud).__name__}", where=str(path), allowed="a PointCloud, from its reader")
+    return cloud
 
 
 def _read_e57(path: Path) -> PointCloud:

@@ -135,7 +135,7 @@ def pictures(
     cells = (
         f"a cell shows the mean of {patch.pooled} x {patch.pooled} pixels; zoom the map to see each" if patch.pooled > 1 else ""
     )
-    thinned = f"{len(points.points):,} points are shown, {points.share:.2%} of all" if points is not None else ""
+    thinned = f"{len(points.points):,} points are shown, {100 * points.share:.2f} % of all" if points is not None else ""
     outside = "where there is no data the map is grey and the wall open"
     note = ". ".join(part[0].upper() + part[1:] for part in (cells, thinned, outside) if part) + "."
     return wall_figure(patch, points, items, layer, shown, number), flat, note

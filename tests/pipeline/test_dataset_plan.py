@@ -25,7 +25,7 @@ def check(width: int, height: int, split: Split, share: float, **tiles: Any) -> 
 @pytest.mark.parametrize("split", ["train", "val", "test"])
 def test_a_wall_of_few_pixels_is_named(split: Split) -> None:
     """300 x 200 of 512 x 512 pixels are 22.9 %."""
-    words = r"maps are 300 x 200 px \(gsd 0\.05 m\), which fill a tile of 512 px to 23% at most, .* is 0\.5; use smaller tiles"
+    words = r"maps are 300 x 200 px \(gsd 0\.05 m\), which fill a tile of 512 px to 23 % at most, .* is 0\.5; use smaller tiles"
     with pytest.raises(InputError, match=words):
         check(300, 200, split, 0.0)
     check(300, 200, split, 0.0, minimum_valid_share=0.22)
@@ -34,7 +34,7 @@ def test_a_wall_of_few_pixels_is_named(split: Split) -> None:
 
 def test_a_validation_region_that_is_too_narrow_is_named() -> None:
     """Two columns of tiles; the second, of the validation, has 600 - 512 = 88 columns of pixels: 17.2 % of a tile."""
-    words = r"^validation_region: .* 600 x 700 px .*, and the validation region is 88 px wide: it fills a tile of 512 px to 17%"
+    words = r"^validation_region: .* 600 x 700 px .*, and the validation region is 88 px wide: it fills a tile of 512 px to 17 %"
     with pytest.raises(InputError, match=words):
         check(600, 700, "val", 0.5)
     check(600, 700, "train", 0.5)
@@ -44,7 +44,7 @@ def test_a_validation_region_that_is_too_narrow_is_named() -> None:
 
 def test_a_region_that_overlap_leaves_without_a_tile_is_named() -> None:
     """Columns begin at 0 and 400; training ends at 400, where a tile of 512 pixels is not at an end yet."""
-    with pytest.raises(InputError, match=r"what the validation region leaves to train is 400 px wide: .* to 0% at most"):
+    with pytest.raises(InputError, match=r"what the validation region leaves to train is 400 px wide: .* to 0 % at most"):
         check(900, 700, "train", 0.5, overlap_px=112, minimum_valid_share=0.0)
 
 
@@ -54,5 +54,5 @@ def test_pixels_without_data_are_named_where_they_are_the_cause() -> None:
     values = np.full((100, 100), np.nan, np.float32)
     values[:20, :50] = 0.0
     error = no_tile(config, planned_epochs(config)[0], values, Grid(0.0, 0.0, 0.05, 100, 100))
-    assert "the fullest of 4 has it in 40% of its pixels, the whole map in 10%; allowed: 50%" in str(error)
+    assert "the fullest of 4 has it in 40 % of its pixels, the whole map in 10 %; allowed: 50 %" in str(error)
     check(100, 100, "train", 0.0, size_px=50)
