@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pipeline.api.building import difference as difference
     from pipeline.api.building import make_blocks as make_blocks
     from pipeline.api.building import make_wall as make_wall
+    from pipeline.api.building import mesh_points as mesh_points
     from pipeline.api.building import observe as observe
     from pipeline.api.building import open_wall as open_wall
     from pipeline.api.building import place_blocks as place_blocks
@@ -53,8 +54,8 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "pipeline.api.building": (
-        "carve", "difference", "make_blocks", "make_wall", "observe", "open_wall", "place_blocks", "reconstruct", "register",
-        "stage",
+        "carve", "difference", "make_blocks", "make_wall", "mesh_points", "observe", "open_wall", "place_blocks", "reconstruct",
+        "register", "stage",
     ),
     "pipeline.api.calibrating": ("Calibration", "calibrate"),
     "pipeline.api.comparing": ("Comparison", "compare"),

@@ -122,7 +122,11 @@ def _read(path: Path) -> TriangleMesh:
         raise InputError(f"is not a valid {kind} file: {problem}", where=where, remedy="export it anew") from None
     faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
     if not len(faces):
-        raise InputError("holds no triangles", where=where, remedy="mesh the points first, then export the surface")
+        raise InputError(
+            "holds no triangles",
+            where=where,
+            remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
+        )
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")

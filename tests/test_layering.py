@@ -19,6 +19,7 @@ OF_SCENE_FOR_SENSORS = {
     "frame",
     "grid",
     "illumination",
+    "lazy",
     "keyed_random",
     "mesh",
     "raycast",

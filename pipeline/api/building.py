@@ -16,8 +16,10 @@ from pipeline.api.maps import DIFFERENCE, data_array
 from pipeline.api.meshes import Mesh
 from pipeline.change import difference as rasters
 from pipeline.config.simulation import SensorName
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.registration import register as icp
 from pipeline.run.site import Site, prepare_site
+from pipeline.surface.from_cloud import surface_of_cloud
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from scene import blocks as solids
 from scene import carve as carving
@@ -103,6 +105,18 @@ def observe(mesh: TriangleMesh, sensor: Sensor, seed: int = 1) -> Observation:
 def reconstruct(observation: Observation, **keys: Any) -> Mesh:
     """The surface through the points of an observation's grid. keys: those of a config's `surface`: method, depth_step_m, ..."""
     return Mesh.of(mesh_observation(observation, parse(SurfaceConfig, keys, "reconstruct")))
+
+
+def mesh_points(points: ArrayLike, viewpoint: ArrayLike, **keys: Any) -> Mesh:
+    """The surface through unorganised points (n, 3), m, by Poisson reconstruction, in their frame; it looks to `viewpoint` (3,).
+
+    keys: poisson_depth, poisson_trim_spacings. Needs the extra `poisson`.
+    """
+    config = parse(SurfaceConfig, {"method": "poisson", **keys}, "mesh_points")
+    cloud = PointCloud(_table(points, "points"))
+    return Mesh.of(
+        surface_of_cloud(cloud, _table(np.reshape(np.asarray(viewpoint), (1, -1)), "viewpoint", 1)[0], config, "points")
+    )
 
 
 def register(moving: Any, reference: Any, seed: int = 1, **keys: Any) -> icp.Registration:

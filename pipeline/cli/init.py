@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from pipeline.cli.answer import Answer
@@ -12,11 +13,16 @@ from scene.errors import InputError
 SUMMARY = "write a short config to start from, with every further key in a comment"
 EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml
   simulate --sensor tls --config my_site.yaml
+  scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml
   scarpsim init --dataset small --out my_set.yaml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--site", metavar="NAME", help="start from a bundled site, such as glendale (default: the demo)")
+    parser.add_argument("--mesh", type=Path, metavar="FILE", help="with the wall of this mesh file, in survey coordinates")
+    parser.add_argument(
+        "--cameras", type=Path, metavar="FILE", help="with the pair of this file: Metashape, COLMAP or cameras.yaml"
+    )
     parser.add_argument("--scanner", metavar="NAME", help="with this scanner, such as riegl_vz400i, its noise and its beam")
     parser.add_argument("--dataset", metavar="NAME", help="the config of a data set instead, such as small")
     parser.add_argument("--out", type=Path, default=Path("scarpsim.yaml"), metavar="FILE", help="default: %(default)s")
@@ -25,10 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Answer:
     out = arguments.out
-    if arguments.dataset and (arguments.site or arguments.scanner):
+    if arguments.dataset and (arguments.site or arguments.scanner or arguments.mesh or arguments.cameras):
         raise InputError("stands beside --site or --scanner", where="--dataset", remedy="a data set's walls name their sites")
     kind = "dataset" if arguments.dataset else "simulation"
-    text = _dataset(arguments.dataset) if arguments.dataset else simulation_text(arguments.site, arguments.scanner)
+    files = {key: _beside(out, path) for key, path in (("mesh", arguments.mesh), ("cameras", arguments.cameras)) if path}
+    text = _dataset(arguments.dataset) if arguments.dataset else simulation_text(arguments.site, arguments.scanner, **files)
     from pipeline.cli.json_schema import schema_line, schema_name, schema_text
     from pipeline.formats.atomic import write_text
 
@@ -46,7 +53,15 @@ def run(arguments: argparse.Namespace) -> Answer:
     return Answer(told, lambda: {"file": str(out), "schema": str(schema), "command": command})
 
 
-def simulation_text(site: str | None, scanner: str | None) -> str:
+def _beside(out: Path, path: Path) -> str:
+    """The path of an input as the config in `out` names it: relative to its folder. Raises InputError where there is none."""
+    if not path.exists():
+        raise InputError("there is no such file", where=str(path), remedy="check the path")
+    return os.path.relpath(path.resolve(), out.parent.resolve())
+
+
+def simulation_text(site: str | None, scanner: str | None, mesh: str = "", cameras: str = "") -> str:
+    """A config that starts from a bundled site, with another scanner, wall (file) or cameras (file)."""
     from pipeline.config.bundled import bundled_config
     from pipeline.config.commented import commented_yaml
     from pipeline.config.simulation import SimulationConfig
@@ -54,6 +69,7 @@ def simulation_text(site: str | None, scanner: str | None) -> str:
 
     source = bundled_config("sites", site) if site else bundled_config("", "demo")
     values = load_yaml(source)
+    values |= ({"wall": {"mesh": mesh}} if mesh else {}) | ({"cameras": {"file": cameras}} if cameras else {})
     if scanner:
         models = [model for model in values["sensor"] if model["sensor"] != "tls"]
         values |= {"scanner": {"preset": scanner, **values["scanner"]}, "sensor": models}

@@ -28,6 +28,7 @@ from pipeline.cli import (
     init,
     inspect,
     schema,
+    surface,
     train,
     view,
 )
@@ -71,6 +72,7 @@ COMMANDS: dict[str, Command] = {
     "detect": detect,
     "evaluate": evaluate,
     "view": view,
+    "surface": surface,
     "init": init,
     "schema": schema,
     "completion": completion,

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import example_data
 import jsonschema
 import numpy as np
 import pytest
@@ -21,11 +22,13 @@ from pipeline.cli import main as cli
 from pipeline.cli.answer import as_json
 from pipeline.cli.json_schema import json_schema
 from pipeline.config.presets import read_preset
-from pipeline.config.simulation import load_config
+from pipeline.config.simulation import CamerasFile, load_config
 from pipeline.dataset.config import load_dataset_config
 from pipeline.formats.atomic import new_folder
+from pipeline.run.site import prepare_site
 from scene.config import load_yaml
 from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
 
 
 class Pipeline:
@@ -94,7 +97,7 @@ MISTAKES = [
     (
         ["frobnicate"],
         "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, gap, train, detect, evaluate, "
-        "view, init, schema, completion, doctor",
+        "view, surface, init, schema, completion, doctor",
     ),
     (["--versio"], "did you mean '--version'?"),
     (["simulate"], "required: --sensor"),
@@ -191,6 +194,22 @@ def test_init_writes_a_config_that_loads_and_its_schema(words: list[str], kind: 
         assert config.scanner.name == preset.name
     else:
         assert load_dataset_config(out).walls
+
+
+def test_init_names_the_files_of_an_own_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relative to the config's folder, and what simulate then reads."""
+    example_data.site(tmp_path / "data", resolution_m=0.5)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plans").mkdir()
+    words = ["--mesh", "data/wall.ply", "--cameras", "data/cameras.xml", "--scanner", "riegl_vz400i", "--out", "plans/site.yaml"]
+    assert cli.main(["init", *words]) == 0
+    held = load_yaml(tmp_path / "plans" / "site.yaml")
+    assert held["wall"] == {"mesh": "../data/wall.ply"}
+    config = load_config(Path("plans/site.yaml"), [], None, None)
+    assert isinstance(config.cameras, CamerasFile)
+    assert config.cameras.pair().left.width > 0
+    assert prepare_site(config, "stereo", KeyedRandom(1)).name == "wall"
+    assert cli.main(["init", "--mesh", "nothing.ply", "--out", "other.yaml"]) == 2
 
 
 def test_init_writes_once(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

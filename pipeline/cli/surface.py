@@ -1,0 +1,56 @@
+"""`scarpsim surface`: a point cloud becomes a wall."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options, between
+from scene.errors import InputError
+
+SUMMARY = "mesh a point cloud, so that it can be a wall or a reference (extra poisson)"
+EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --out wall.ply
+  scarpsim init --mesh wall.ply --out my_site.yaml"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="points: .laz .las .ply .e57 .xyz")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the mesh, .ply, in the points' coordinates")
+    parser.add_argument(
+        "--seen-from",
+        type=float,
+        nargs=3,
+        required=True,
+        metavar=("X", "Y", "Z"),
+        help="where a sensor stood, in the points' coordinates [m]: the surface looks there",
+    )
+    parser.add_argument(
+        "--trim", type=between(0.1, 1000.0), default=3.0, metavar="N", help="how far it reaches, in point spacings (default: 3)"
+    )
+    parser.add_argument(
+        "--depth", type=int, choices=range(4, 17), metavar="N", help="of the octree, 4 to 16 (default: as the points)"
+    )
+    add_output_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    out = arguments.out
+    if out.suffix.lower() != ".ply":
+        raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply")
+    if out.exists():
+        raise InputError("exists already", where=str(out), remedy="choose another name with --out")
+    import numpy as np
+
+    from pipeline.formats.ply import write_ply
+    from pipeline.formats.points import read_points
+    from pipeline.surface.from_cloud import surface_of_cloud
+    from pipeline.surface.mesh import SurfaceConfig
+
+    config = SurfaceConfig(method="poisson", poisson_depth=arguments.depth, poisson_trim_spacings=arguments.trim)
+    cloud = read_points(arguments.cloud)
+    mesh = surface_of_cloud(cloud, np.array(arguments.seen_from), config, str(arguments.cloud))
+    write_ply(out, mesh)
+    counts = {"points": len(cloud.points), "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    told = f"{counts['points']:,} points, {counts['triangles']:,} triangles: {out}; a config of it: scarpsim init --mesh {out}"
+    return Answer(told, lambda: {"file": str(out), **counts})
