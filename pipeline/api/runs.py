@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-PICTURES = ("difference", "hillshade", "histogram", "icp", "m3c2")
+PICTURES = ("difference", "blocks", "hillshade", "histogram", "icp", "m3c2")
 _COLUMNS = (
     "epoch", "block", "shape", "size_x_m", "size_y_m", "size_z_m", "volume_m3", "measured_volume_m3", "measured_area_m2",
     "measured_mean_depth_m", "position_x_m", "position_y_m", "position_z_m", "world_x_m", "world_y_m", "world_z_m", "annotated",
@@ -145,7 +145,7 @@ class Run:
         return frame(each.statistics for each in self.epochs)
 
     def plot(self, kind: str = "difference", epoch: int = 1) -> Picture:
-        """A picture of the report, of an epoch: difference, hillshade, histogram, icp or m3c2."""
+        """A picture of the report, of an epoch: difference, blocks, hillshade, histogram, icp or m3c2."""
         return self[epoch].plot(kind)
 
     def __repr__(self) -> str:
@@ -232,7 +232,7 @@ class Epoch:
         )
 
     def plot(self, kind: str = "difference") -> Picture:
-        """A picture of the report: difference, hillshade, histogram, icp or m3c2; of the reference its hillshade."""
+        """A picture of the report: difference, blocks, hillshade, histogram, icp or m3c2; of the reference its hillshade."""
         if self.number == 0:
             return Picture((self.run.folder / "reference.png").read_bytes())
         return Picture(self.file(pick(dict(zip(PICTURES, PICTURES, strict=True)), kind, "plot"), ".png").read_bytes())

@@ -53,6 +53,8 @@ COLOURS = colormaps["RdBu_r"].resampled(49)
 """In steps of a quarter of a sigma, which cannot be told apart by eye and make a smaller file."""
 _GREYS = colormaps["gray"].resampled(64)
 SEQUENTIAL = colormaps["viridis"].resampled(48)
+_MOST_NUMBERED, _MOST_ZOOMED, _ZOOMS_A_ROW = 200, 24, 6
+"""Blocks whose numbers stand on a map, and that are shown by themselves."""
 _CROWDED = 0.15
 """A map whose median lies within this share of its range from the low end would be of one colour."""
 
@@ -94,7 +96,10 @@ def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "")
 
 
 def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, title: str = "") -> bytes:
-    """A difference map (h, w), m, NaN without data, on a scale of +-6 `sigma_m`, with outlines of the labels `block` (h, w)."""
+    """A difference map (h, w), m, NaN without data, on a scale of +-6 `sigma_m`, with outlines and numbers of the labels `block`.
+
+    block: (h, w); of more than 200 blocks the numbers are left out.
+    """
     if not sigma_m > 0:
         raise ValueError(f"sigma_m must be positive, got {sigma_m}")
     values = mean_pooled(difference, pooling(grid)) * 1e3
@@ -105,8 +110,63 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
     inside = _max_pooled(block != WALL, pooling(grid))
     if inside.any() and min(inside.shape) > 1:
         axes.contour(inside, levels=[0.5], colors="black", linewidths=0.6, origin="upper", extent=extent)
+    places = block_boxes(block)
+    for label, (_, right, _, top) in places.items() if len(places) <= _MOST_NUMBERED else ():
+        at = grid.x_min + right * grid.gsd, grid.y_max - top * grid.gsd
+        axes.annotate(f"{label}", at, fontsize=6, annotation_clip=True)
     _sigma_bar(figure, axes, image, sigma_m * 1e3)
-    _no_data_legend(axes, values, NO_DATA, "outline: block" if inside.any() else "")
+    _no_data_legend(axes, values, NO_DATA, "outline: block, numbered as in the table" if inside.any() else "")
+    return png_bytes(figure)
+
+
+def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
+    """Left, right, bottom, top of the pixels of each label but WALL in (h, w), px from the top-left corner; right and bottom are
+    the first beyond."""
+    rows, columns = np.nonzero(block != WALL)
+    if not len(rows):
+        return {}
+    labels, place = np.unique(block[rows, columns], return_inverse=True)
+    low = np.full((2, len(labels)), np.iinfo(np.int64).max)
+    high = np.full((2, len(labels)), -1)
+    for axis, values in enumerate((columns, rows)):
+        np.minimum.at(low[axis], place, values)
+        np.maximum.at(high[axis], place, values)
+    return {
+        int(label): (int(low[0, k]), int(high[0, k]) + 1, int(high[1, k]) + 1, int(low[1, k])) for k, label in enumerate(labels)
+    }
+
+
+def blocks_figure(
+    difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, captions: Mapping[int, str]
+) -> bytes | None:
+    """Each block of a difference map by itself, twice as large as the block, on the map's scale; none where there are no blocks.
+
+    captions: by label, in the order in which they are shown; 24 at most.
+    """
+    places = block_boxes(block)
+    shown = [label for label in captions if label in places][:_MOST_ZOOMED]
+    if not shown:
+        return None
+    rows = -(-len(shown) // _ZOOMS_A_ROW)
+    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 0.3 + 2.1 * rows), dpi=DPI, layout="constrained")
+    limit = SCALE_SIGMAS * sigma_m * 1e3
+    for axes, label in zip(figure.subplots(rows, _ZOOMS_A_ROW, squeeze=False).flat, shown, strict=False):
+        left, right, bottom, top = places[label]
+        reach = max(right - left, bottom - top, 4)
+        (first, last), (begin, end) = (
+            ((low + high) // 2 - reach, (low + high) // 2 + reach) for low, high in ((top, bottom), (left, right))
+        )
+        part = slice(max(first, 0), max(last, 1)), slice(max(begin, 0), max(end, 1))
+        axes.set_facecolor(NO_DATA)
+        axes.imshow(1e3 * difference[part], cmap=COLOURS, vmin=-limit, vmax=limit, interpolation="nearest")
+        if min(difference[part].shape) > 1:
+            axes.contour(block[part] == label, levels=[0.5], colors="black", linewidths=0.8)
+        side = difference[part].shape[1] * grid.gsd
+        axes.set_title(f"{label}: {captions[label]}", fontsize=8)
+        axes.set_xlabel(f"{side:.2g} m wide", fontsize=7)
+        axes.set(xticks=[], yticks=[])
+    for axes in figure.axes[len(shown) :]:
+        axes.set_visible(False)
     return png_bytes(figure)
 
 
@@ -303,9 +363,12 @@ def _colour_bar(figure: Figure, axes: Axes, image: AxesImage, label: str, extend
 
 
 def _sigma_bar(figure: Figure, axes: Axes, image: AxesImage, sigma_mm: float) -> None:
-    ticks = sigma_mm * np.arange(-SCALE_SIGMAS, SCALE_SIGMAS + 1, 2)
-    digits = max(0, int(np.ceil(-np.log10(sigma_mm))) + 1)
-    label = f"{DIFFERENCE_LABEL}; a tick is 2 \N{GREEK SMALL LETTER SIGMA}, \N{GREEK SMALL LETTER SIGMA} = {sigma_mm:.3g} mm"
+    limit = SCALE_SIGMAS * sigma_mm
+    ticks = MaxNLocator(nbins=8, steps=[1, 2, 2.5, 5, 10], symmetric=True).tick_values(-limit, limit)
+    ticks = ticks[np.abs(ticks) <= 1.001 * limit]
+    digits = max(0, int(np.ceil(-np.log10(np.diff(ticks).min()) + 0.39)))  # 0.39: 2.5 needs one more digit
+    sigma = "\N{GREEK SMALL LETTER SIGMA}"
+    label = f"{DIFFERENCE_LABEL}; to 6 {sigma}, {sigma} = {sigma_mm:.3g} mm"
     _colour_bar(figure, axes, image, label, "both").set_ticks(ticks, labels=[_signed(tick, digits) for tick in ticks])
 
 

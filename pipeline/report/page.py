@@ -28,7 +28,7 @@ def template(name: str) -> jinja2.Template:
     environment.filters |= {
         "mm": millimetres,
         "numbers": _numbers,
-        "volume": _volume,
+        "litres": litres,
         "percent": percent,
         "picture": picture_source,
     }
@@ -69,9 +69,10 @@ def _numbers(values: Sequence[float], digits: int = 2, factor: float = 1.0) -> s
     return ", ".join(true_minus(factor * value, digits) for value in values)
 
 
-def _volume(cubic_metres: float | None) -> str:
-    """Cubic metres to three significant digits, so that a pebble and a house both show."""
+def litres(cubic_metres: float | None) -> str:
+    """Cubic metres as litres, to three significant digits, so that a pebble and a house both show."""
     if cubic_metres is None:
         return _NOTHING
-    leading = math.floor(math.log10(abs(cubic_metres))) if cubic_metres else 0
-    return true_minus(cubic_metres, max(2 - leading, 0))
+    value = 1e3 * cubic_metres
+    digits = max(2 - math.floor(math.log10(abs(value))), 0) if value else 2
+    return f"{value:,.{digits}f}".replace("-", "\N{MINUS SIGN}" if round(value, digits) else "")

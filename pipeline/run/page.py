@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.formats.atomic import write_text
 from pipeline.report.figures import SCALE_SIGMAS
-from pipeline.report.page import millimetres, template
+from pipeline.report.page import litres, millimetres, template
 
 _SENSORS = {"stereo": "stereo pair", "tls": "terrestrial laser scanner"}
 _UNFOLDED_ROWS = 60
@@ -45,7 +45,7 @@ class BlockRow:
 
 @dataclass(frozen=True)
 class EpochReport:
-    """What the report shows of an epoch; pictures are PNG bytes. sigma_m: of the difference map's colour scale;
+    """What the report shows of an epoch; pictures are PNG bytes. sigma_m: of the difference map's colour scale; zooms: on blocks;
     registration: RMS of the inliers, m, and iterations, None where epochs are not registered, then convergence is None too."""
 
     number: int
@@ -59,14 +59,22 @@ class EpochReport:
     histogram: bytes
     convergence: bytes | None = None
     registration: RegistrationSummary | None = None
+    zooms: bytes | None = None
 
     @property
     def annotated(self) -> int:
         return sum(block.annotated for block in self.blocks)
 
+    @property
+    def total(self) -> tuple[float, float]:
+        """Volume of all blocks together, m3: true, and measured of those that the map shows."""
+        return sum(block.volume_m3 for block in self.blocks), sum(block.measured_volume_m3 or 0.0 for block in self.blocks)
+
     def summary(self) -> str:
         """One sentence in plain words."""
-        carved = f"Epoch {self.number}: {_count(len(self.blocks), 'block')} carved, {self.annotated} annotated"
+        true, measured = map(litres, self.total)
+        volumes = f" of {true} l together, of which the map shows {measured} l" if self.blocks else ""
+        carved = f"Epoch {self.number}: {_count(len(self.blocks), 'block')} carved{volumes}, {self.annotated} annotated"
         if self.outside.get("nmad_m") is None:
             return f"{carved}; the difference map has no data outside the blocks."
         noise = f"NMAD {millimetres(self.outside['nmad_m'])} and median {millimetres(self.outside['median_m'])}"

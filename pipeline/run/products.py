@@ -29,7 +29,8 @@ from pipeline.formats.laz import write_laz
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import write_xyz
-from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
+from pipeline.report.figures import blocks_figure, convergence_figure, difference_figure, hillshade_figure, histogram_figure
+from pipeline.report.page import litres
 from pipeline.run.acquisition import Look
 from pipeline.run.epoch import Epoch, Reference
 from pipeline.run.recorded_points import recorded_points, scans_of
@@ -89,6 +90,11 @@ def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Refe
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
         masks = epoch.raster.block != WALL
         write_bytes(out / f"{name}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
+        largest = sorted(epoch.blocks, key=lambda record: -record["volume_m3"])
+        captions = {record["label"]: f"{litres(record['volume_m3'])} l" for record in largest}
+        zooms = blocks_figure(epoch.difference, grid, epoch.raster.block, sigma, captions)
+        if zooms is not None:
+            write_bytes(out / f"blocks_{epoch.number:03d}.png", zooms)
         write_bytes(
             out / f"hillshade_{epoch.number:03d}.png", hillshade_figure(epoch.raster.heights, grid, f"Epoch {epoch.number}")
         )

@@ -49,7 +49,7 @@ def _key_figures(site: Site, config: dict[str, Any], records: list[dict[str, Any
 def _epoch(out: Path, record: dict[str, Any]) -> EpochReport:
     number, annotated = record["epoch"], {annotation["block"] for annotation in record["annotations"]["annotations"]}
     registration = record["registration"]
-    pictures = {name: out / f"{name}_{number:03d}.png" for name in ("hillshade", "difference", "histogram", "icp")}
+    pictures = {name: out / f"{name}_{number:03d}.png" for name in ("hillshade", "difference", "histogram", "icp", "blocks")}
     fields = ("rms_m", "inliers", "points", "iterations", "reason")
     return EpochReport(
         number=number,
@@ -62,6 +62,7 @@ def _epoch(out: Path, record: dict[str, Any]) -> EpochReport:
         difference=pictures["difference"].read_bytes(),
         histogram=pictures["histogram"].read_bytes(),
         convergence=pictures["icp"].read_bytes() if registration else None,
+        zooms=pictures["blocks"].read_bytes() if pictures["blocks"].exists() else None,
         registration=RegistrationSummary(**{name: registration[name] for name in fields}) if registration else None,
     )
 

@@ -16,8 +16,15 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from pipeline.report.figures import convergence_figure, difference_figure, hillshade_figure, histogram_figure
-from pipeline.report.page import template
+from pipeline.report.figures import (
+    block_boxes,
+    blocks_figure,
+    convergence_figure,
+    difference_figure,
+    hillshade_figure,
+    histogram_figure,
+)
+from pipeline.report.page import litres, template
 from pipeline.run.page import BlockRow, EpochReport, RegistrationSummary, RunReport, write_report
 from scene.grid import Grid
 
@@ -162,7 +169,7 @@ def test_page_holds_every_number(html: str) -> None:
     text = unescape(re.sub(r"data:image[^\"]*", "", html)).replace("\N{MINUS SIGN}", "-")
     expected = ["4,812,345", "71,579", "7,732,834", "214.3 mm", "119.1 mm", "250.8 mm", "132.2 mm", "-0.6 mm", "9.4 mm", "9.7 mm"]
     expected += ["8.2 mm", "8.1 mm", "12.3 mm", "90,123", "95,456", "14 iterations", "the step is below the threshold", "25 mm"]
-    expected += ["1.36, 1.28, 0.36", "0.453", "0.434", "-4.2 %", "48.92, 28.00, 0.30", "512049.04, 6123456.50, 329.40"]
+    expected += ["1.36, 1.28, 0.36", "453", "434", "-4.2 %", "48.92, 28.00, 0.30", "512049.04, 6123456.50, 329.40"]
     expected += ["0.52, 0.41, 0.33", "0.0769", "8.92, 23.30, -0.31", "512009.01, 6123457.50, 334.10", "sphere"]
     expected += ["gsd_m: 0.025", "style: glendale", "<b>& Söhne</b>"]
     assert [number for number in expected if number not in text] == []
@@ -219,3 +226,26 @@ def test_what_comes_from_a_file_stays_text(tmp_path: Path) -> None:
         assert template(path.relative_to(TEMPLATES).as_posix()).environment.autoescape is True
         past = re.findall(r"\{\{([^}]*)\| *safe", path.read_text())
         assert all(re.fullmatch(r"\s*'[^']*'\s*", value) for value in past), path.name
+
+
+def test_blocks_are_shown_by_themselves_in_the_order_given() -> None:
+    difference, block = synthetic()
+    block[130:140, 200:230] = 7
+    assert block_boxes(block) == {1: (60, 120, 80, 40), 7: (200, 230, 140, 130)}
+    both = blocks_figure(difference, GRID, block, SIGMA_M, {7: "1 l", 1: "2 l", 9: "not on the map"})
+    assert both is not None
+    assert both.startswith(b"\x89PNG")
+    assert both != blocks_figure(difference, GRID, block, SIGMA_M, {1: "2 l", 7: "1 l"})
+    assert blocks_figure(difference, GRID, np.zeros_like(block), SIGMA_M, {1: "2 l"}) is None
+    assert block_boxes(np.zeros_like(block)) == {}
+
+
+def test_volumes_are_read_in_litres() -> None:
+    shown = [litres(value) for value in (0.000591, 0.0642, 1.2345, 123.0, -0.0123, 0.0, None)]
+    assert shown == ["0.591", "64.2", "1,234", "123,000", "\N{MINUS SIGN}12.3", "0.00", "\N{EN DASH}"]
+
+
+def test_the_table_ends_with_the_volume_of_all_blocks() -> None:
+    epoch = run_report().epochs[0]
+    assert epoch.total == pytest.approx((0.5299, 0.434))
+    assert "2 blocks carved of 530 l together, of which the map shows 434 l" in epoch.summary()
