@@ -89,6 +89,11 @@ class ProductsConfig(Config):
 
     truth_channels: bool = Field(True, description="the true range or depth of each point, as extra dimensions of points.laz")
     world: bool | None = Field(None, description="points and surface in the wall's own coordinates too; none: for imported walls")
+    surface: bool = Field(True, description="the reconstructed surface of each epoch, surface.ply (`view`, `icp-study` need it)")
+    truth: bool = Field(True, description="the wall as it really is, truth.ply (`view`, `icp-study` need it)")
+    crs: str | None = Field(
+        None, description="coordinate system of the wall's own coordinates, such as EPSG:28356: stated in points_world.laz"
+    )
     formats: tuple[Literal["ply", "xyz", "e57"], ...] = Field((), description="points in these formats too, beside points.laz")
     block_meshes: bool = Field(
         False, description="four meshes of each block: wall difference, intersection, niche, removed block"

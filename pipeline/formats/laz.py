@@ -48,13 +48,14 @@ def write_laz(
     extra: Mapping[str, NDArray[Any]] | None = None,
     scale_m: float = 1e-6,
     date: datetime.date = datetime.date(2000, 1, 1),
+    wkt: str = "",
 ) -> None:
     """Write a point cloud as LAZ, or as LAS where `path` ends in .las; equal arguments give equal bytes.
 
     points: (n, 3), m, finite; intensity: (n,) relative received power, at least 0, stored in 16 bits (see `_full_scale`);
     gps_time: (n,), s; return_number, number_of_returns: (n,), 1 to 15, none: 1 of 1; scan_angle_rad: (n,) angle of the emitted
     direction from straight down, as LAS has it (for a scanner pi - zenith), stored in steps of 0.006 degrees; extra: named (n,)
-    channels, stored as extra dimensions in the type they have.
+    channels, stored as extra dimensions in the type they have; wkt: of the coordinate system, where it is known.
     Coordinates are stored as int32 multiples of `scale_m` from an offset in whole metres at the middle of the cloud; a cloud
     wider than 4295 m takes the next power of ten. Raises InputError where the file cannot be written.
     """
@@ -64,6 +65,8 @@ def write_laz(
     channels = channels if scan_angle_rad is None else {"scan_angle": np.rint(scan_angle_rad / _SCAN_ANGLE_STEP), **channels}
     header = _header(points, extra, scale_m, date)
     full_scale = _full_scale(intensity)
+    if wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
     if intensity is not None:
         header.vlrs.append(laspy.VLR(_USER, _FULL_SCALE_RECORD, "intensity of 65535 counts", struct.pack("<d", full_scale)))
     with writing(path) as temporary, temporary.open("wb") as file, _writer(file, header, path.suffix != ".las") as writer:

@@ -6,9 +6,10 @@ What is written is known by its checksums, so that a later call can tell whether
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from pipeline.change.tiles import tiles
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.atomic import explained, give_name, note, noting, to_disk, write_bytes, write_json
 from pipeline.formats.checksum import sha256
-from pipeline.formats.e57 import write_e57
+from pipeline.formats.crs import wkt_of
+from pipeline.formats.e57 import E57Scan, write_e57
 from pipeline.formats.geotiff import write_geotiff, write_tiff
 from pipeline.formats.inside import inside
 from pipeline.formats.laz import write_laz
@@ -175,30 +177,40 @@ def _write_common(
     blocks: list[dict[str, Any]],
 ) -> None:
     """What every epoch has: points, depth map, surface, truth, blocks."""
+    products = config.products
     cloud = recorded_points(seen.observations)
     write_cloud(folder / "points.laz", cloud)
-    if "ply" in config.products.formats:
-        write_ply_points(folder / "points.ply", cloud)
-    if "xyz" in config.products.formats:
-        write_xyz(folder / "points.xyz", cloud)
-    if "e57" in config.products.formats:
-        write_e57(folder / "points.e57", scans_of(seen.observations))
+    _write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations))
     if seen.observation.sensor == "stereo":
         depth = seen.observation.depth.astype(np.float32)
         write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
-    write_ply(folder / "surface.ply", surface)
-    write_ply(folder / "truth.ply", truth)
+    if products.surface:
+        write_ply(folder / "surface.ply", surface)
+    if products.truth:
+        write_ply(folder / "truth.ply", truth)
     write_json(folder / "blocks.json", blocks)
-    wanted = config.products.world
-    if wanted or (wanted is None and isinstance(config.wall, ImportedWall)):
-        write_cloud(folder / "points_world.laz", replace(cloud, points=site.frame.to_world(cloud.points)))
-        write_ply(folder / "surface_world.ply", _in_world(surface, site))
-    if config.products.metashape and seen.depth_maps is not None:
+    if products.world or (products.world is None and isinstance(config.wall, ImportedWall)):
+        cloud = replace(cloud, points=site.frame.to_world(cloud.points))
+        write_cloud(folder / "points_world.laz", cloud, wkt_of(products.crs, "products.crs") if products.crs else "")
+        _write_formats(folder / "points_world", products.formats, cloud, partial(scans_of, seen.observations, site.frame))
+        if products.surface:
+            write_ply(folder / "surface_world.ply", _in_world(surface, site))
+    if products.metashape and seen.depth_maps is not None:
         write_metashape_export(folder / "metashape", *seen.depth_maps)
 
 
-def write_cloud(path: Path, cloud: PointCloud) -> None:
-    """Write points.laz, with the channels that the format has a place of its own for in theirs."""
+def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]]) -> None:
+    """Points in the formats beside LAZ, by one stem."""
+    if "ply" in formats:
+        write_ply_points(stem.with_suffix(".ply"), cloud)
+    if "xyz" in formats:
+        write_xyz(stem.with_suffix(".xyz"), cloud)
+    if "e57" in formats:
+        write_e57(stem.with_suffix(".e57"), scans())
+
+
+def write_cloud(path: Path, cloud: PointCloud, wkt: str = "") -> None:
+    """Write points.laz, with the channels that the format has a place of its own for in theirs; wkt: of the coordinates."""
     extra = dict(cloud.extra)
     write_laz(
         path,
@@ -209,6 +221,7 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
         number_of_returns=extra.pop("number_of_returns", None),
         scan_angle_rad=extra.pop("scan_angle_rad", None),
         extra=extra,
+        wkt=wkt,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.formats.e57 import E57Scan
 from pipeline.formats.point_cloud import PointCloud
+from scene.frame import WallFrame
 from sensors.observation import Observation
 
 
@@ -35,14 +36,18 @@ def recorded_points(observations: Sequence[Observation]) -> PointCloud:
     )
 
 
-def scans_of(observations: Sequence[Observation]) -> list[E57Scan]:
-    """Each observation as an E57 scan: its grid as `row` and `column`, the sensor's place as the pose (the wall frame's axes)."""
+def scans_of(observations: Sequence[Observation], frame: WallFrame | None = None) -> list[E57Scan]:
+    """Each observation as an E57 scan: its grid as `row` and `column`, the sensor's place as the pose (the wall frame's axes).
+
+    frame: then the pose leads to the world instead of to the wall frame.
+    """
+    frame = frame or WallFrame.identity()
     scans = []
     for number, seen in enumerate(observations, start=1):
         cloud = _grid_points(seen)
         row, column = (axis.astype(np.int32) for axis in np.nonzero(seen.valid))
         local = PointCloud(cloud.points - seen.viewpoint, cloud.intensity, cloud.gps_time, {"row": row, "column": column})
-        scans.append(E57Scan(f"station {number}", local, seen.viewpoint, np.eye(3)))
+        scans.append(E57Scan(f"station {number}", local, frame.to_world(seen.viewpoint), frame.rotation.T))
     return scans
 
 

@@ -20,6 +20,7 @@ from pipeline.change.annotate import merge
 from pipeline.config.simulation import CamerasFile, SensorName, SimulationConfig
 from pipeline.formats.atomic import noting, write_json
 from pipeline.formats.checksum import sha256
+from pipeline.formats.crs import wkt_of
 from pipeline.formats.lock import is_free, locked
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
@@ -91,6 +92,8 @@ def simulate(
     finished epochs are completed before KeyboardInterrupt goes on.
     """
     progress = progress or Progress()
+    if config.products.crs is not None:
+        wkt_of(config.products.crs, "products.crs")  # a mistake there should not cost a simulation
     progress.plan(_plan(config))
     identity = {"schema": SCHEMA, "sensor": sensor, "seed": config.seed, "config": config.model_dump(mode="json")}
     identity["inputs"] = _inputs(config)
