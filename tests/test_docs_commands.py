@@ -26,18 +26,20 @@ from pipeline.cli.main import COMMANDS, main, simulate
 from pipeline.config.bundled import configs_folder
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import load_config
+from pipeline.formats.metashape import write_metashape
 from pipeline.formats.ply import write_ply
 from pipeline.view.server import open_results
 from scene.keyed_random import KeyedRandom
 from scene.procedural import ProceduralWall
+from sensors.placement import RigConfig, Target
 
 TINY = [
     *("--set", "scanner.azimuth_step_rad=0.002", "--set", "scanner.zenith_step_rad=0.002"),
     *("--set", "difference.gsd_m=0.1", "--set", "rockfall.count=2", "--quiet"),
 ]
 TINY_WALL = ["--set", "wall.width_m=6", "--set", "wall.height_m=4", "--set", "wall.resolution_m=0.2"]
-INIT = "scarpsim init --out site.yaml"
-FIRST = "simulate --sensor tls --config site.yaml --set wall='{mesh: wall.ply}' --set scanner.preset=riegl_vz400i"
+INIT = "scarpsim init --mesh wall.ply --cameras cameras.xml --scanner riegl_vz400i --out site.yaml"
+FIRST = "simulate --sensor tls --config site.yaml"
 MY_SITE = "scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml"
 MY_SET = "scarpsim init --dataset small"
 PLAN = "scarpsim inspect configs/sites/glendale.yaml --out plan"
@@ -51,7 +53,6 @@ RESOLVED = (
     "simulate --sensor stereo --config configs/sites/bulga.yaml --set epochs=20 --set 'tiles={size_px: 512}' --out runs/bulga",
     "simulate --sensor stereo --set matcher=sgbm",
     "simulate --sensor tls --config gap/model_after.yaml",
-    "simulate --sensor tls --config site.yaml",
     "simulate --sensor tls --config runs/mine/run.json",
     "simulate --sensor tls --set scanner=my_scanner.yaml",
     "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high",
@@ -115,15 +116,25 @@ NAMED = (
     "scarpsim gap MEASUREMENT --identifiability",
     "scarpsim gap MEASUREMENT --out DIR",
     "scarpsim gap MEASUREMENT --out gap",
+    "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",
     "scarpsim inspect CONFIG",
+    "scarpsim dataset",
+    "scarpsim surface",
+    "scarpsim surface scan.laz --seen-from X Y Z --out wall.ply",
     "scarpsim view",
 )
 """Not to be typed as they stand: the command and its flags must be there."""
 
 OF_A_STYLE_TO_COME = ("simulate --sensor tls --set wall.style=my_style --set rockfall.count=10 --out runs/my_style",)
 """With a style that the page tells how to write."""
+
+OF_A_PACKAGE_TO_COME = (
+    "simulate --sensor tls --set scanner=my_scanner --set wall.style=quarry",
+    "scarpsim compare my_site.yaml my_scanner",
+)
+"""With a package that the page tells how to write; tests/test_plug_ins.py installs one."""
 
 
 def carry_out(command: str, *further: str) -> str:
@@ -142,7 +153,10 @@ def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     before, folder = Path.cwd(), tmp_path_factory.mktemp("docs")
     os.chdir(folder)
     try:
-        write_ply(Path("wall.ply"), ProceduralWall(width_m=6.0, height_m=4.0, resolution_m=0.2).mesh(KeyedRandom(1)))
+        wall = ProceduralWall(width_m=6.0, height_m=4.0, resolution_m=0.2).mesh(KeyedRandom(1))
+        write_ply(Path("wall.ply"), wall)
+        pair = RigConfig(distance_m=30.0, base_m=8.0).place(Target(wall))
+        write_metashape(Path("cameras.xml"), {"left": pair.left, "right": pair.right})
         carry_out(INIT)
         carry_out(FIRST, *TINY, "--out", "runs/my_run")
         carry_out(MY_SITE)
@@ -166,7 +180,7 @@ MODELS: dict[str, Any] = {
 
 def test_every_command_is_in_a_list() -> None:
     """And none is in a list that no page shows any more; the lists hold each once."""
-    listed = [*RUN, *RESOLVED, *PARSED, *NAMED, *OF_A_STYLE_TO_COME]
+    listed = [*RUN, *RESOLVED, *PARSED, *NAMED, *OF_A_STYLE_TO_COME, *OF_A_PACKAGE_TO_COME]
     assert len(set(listed)) == len(listed)
     carried_out = {
         line for page in howtos.PICTURES for step in howtos.steps(page) if not step.file for line in step.text.splitlines()
@@ -184,8 +198,12 @@ def test_commands_are_found_in_all_their_forms(tmp_path: Path) -> None:
     assert commands(page) == ["scarpsim doctor", "simulate --sensor tls", "scarpsim gap X"]
 
 
-def test_init_writes_the_demo_s_config() -> None:
-    assert load_config(Path("site.yaml"), [], None, None) == load_config(configs_folder() / "demo.yaml", [], None, None)
+def test_init_writes_the_demo_s_config_with_the_files_of_one_s_own() -> None:
+    assert main(["init", "--out", "demo.yaml", "--quiet"]) == 0
+    demo, own = (load_config(path, [], None, None) for path in (configs_folder() / "demo.yaml", Path("site.yaml")))
+    assert load_config(Path("demo.yaml"), [], None, None) == demo
+    changed = {name for name in type(own).model_fields if getattr(own, name) != getattr(demo, name)}
+    assert changed == {"wall", "cameras", "scanner", "sensor"}
 
 
 def test_the_first_simulation_is_of_the_mesh_and_the_scanner_that_were_asked_for() -> None:
