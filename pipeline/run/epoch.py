@@ -15,6 +15,8 @@ from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import Registration, register_to
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import Look, look, reconstruct
+from pipeline.run.labels import labels
+from pipeline.run.registered import reference_and_target
 from pipeline.run.site import Site
 from scene.blocks import Blocks, place_blocks
 from scene.carve import Carved, carve, carved_records
@@ -74,8 +76,8 @@ def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom,
             check_in_front(caster, viewpoint, where)
         seen = look(config, site, caster, random.child("epoch", 0, "observe"))
     with progress.stage("epoch 0: mesh"):
-        surface = reconstruct(config, seen)
-        target = None if config.icp is None else ReferenceSurface.build(surface.vertices, surface.vertex_normals())
+        found, keyed = reconstruct(config, seen), random.child("epoch", 0, "register")
+        surface, target = reference_and_target(config, found, caster.mesh, keyed)
     with progress.stage("epoch 0: difference"):
         raster = surface_raster(surface, raster_grid(surface.bounds, config.difference))
     return Reference(seen, caster, surface, raster, target)
@@ -95,7 +97,8 @@ def observe_epoch(
         carved = replace(carved, mesh=as_observed(config, carved.mesh))
         records = carved_records(blocks, carved.removed_volume_m3)
     with progress.stage(f"epoch {number}: observe"):
-        seen = look(config, site, RayCaster(carved.mesh), keyed.child("observe"))
+        after = RayCaster(carved.mesh)
+        seen = look(config, site, after, keyed.child("observe"))
     with progress.stage(f"epoch {number}: mesh"):
         surface = reconstruct(config, seen)
     registration, registered = None, surface
@@ -105,6 +108,8 @@ def observe_epoch(
             registered = surface.with_vertices(registration.apply(surface.vertices))
     with progress.stage(f"epoch {number}: difference"):
         raster = surface_raster(registered, reference.raster.grid)
+        if seen.vertices is None:
+            raster = replace(raster, block=labels(after, seen, registration, raster.grid))
         change = difference(reference.raster, raster)
         measured = measure_blocks(change, raster, len(records))
         statistics = block_statistics(change, raster.block)
