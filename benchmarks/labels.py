@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.report.progress import Progress
+from pipeline.run.displacement import displacement
 from pipeline.run.epoch import observe_epoch, observe_reference
-from pipeline.run.labels import displacement
 from pipeline.run.site import prepare_site
 from scene.backend import dr
 from scene.blocks import Blocks

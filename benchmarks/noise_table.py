@@ -29,7 +29,7 @@ from pipeline.run.site import Site, prepare_site
 from scene.config import load_yaml, parse
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
-from sensors.model import OrientationNoise, StereoModel, StereoNoise
+from sensors.model import StereoModel, StereoNoise
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "noise.md"
 LEVELS = ("high", "medium", "low")
@@ -53,16 +53,11 @@ class Reading:
     noisy_reference: bool = True
     each_camera: bool = True
 
-    def models(self, model: StereoModel, random: KeyedRandom) -> tuple[StereoModel, StereoModel]:
+    def models(self, model: StereoModel) -> tuple[StereoModel, StereoModel]:
         """The models of the two observations of one map."""
-        before, after = (model if self.each_camera else _for_both(model, random.child(epoch)) for epoch in ("before", "after"))
-        return before if self.noisy_reference else SILENT, after
-
-
-def _for_both(model: StereoModel, random: KeyedRandom) -> StereoModel:
-    """The model with one draw of its orientation, the same for both cameras, as effects."""
-    matching = model.noise.model_copy(update={"orientation": OrientationNoise()})
-    return model.model_copy(update={"noise": matching, "effects": model.noise.orientation.draw("both", random)})
+        drawn = "each_camera" if self.each_camera else "both_alike"
+        after = model.model_copy(update={"noise": model.noise.model_copy(update={"orientation_drawn": drawn})})
+        return after if self.noisy_reference else SILENT, after
 
 
 SILENT = StereoModel(noise=StereoNoise(parallax_sigma_px=0.0, regularization_sigma_px=0.0))
@@ -91,7 +86,7 @@ class Maps:
         path = self.folder / f"{hashlib.sha256(identity.encode()).hexdigest()[:16]}_{number:03}.json"
         if not path.exists():
             random = KeyedRandom(FIRST_SEED + number)
-            before, after = (with_model(self.site, epoch) for epoch in reading.models(model, random))
+            before, after = (with_model(self.site, epoch) for epoch in reading.models(model))
             path.write_text(json.dumps(statistics(noise_map(self.config, before, after, self.caster, random)).to_dict()))
         return dict(json.loads(path.read_text()))
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from pipeline.change.matched_filter import HARDLY_SHOWS
 from scene.config import Config
 from scene.grid import Grid
 from scene.mesh import IntArray
@@ -25,6 +26,12 @@ class AnnotationConfig(Config):
     """Which blocks are annotated."""
 
     minimum_area_px: int = Field(4, ge=1, description="blocks that show on fewer pixels of an image are left out")
+    ignore_below: float = Field(
+        HARDLY_SHOWS,
+        ge=0,
+        description="data sets: blocks with a smaller matched-filter signal-to-noise ratio get `ignore: 1`, and training leaves "
+        "them out of the loss; they count in evaluations",
+    )
 
 
 @dataclass(frozen=True)

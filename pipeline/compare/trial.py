@@ -22,7 +22,7 @@ from pipeline.registration.register import register_to
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import Look, look, reconstruct
 from pipeline.run.epoch import as_observed
-from pipeline.run.registered import reference_and_target
+from pipeline.run.registered import reference_and_target, reference_sensor
 from pipeline.run.site import Site, prepare_site
 from scene.blocks import RockfallConfig, place_blocks
 from scene.carve import carve, carved_records
@@ -164,7 +164,7 @@ class _Run:
         self.contestant, self.site, self.config = contestant, site, contestant.config
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, f"{contestant.name}: {where}")
-        self.first = look(self.config, site, caster, random.child("epoch", 0, "observe"))
+        self.first = look(self.config, reference_sensor(self.config, site), caster, random.child("epoch", 0, "observe"))
         keyed = random.child("epoch", 0, "register")
         surface, self.target = reference_and_target(self.config, reconstruct(self.config, self.first), caster.mesh, keyed)
         self.raster = surface_raster(surface, grid)

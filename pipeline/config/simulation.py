@@ -138,6 +138,9 @@ class SimulationConfig(Config):
     surface: SurfaceConfig = SurfaceConfig()
     fusion: FusionConfig = FusionConfig()
     icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: left out")
+    noisy_reference: bool = Field(
+        True, description="whether the reference epoch has the sensor's noise too; effects it has in any case"
+    )
     icp_target: Literal["reference", "true_wall"] = Field(
         "reference",
         description="what ICP registers to: the reconstructed reference, or the wall as it really is (thesis 3.6), to which the "

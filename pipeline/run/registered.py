@@ -1,12 +1,34 @@
-"""The first epoch's surface and what the later ones are registered to: that surface, or the wall as it really is."""
+"""The first epoch: how it is observed, and what later ones are registered to: its surface, or the wall as it really is."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from pipeline.config.simulation import SimulationConfig
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import register_to
+from pipeline.run.site import Site
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
+from sensors.observation import Sensor
+from sensors.stereo import StereoPair
+from sensors.stereo_matched import MatchedStereoPair
+from sensors.tls import LaserScanner
+
+
+def reference_sensor(config: SimulationConfig, site: Site) -> Site:
+    """The site as the reference epoch is observed from it: without the sensor's noise where the config says so."""
+    if config.noisy_reference:
+        return site
+    sensor = site.sensor
+    if isinstance(sensor, MatchedStereoPair):
+        quiet: Sensor = replace(sensor, pair=replace(sensor.pair, model=sensor.pair.model.without_noise()))
+    elif isinstance(sensor, StereoPair | LaserScanner):
+        quiet = replace(sensor, model=sensor.model.without_noise())
+    else:
+        raise TypeError(f"neither a scanner nor a pair: {type(sensor).__name__}")
+    further = tuple(replace(each, model=each.model.without_noise()) for each in site.further_stations)
+    return replace(site, sensor=quiet, further_stations=further)
 
 
 def reference_and_target(

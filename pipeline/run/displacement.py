@@ -1,4 +1,4 @@
-"""Labels of an epoch's map: the outlines of the carved niches, carried to where the sensor's errors and ICP put them.
+"""How far an epoch's map is displaced: what carries the outlines of the carved niches to where sensor and ICP put them.
 
 A label is that of the carved wall's face seen along -z. A surface of a sensor's own samples has none of these faces. Its samples
 tell how far the map is displaced: x and y of what was recorded and registered, minus where it was. Averaged over cells of some
@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.registration.register import Registration
-from pipeline.run.acquisition import Look
 from scene.grid import Grid
-from scene.mesh import FloatArray, IntArray
-from scene.raycast import RayCaster
+from scene.mesh import FloatArray
 from sensors.observation import Observation
 
 _CELL_M = 0.5
@@ -23,14 +21,6 @@ _CELL_M = 0.5
 _LEAST_SAMPLES = 30
 _OUTLIER = 6.0
 """Samples displaced by more than this many NMAD from the median met another surface than the one they are beside."""
-
-
-def labels(carved: RayCaster, seen: Look, registration: Registration | None, grid: Grid) -> IntArray:
-    """(h, w) the block whose niche each pixel of `grid` shows, WALL elsewhere.
-
-    carved: the wall as it is; seen: the sensor's samples of it; registration: what moved them onto the reference.
-    """
-    return carved.labels_down(grid, displacement(seen.observations, registration, grid))
 
 
 def displacement(observations: tuple[Observation, ...], registration: Registration | None, grid: Grid) -> FloatArray:
