@@ -24,6 +24,7 @@ from pipeline.report.progress import Progress
 from pipeline.run.site import Site
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from sensors.camera import Side
 from sensors.effects.base import Effect
 from sensors.model import OrientationNoise, Spread
 from sensors.stereo import StereoPair
@@ -222,7 +223,7 @@ def _patterns(simulator: Reobserver, pair: StereoPair) -> Patterns | None:
         return None
     still, maps = simulator.heights(simulator.silent, KeyedRandom(0)), []
     for name, sigma in moving.items():
-        side = "both" if pair.model.noise.orientation_drawn == "both_alike" else "left"
+        side: Side = "both" if pair.model.noise.orientation_drawn == "both_alike" else "left"
         alone = OrientationNoise(**{name: Spread(mean=sigma)}).draw(side, KeyedRandom(0))
         effects: tuple[Effect, ...] = tuple(effect for effect in alone if not effect.is_null)
         model = simulator.silent.model_copy(update={"effects": (*pair.model.effects, *effects)})

@@ -22,13 +22,19 @@ def reference_sensor(config: SimulationConfig, site: Site) -> Site:
         return site
     sensor = site.sensor
     if isinstance(sensor, MatchedStereoPair):
-        quiet: Sensor = replace(sensor, pair=replace(sensor.pair, model=sensor.pair.model.without_noise()))
-    elif isinstance(sensor, StereoPair | LaserScanner):
+        quiet: Sensor = replace(sensor, pair=_quiet(sensor.pair))
+    elif isinstance(sensor, StereoPair):
+        quiet = _quiet(sensor)
+    elif isinstance(sensor, LaserScanner):
         quiet = replace(sensor, model=sensor.model.without_noise())
     else:
         raise TypeError(f"neither a scanner nor a pair: {type(sensor).__name__}")
     further = tuple(replace(each, model=each.model.without_noise()) for each in site.further_stations)
     return replace(site, sensor=quiet, further_stations=further)
+
+
+def _quiet(pair: StereoPair) -> StereoPair:
+    return replace(pair, model=pair.model.without_noise())
 
 
 def reference_and_target(
