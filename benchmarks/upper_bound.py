@@ -1,4 +1,4 @@
-"""What any detector could find: share of blocks with a matched-filter signal-to-noise ratio above 4, by reconstruction and placement.
+"""What any detector could find: share of blocks with a matched-filter signal-to-noise ratio above 4, by way and placement.
 
     python benchmarks/upper_bound.py [--width 24 --height 14] [--write]
 

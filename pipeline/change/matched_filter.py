@@ -1,12 +1,15 @@
-"""How well a niche can stand out from a map's noise: the signal-to-noise ratio of the matched filter, a bound for any detector.
+"""How well a niche stands out from a map's noise: the signal-to-noise ratio of a filter matched to its shape.
 
-For a known change t(p) in stationary Gaussian noise with the power spectrum S(k) the best linear test is the matched filter
-(Turin 1960, "An introduction to matched filters"), whose signal-to-noise ratio is
+The filter correlates the map with the change t(p) that really happened. In stationary noise n with the power spectrum
+S(k) = <|N(k)|^2> its output is sum t^2 in the mean and scatters by the root of t' C t, so
 
-    rho^2 = sum_k |T(k)|^2 / S(k),    in white noise of standard deviation s:  rho^2 = sum_p t(p)^2 / s^2
+    rho = sum_k |T(k)|^2 / sqrt(sum_k |T(k)|^2 S(k)),    in white noise of standard deviation s:  rho^2 = sum_p t(p)^2 / s^2
 
-S is estimated from the map outside of the blocks (Welch 1967: overlapping windows under a Hann taper). A detector does not know
-place and shape, so it finds fewer; one that meets noise of another grain inside the niches than outside may find more.
+which is the best linear test in white noise (Turin 1960, "An introduction to matched filters"). Whitening would gain more on
+paper: it would look for sharp rims at frequencies where a map interpolated from coarse samples has no noise, but no niche
+either. S is estimated outside of the blocks (Welch 1967: overlapping windows under a Hann taper).
+Limits: a detector does not know place and shape, so it finds fewer. Where samples are coarse the map shows less of a niche than
+really happened; where a surface has finer triangles inside niches than outside, noise has a finer grain there.
 """
 
 from __future__ import annotations
@@ -83,7 +86,7 @@ def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
     if weight == 0 or not total.any():
         return None
     spectrum = ndimage.uniform_filter(total * side**2 / weight, 3, mode="wrap")  # few windows scatter: neighbours are alike
-    return np.asarray(np.maximum(spectrum, 1e-12 * spectrum.max()))
+    return np.asarray(spectrum)
 
 
 def true_change(wall: RayCaster, carved: RayCaster, block: IntArray, grid: Grid, shift_m: FloatArray) -> NDArray[np.float32]:
@@ -111,7 +114,7 @@ def _ratio(template: FloatArray, spectrum: FloatArray) -> float:
         rows, columns = (length // step for length in template.shape)
         template = template.reshape(rows, step, columns, step).mean(axis=(1, 3))
     power = np.abs(np.fft.fft2(template, (side, side))) ** 2
-    return float(np.sqrt(np.sum(power / spectrum)) * step)
+    return float(np.sum(power) / np.sqrt(np.sum(power * spectrum)) * step) if power.any() else 0.0
 
 
 def _windows(noise: NDArray[np.float32], side: int) -> Iterator[NDArray[np.float32]]:
