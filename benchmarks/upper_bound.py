@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.change.annotate import AnnotationConfig, block_annotations
-from pipeline.change.matched_filter import STANDS_OUT
+from pipeline.change.annotate import STANDS_OUT, AnnotationConfig, block_annotations
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig
 from pipeline.dataset.config import load_dataset_config

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.change.matched_filter import HARDLY_SHOWS
 from scene.config import Config
 from scene.grid import Grid
 from scene.mesh import IntArray
 
+STANDS_OUT, HARDLY_SHOWS = 4.0, 2.0
+"""Signal-to-noise ratios (matched_filter.py) above which a block can be found among the noise of a tile, and below which nothing
+shows where it is."""
 BLOCK_CATEGORY = {"id": 1, "name": "block", "supercategory": "rockfall"}
 
 

@@ -8,8 +8,9 @@ S(k) = <|N(k)|^2> its output is sum t^2 in the mean and scatters by the root of 
 which is the best linear test in white noise (Turin 1960, "An introduction to matched filters"). Whitening would gain more on
 paper: it would look for sharp rims at frequencies where a map interpolated from coarse samples has no noise, but no niche
 either. S is estimated outside of the blocks (Welch 1967: overlapping windows under a Hann taper).
-Limits: a detector does not know place and shape, so it finds fewer. Where samples are coarse the map shows less of a niche than
-really happened; where a surface has finer triangles inside niches than outside, noise has a finer grain there.
+Where samples are coarse the map shows less of a niche than really happened, and where a surface has finer triangles inside niches
+than outside, the noise in them has a finer grain. As the truth is known, both are seen in what the filter finds, and the ratios of
+a map are corrected for them (`_correction`). Limits: a detector does not know place and shape, so it finds fewer.
 """
 
 from __future__ import annotations
@@ -24,9 +25,8 @@ from scene.grid import Grid
 from scene.mesh import WALL, FloatArray, IntArray
 from scene.raycast import RayCaster
 
-STANDS_OUT, HARDLY_SHOWS = 4.0, 2.0
-"""Ratios above which a block can be found among the noise of a tile, and below which nothing shows where it is."""
 _SIDES = (64, 128, 256)
+_LEAST_BLOCKS = 20
 _LEAST_FREE = 0.5
 """Share of a window outside of blocks and with data from which it counts."""
 
@@ -43,14 +43,30 @@ def signal_to_noise(
     noise = np.where((block == WALL) & np.isfinite(difference), difference, np.float32(np.nan))
     spectra = _Spectra(noise)
     seen = np.where(np.isfinite(difference) & np.isfinite(change), change, np.float32(0.0))
-    result = np.zeros(count)
+    result, share = np.zeros(count), np.full(count, np.nan)
     for index, box in enumerate(ndimage.find_objects(block, count)):
         if box is None:
             continue
         template = np.where(block[box] == index + 1, seen[box], 0.0)
         spectrum = spectra.of(2 * max(template.shape))
         result[index] = np.nan if spectrum is None else _ratio(template, spectrum)
-    return result
+        if template.any():
+            share[index] = np.sum(template * np.where(template != 0, difference[box], 0.0)) / np.sum(template**2)
+    return result * _correction(share, result)
+
+
+def _correction(share: NDArray[np.float64], ratio: NDArray[np.float64]) -> float:
+    """By what the ratios of one map are to be multiplied, from what the filter found of each change: share a = sum t d / sum t^2.
+
+    The median of a tells how much of a change the map shows, the scatter of (a - median) rho, 1 where the spectrum is right, how
+    noise inside niches differs from that outside. 1 where few blocks tell.
+    """
+    known = np.isfinite(share) & np.isfinite(ratio) & (ratio > 0)
+    if known.sum() < _LEAST_BLOCKS:
+        return 1.0
+    middle = float(np.median(share[known]))
+    scatter = 1.4826 * float(np.median(np.abs(share[known] - middle) * ratio[known]))
+    return max(middle, 0.0) / scatter if scatter > 0 else 1.0
 
 
 class _Spectra:

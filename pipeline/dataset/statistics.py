@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.change.matched_filter import STANDS_OUT
+from pipeline.change.annotate import STANDS_OUT
 
 SIZE_EDGES_M = np.geomspace(0.04, 6.0, 81)
 Cell = tuple[str, str, str, str, str]

@@ -67,3 +67,18 @@ def test_what_does_not_show_has_none_and_a_map_without_noise_tells_nothing() -> 
     assert signal_to_noise(hidden, block, change, 1)[0] == 0.0
     assert np.isnan(signal_to_noise(change, block, change, 1)[0])
     assert noise_spectrum(noise[:50, :50], 64) is None
+
+
+@pytest.mark.parametrize(("shown", "scatter"), [(0.75, 1.0), (1.0, 0.5)])
+def test_the_ratio_is_of_what_the_map_shows_and_of_the_noise_inside_niches(shown: float, scatter: float) -> None:
+    """A map that shows 3/4 of each change has 3/4 of the ratio, noise of half the size inside niches doubles it.
+
+    60 blocks: a median scatters by 1.25 / sqrt(60) of a ratio's unit over rho = 10, the NMAD by 1.17 / sqrt(2 60) = 11 %.
+    """
+    y, x = np.indices(SHAPE)
+    block = np.where((y % 64 < 5) & (x % 64 < 5) & (y < 384), 1 + (y // 64) * 10 + x // 64, 0).astype(np.int32)
+    count, sigma = 60, 0.02
+    change = np.where(block > 0, 0.04, 0).astype(np.float32)
+    noise = np.random.default_rng(5).normal(0, sigma, SHAPE) * np.where(block > 0, scatter, 1.0)
+    found = signal_to_noise((shown * change + noise).astype(np.float32), block, change, count)
+    assert np.median(found) == pytest.approx(0.04 * 5 / sigma * shown / scatter, rel=0.3)
