@@ -8,9 +8,9 @@ S(k) = <|N(k)|^2> its output is sum t^2 in the mean and scatters by the root of 
 which is the best linear test in white noise (Turin 1960, "An introduction to matched filters"). Whitening would gain more on
 paper: it would look for sharp rims at frequencies where a map interpolated from coarse samples has no noise, but no niche
 either. S is estimated outside of the blocks (Welch 1967: overlapping windows under a Hann taper).
-Where samples are coarse the map shows less of a niche than really happened, and where a surface has finer triangles inside niches
-than outside, the noise in them has a finer grain. As the truth is known, both are seen in what the filter finds, and the ratios of
-a map are corrected for them (`_correction`). Limits: a detector does not know place and shape, so it finds fewer.
+Where samples are coarse the map shows less of a niche than really happened, and where a surface has finer triangles inside
+niches than outside, the noise in them has a finer grain. As the truth is known, both are seen in what the filter finds, and the
+ratios of a map are corrected for them (`_correction`). Limits: a detector does not know place and shape, so it finds fewer.
 """
 
 from __future__ import annotations
