@@ -54,7 +54,8 @@ RESOLVED = (
     "simulate --sensor tls --config site.yaml",
     "simulate --sensor tls --config runs/mine/run.json",
     "simulate --sensor tls --set scanner=my_scanner.yaml",
-    "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_independent_high",
+    "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high --set reconstruction=vertices "
+    "--set noisy_reference=false",
     "simulate --sensor stereo --config my_site.yaml --set sensor=calibration/calibrated.yaml",
     "scarpsim inspect glendale",
     "scarpsim inspect configs/sites/glendale.yaml --set station.distance_m=100 --set cameras.distance_m=100 --out plans/100m",

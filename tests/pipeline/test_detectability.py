@@ -155,7 +155,7 @@ def test_a_block_of_the_smallest_size_is_seen_with_the_probability_asked_for() -
 
 
 def test_the_smallest_findable_block_is_that_of_the_closed_form() -> None:
-    """White noise w on a lattice a x b: S/N = r s^2 / (w sqrt(2 a b)), r the depth over the side; at least one point lies on it."""
+    """White noise w on a lattice a x b: S/N = r s^2 / (w sqrt(2 a b)), r depth over side; at least one point on it."""
     white, a, b = np.array([0.003, 0.01, 0.05]), np.array([0.02, 0.03, 0.1]), np.array([0.02, 0.05, 0.1])
     cases = sampling(white=white, step_a=a, step_b=b, shadow_a=0.0, shadow_b=0.0)
     expected = np.sqrt(FINDABLE * white * np.sqrt(2 * a * b) / PLAN.depth_ratio)
