@@ -178,9 +178,7 @@ def main() -> None:
     parser.add_argument("--quality", default="medium", choices=["high", "medium", "low"], help="of the depth maps")
     parser.add_argument("--parameters", action="store_true", help="the noise of each parameter alone")
     parser.add_argument("--readings", action="store_true", help="the printed noise, read in four ways")
-    parser.add_argument(
-        "--faithful", action="store_true", help="the levels as the data sets have them"
-    )
+    parser.add_argument("--faithful", action="store_true", help="the levels as the data sets have them")
     parser.add_argument("--out", type=Path, default=Path("runs/noise_table"))
     asked = parser.parse_args()
     settings = [*SETTINGS, f"depth_map={asked.quality}", *(FAITHFUL if asked.faithful else [])]

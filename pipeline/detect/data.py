@@ -109,8 +109,9 @@ def batches(
         for index in group:
             random = np.random.default_rng((training.seed, epoch, 1 + int(index))) if learning else None
             labelled = window(folder.labelled(int(index)), size, random)
-            for axis in (1, 0) if random is not None and training.flips else ():
-                labelled = mirrored(labelled, axis) if random.random() < 0.5 else labelled
+            if random is not None and training.flips:
+                for axis in (1, 0):
+                    labelled = mirrored(labelled, axis) if random.random() < 0.5 else labelled
             examples.append(network_input(labelled, detector))
         return {name: np.stack([example[name] for example in examples]) for name in examples[0]}
 
