@@ -100,6 +100,7 @@ def main() -> None:
                     f"sensor={model or SILENT}",
                     f"rockfall.size_m={distribution}",
                     "rockfall.safe_zone_offset_m=0.3",
+                    "noisy_reference=false",
                     f"wall.width_m={arguments.width}",
                     f"wall.height_m={arguments.height}",
                 ]

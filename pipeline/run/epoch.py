@@ -110,8 +110,7 @@ def observe_epoch(
     with progress.stage(f"epoch {number}: difference"):
         raster = surface_raster(registered, reference.raster.grid)
         shift = displacement(seen.observations, registration, raster.grid)
-        if seen.vertices is None:
-            raster = replace(raster, block=after.labels_down(raster.grid, shift))
+        raster = replace(raster, block=after.labels_down(raster.grid, shift))
         change = difference(reference.raster, raster)
         lost = true_change(reference.caster, after, raster.block, raster.grid, shift)
         measured = measure_blocks(change, raster, signal_to_noise(change, raster.block, lost, len(records)))
