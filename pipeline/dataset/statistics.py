@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.change.annotate import STANDS_OUT
 
 SIZE_EDGES_M = np.geomspace(0.04, 6.0, 81)
+_FINER = {"stereo": "a finer depth_map, or reconstruction: vertices", "tls": "finer scanner steps"}
 Cell = tuple[str, str, str, str, str]
 """Split, sensor, wall, noise, size class."""
 
@@ -85,8 +86,7 @@ class SetStatistics:
         """What is amiss with ray-traced samples: fewer than two along the smallest edge of a block."""
         return [
             f"{sensor} {wall}: samples are {1e3 * spacing:.0f} mm apart, the smallest block has an edge of {1e3 * edge:.0f} mm: "
-            "less than two samples a smallest edge, which lose depth and rims of small niches; take a finer depth_map or scanner "
-            "step, or reconstruction: vertices"
+            f"less than two samples a smallest edge, which lose depth and rims of small niches; take {_FINER[sensor]}"
             for (sensor, wall), spacing in sorted(self.spacing_m.items())
             if (edge := self.smallest_m[sensor, wall]) < 2 * spacing
         ]

@@ -1,8 +1,8 @@
 """How far an epoch's map is displaced: what carries the outlines of the carved niches to where sensor and ICP put them.
 
-A label is that of the carved wall's face seen along -z. The sensor's samples tell how far the map is displaced: x and y of what
-was recorded and registered, minus where it was. Averaged over cells of some hundred samples this is smooth, and free of white noise
-that would fray the outlines of small niches; a pixel takes the label of the place that it came from.
+A label is that of the carved wall's face seen along -z. The sensor's samples tell how far the map is displaced: x and y of
+what was recorded and registered, minus where it was. Averaged over cells of some hundred samples this is smooth, and free of
+white noise that would fray the outlines of small niches; a pixel takes the label of the place that it came from.
 """
 
 from __future__ import annotations
