@@ -2,7 +2,7 @@
 
     python benchmarks/calibrate_speed.py [--site glendale]
 
-Windows as a calibration lays them on a map of the whole wall; glendale_high noise; medium depth maps.
+Windows as a calibration lays them on a map of the whole wall; glendale_independent_high noise; medium depth maps.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--site", default="glendale")
     arguments = parser.parse_args()
-    config = load_config(bundled_config("sites", arguments.site), ["sensor=glendale_high"], "stereo", None)
+    config = load_config(bundled_config("sites", arguments.site), ["sensor=glendale_independent_high"], "stereo", None)
     site = prepare_site(config, "stereo", KeyedRandom(config.seed))
     grid = raster_grid(site.mesh.bounds, config.difference)
     model = config.stereo_model()

@@ -52,30 +52,6 @@ def integral(raster: NDArray[np.generic]) -> IntArray:
     return sums
 
 
-def highest_under(mesh: TriangleMesh, boxes: FloatArray) -> FloatArray:
-    """(k,) the largest z of the triangles whose projection overlaps each box's, m; -inf where there are none.
-
-    boxes: (k, 2, 2 or 3) smallest and largest coordinates, m.
-    """
-    corners = mesh.vertices[mesh.faces[faces_under(mesh, boxes)]]
-    corners = corners[np.argsort(_extreme(np.minimum, corners[:, :, 0]), kind="stable")]
-    low, high = _extreme(np.minimum, corners[:, :, :2]), _extreme(np.maximum, corners)
-    widest = float((high[:, 0] - low[:, 0]).max(initial=0.0))
-    first = np.searchsorted(low[:, 0], boxes[:, 0, 0] - widest, side="left")
-    last = np.searchsorted(low[:, 0], boxes[:, 1, 0], side="right")
-    tops = np.full(len(boxes), -np.inf)
-    for number, box in enumerate(boxes[:, :, :2]):
-        strip = slice(first[number], last[number])
-        near = np.flatnonzero((high[strip, 0] >= box[0, 0]) & (high[strip, 1] >= box[0, 1]) & (low[strip, 1] <= box[1, 1]))
-        near += first[number]
-        tops[number] = high[near[_overlaps(corners[near, :, :2], box)], 2].max(initial=-np.inf)
-    return tops
-
-
-def _extreme(choose: np.ufunc, corners: FloatArray) -> FloatArray:
-    return choose(choose(corners[:, 0], corners[:, 1]), corners[:, 2])
-
-
 def _cells(positions: FloatArray, corner: FloatArray, cell: float, shape: NDArray[np.int64]) -> IntArray:
     """Cell numbers along one or both axes; 0 and shape - 1 hold all that lies outside the boxes' common rectangle."""
     return np.clip(np.floor((positions - corner) / cell) + 1, 0, shape - 1).astype(np.int32)
@@ -83,14 +59,3 @@ def _cells(positions: FloatArray, corner: FloatArray, cell: float, shape: NDArra
 
 def _span(a: IntArray, b: IntArray, c: IntArray) -> tuple[IntArray, IntArray]:
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-
-
-def _overlaps(triangles: FloatArray, box: FloatArray) -> NDArray[np.bool_]:
-    """Whether triangles (f, 3, 2) whose bounding boxes overlap a box (2, 2) do so too: no edge of theirs parts them from it."""
-    edges = np.roll(triangles, -1, axis=1) - triangles
-    inward = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
-    turn = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-    inward *= np.where(turn < 0, -1.0, 1.0)[:, None, None]
-    centre, half = box.mean(axis=0), np.ptp(box, axis=0) / 2
-    reach = np.sum(inward * (centre - triangles), axis=2) + np.sum(np.abs(inward) * half, axis=2)
-    return np.all(reach >= 0, axis=1) | (turn == 0)

@@ -200,13 +200,24 @@ class RayCaster:
         met = face >= 0
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
-    def look_down(self, grid: Grid) -> tuple[Hits, mi.Array3f64]:
-        """Cast one ray per pixel centre of `grid` along -z from above the mesh, row by row; returns hits and points."""
+    def labels_down(self, grid: Grid, shift_m: FloatArray) -> IntArray:
+        """(h, w) the label of the face seen along -z from each pixel's centre minus `shift_m` ((h, w, 2) in x and y)."""
+        hits, _ = self.look_down(grid, shift_m)
+        return np.array(hits.block).reshape(grid.shape)
+
+    def look_down(self, grid: Grid, shift_m: FloatArray | None = None) -> tuple[Hits, mi.Array3f64]:
+        """Cast one ray per pixel centre of `grid` along -z from above the mesh, row by row; returns hits and points.
+
+        shift_m: (h, w, 2) by which the rays stand aside, towards -x and -y.
+        """
         index = dr.arange(mi.UInt32, grid.width * grid.height)
         row, column = index // grid.width, index % grid.width
         top = float(self.mesh.bounds[1, 2]) + 1.0
         x_min, y_max, gsd, start = (dr.opaque(mi.Float64, value) for value in (grid.x_min, grid.y_max, grid.gsd, top))
-        origin = mi.Array3f64(x_min + (column + 0.5) * gsd, y_max - (row + 0.5) * gsd, start)
+        x, y = x_min + (column + 0.5) * gsd, y_max - (row + 0.5) * gsd
+        if shift_m is not None:
+            x, y = (place - on_device(mi.Float64, shift_m[..., axis]) for axis, place in enumerate((x, y)))
+        origin = mi.Array3f64(x, y, start)
         hits = self.intersect(origin, mi.Array3f64(0.0, 0.0, -1.0))
         return hits, mi.Array3f64(origin.x, origin.y, origin.z - hits.distance)
 

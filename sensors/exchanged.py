@@ -42,6 +42,7 @@ def observe_right(sensor: StereoSensor, scene: RayCaster, random: KeyedRandom) -
         depth=_turned(seen.depth),
         block=_turned(seen.block),
         truth={name: _turned(channel) for name, channel in seen.truth.items()},
+        offset=None if seen.offset is None else _turned(seen.offset),
     )
 
 

@@ -32,4 +32,5 @@ def mean_of_faces(first: Observation, second: Observation, tolerance_m: float) -
         block=np.where(filled, second.block, first.block),
         intensity=None if first.intensity is None or second.intensity is None else merged(first.intensity, second.intensity),
         truth={name: merged(channel, second.truth[name]) for name, channel in first.truth.items()},
+        offset=None if first.offset is None or second.offset is None else merged(first.offset, second.offset),
     )

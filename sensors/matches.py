@@ -68,6 +68,10 @@ class Matches:
         self._evaluate()
         return np.where(self.matched.numpy(), self.albedo.numpy(), np.nan).reshape(self.shape)
 
+    def sampled(self, raster: FloatArray) -> mi.Float64:
+        """(n,) the values of a (rows, columns) raster, each where its match is."""
+        return on_device(mi.Float64, raster)
+
     def with_raster(self, disparity: FloatArray) -> Matches:
         """The same cells with these (rows, columns) disparities, px, matched where they are not NaN."""
         return replace(self, disparity=on_device(mi.Float64, disparity), matched=on_device(mi.Bool, ~np.isnan(disparity)))

@@ -54,6 +54,10 @@ class TlsModel(Config):
             raise ValueError("a scanner has one beam: name beam_divergence once")
         return self
 
+    def without_noise(self) -> TlsModel:
+        """The same effects alone."""
+        return self.model_copy(update={"noise": TlsNoise(range_sigma_m=0.0, angle_sigma_rad=0.0)})
+
     def variance(self, at: PulseGeometry) -> FloatArray:
         """(n,) variance of a recorded range that the model predicts, m2."""
         return np.asarray(sum((effect.variance(at) for effect in self.chain()), np.zeros(len(at))))
@@ -144,6 +148,14 @@ class StereoNoise(Config):
         32.0, gt=0, description="distance of the grid's nodes [px of the full-resolution frame]"
     )
     orientation: OrientationNoise = OrientationNoise()
+    orientation_drawn: Literal["each_camera", "both_alike"] = Field(
+        "each_camera", description="orientation noise of its own for each camera, or one draw for both, most of which cancels"
+    )
+
+    def draw(self, random: KeyedRandom) -> tuple[Effect, ...]:
+        """The orientation noise of one observation, as effects."""
+        sides: tuple[Side, ...] = ("both",) if self.orientation_drawn == "both_alike" else ("left", "right")
+        return tuple(effect for side in sides for effect in self.orientation.draw(side, random.child(side)))
 
 
 class StereoModel(Config):
@@ -152,6 +164,10 @@ class StereoModel(Config):
     sensor: Literal["stereo"] = "stereo"
     noise: StereoNoise = StereoNoise()
     effects: tuple[StereoEffect, ...] = Field((), description="effects of the catalogue beyond the base noise")
+
+    def without_noise(self) -> StereoModel:
+        """The same effects alone."""
+        return self.model_copy(update={"noise": StereoNoise(parallax_sigma_px=0.0, regularization_sigma_px=0.0)})
 
     @property
     def matching_noise(self) -> tuple[MatchingNoise, ...]:
@@ -176,8 +192,7 @@ class StereoModel(Config):
         """The base noise and the effects, as one list of effects; the orientation is drawn from `random`."""
         noise = self.noise
         return (
-            *noise.orientation.draw("left", random.child("orientation", "left")),
-            *noise.orientation.draw("right", random.child("orientation", "right")),
+            *noise.draw(random.child("orientation")),
             ParallaxNoise(sigma_px=noise.parallax_sigma_px),
             RegularizationNoise(sigma_px=noise.regularization_sigma_px, step_px=noise.regularization_step_px),
             *self.effects,

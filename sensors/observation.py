@@ -46,7 +46,8 @@ class Observation:
     intensity: (h, w) float32 relative received power; pulse_interval_s: time from one cell to the next, in order of rows; truth:
     named (h, w) channels, such as `true_range_m`, present where the sensor was asked for them; further: returns beside those in
     the grid, of a scanner that records several; None where no pulse has any; zenith_rad: (w,) nominal zenith angle of each column
-    of a scanner's grid.
+    of a scanner's grid; offset: (h, w, 2) float32, m, x and y of the recorded minus the
+    true point, None where it is not known.
     """
 
     sensor: str
@@ -59,6 +60,7 @@ class Observation:
     truth: dict[str, NDArray[np.floating]] = field(default_factory=dict)
     further: FurtherReturns | None = None
     zenith_rad: FloatArray | None = None
+    offset: NDArray[np.float32] | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -76,6 +78,11 @@ class Observation:
 def packed(point: mi.Array3f64) -> mi.Float64:
     """The 3 x (n,) device points as one (3 n,) array, point by point, so that it is written once and needs no transpose."""
     return dr.ravel(point)
+
+
+def offset_of(recorded: mi.Array3f64, true: mi.Array3f64) -> mi.Float32:
+    """(2 n,) x and y of the recorded minus the true points, point by point."""
+    return dr.ravel(mi.Array2f(recorded.x - true.x, recorded.y - true.y))
 
 
 class Sensor(Protocol):

@@ -18,9 +18,13 @@ MOST_RETURNS = 15
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recorded returns of n pulses: points (n, 3), depth, intensity, block and channels of the truth (n,); NaN, WALL for none."""
+    """Recorded returns of n pulses: points (n, 3), depth, intensity, block and channels of the truth (n,); NaN, WALL for none.
+
+    offset: (n, 2) x and y of the recorded minus the true points, m.
+    """
 
     points: FloatArray
+    offset: NDArray[np.float32]
     depth: FloatArray
     intensity: NDArray[np.float32]
     block: IntArray

@@ -28,7 +28,7 @@ from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Effect, Stage, apply_stage
 from sensors.matches import ImageRows, Matches
 from sensors.model import StereoModel
-from sensors.observation import Observation, packed
+from sensors.observation import Observation, offset_of, packed
 from sensors.rectify import Rectification, rectify
 
 Quality = Literal["high", "medium", "low"]
@@ -52,22 +52,26 @@ class StereoPair:
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
         """One depth map, reprojected with the nominal calibration; rows and columns are those of the left image, reduced."""
         effects = self.model.chain(random)
+        matches, left_u, left_v, point = self.traced(scene, effects, random)
+        for stage in (Stage.MATCH, Stage.FILL):
+            matches = apply_stage(effects, stage, matches, random)
+        nominal = self.cameras.in_wall_frame(self.frame)
+        return self.recorded(matches, reproject(rectify(nominal), left_u, left_v, matches.disparity), nominal.left, point)
+
+    def traced(
+        self, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom
+    ) -> tuple[Matches, mi.Float64, mi.Float64, mi.Array3f64]:
+        """What the real pair sees, before the matching: matches, rectified left pixels (u, v), px, and the points, wall frame."""
         nominal = self.cameras.in_wall_frame(self.frame)
         real = self.real_pair(effects, random).in_wall_frame(self.frame)
         index, u, v = self.cells()
         hits, point = view(scene, real.left, u - exposed(effects, "left", v, random), v)
         matched, right_u, right_v = _visible(scene, real.right, hits, point)
         right_u += exposed(effects, "right", right_v, random)
-        geometry = rectify(nominal)
-        f, v_0 = geometry.f, geometry.v
-        left_u, left_v = rectified_pixel(nominal.left, geometry.left, u, v, f, geometry.u_left, v_0)
-        rectified_u, _ = rectified_pixel(nominal.right, geometry.right, right_u, right_v, f, geometry.u_right, v_0)
+        left_u, left_v, disparity = rectified_disparity(nominal, rectify(nominal), (u, v), (right_u, right_v))
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
         size = nominal.left.width, nominal.left.height, REDUCTION[self.quality]
-        matches = Matches(index, u, v, left_u - rectified_u, matched, *seen, *size)
-        for stage in (Stage.MATCH, Stage.FILL):
-            matches = apply_stage(effects, stage, matches, random)
-        return self.recorded(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
+        return Matches(index, u, v, disparity, matched, *seen, *size), left_u, left_v, point
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -92,15 +96,18 @@ class StereoPair:
         row, column = index // columns, index % columns
         return (mi.Float64(column) + 0.5) * float(step), (mi.Float64(row) + 0.5) * float(step)
 
-    def recorded(self, matches: Matches, camera_point: mi.Array3f64, left: Camera) -> Observation:
-        """The observation of matches whose points, 3 x (n,) m, are given in the frame of the nominal left camera."""
+    def recorded(self, matches: Matches, camera_point: mi.Array3f64, left: Camera, true_point: mi.Array3f64) -> Observation:
+        """The observation of matches whose points, 3 x (n,) m, are given in the frame of the nominal left camera.
+
+        true_point: 3 x (n,) what the pixels really see, wall frame, m.
+        """
         valid = matches.matched & (camera_point.z > 0)
         depth = dr.select(valid, camera_point.z, np.nan)
         point = dr.select(valid, rotated(left.rotation, camera_point) + vector(left.position), np.nan)
         block = dr.select(valid, matches.block, WALL)
         truth = {"true_depth_m": dr.select(valid, matches.true_depth, np.nan)} if self.truth else {}
-        points = packed(point)
-        dr.eval(points, depth, block, truth, valid)
+        points, offset = packed(point), offset_of(point, true_point)
+        dr.eval(points, offset, depth, block, truth, valid)
         if dr.none(valid):
             raise InputError(
                 "no part of the wall is seen by both cameras",
@@ -115,6 +122,7 @@ class StereoPair:
             block=block.numpy().reshape(shape),
             viewpoint=left.position,
             truth={name: channel.numpy().reshape(shape) for name, channel in truth.items()},
+            offset=offset.numpy().reshape(*shape, 2),
         )
 
 
@@ -151,6 +159,15 @@ def _visible(scene: RayCaster, camera: Camera, hits: Hits, point: mi.Array3f64) 
     inside = (local.z > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
     seen = hits.valid & inside & (dr.dot(hits.normal, mi.Vector3f(sight)) < 0)
     return seen & ~scene.occluded(centre, sight, 1.0 - SHADOW_MARGIN), u, v
+
+
+def rectified_disparity(
+    nominal: CameraPair, geometry: Rectification, left: tuple[mi.Float64, mi.Float64], right: tuple[mi.Float64, mi.Float64]
+) -> tuple[mi.Float64, mi.Float64, mi.Float64]:
+    """Rectified left pixels (u, v) and disparities, px, of corresponding pixels (u, v) of both images."""
+    left_u, left_v = rectified_pixel(nominal.left, geometry.left, *left, geometry.f, geometry.u_left, geometry.v)
+    right_u, _ = rectified_pixel(nominal.right, geometry.right, *right, geometry.f, geometry.u_right, geometry.v)
+    return left_u, left_v, left_u - right_u
 
 
 def rectified_pixel(

@@ -83,7 +83,8 @@ class MatchedStereoPair:
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
         matches = Matches(index, u, v, full_px, ~dr.isnan(found), *seen, nominal.left.width, nominal.left.height, step)
         matches = apply_stage(effects, Stage.FILL, matches, random)
-        return self.pair.recorded(matches, reproject(geometry, left_u, left_v, matches.disparity), nominal.left)
+        camera_point = reproject(geometry, left_u, left_v, matches.disparity)
+        return self.pair.recorded(matches, camera_point, nominal.left, point)
 
     def photograph(
         self, scene: RayCaster, real: CameraPair, effects: tuple[Effect, ...], random: KeyedRandom

@@ -23,7 +23,7 @@ from sensors.effects.base import Stage, apply_stage
 from sensors.faces import mean_of_faces
 from sensors.footprint import Beam, Echo
 from sensors.model import TlsModel
-from sensors.observation import FurtherReturns, Observation, packed
+from sensors.observation import FurtherReturns, Observation, offset_of, packed
 from sensors.placement import EXACT_POSE, PoseSigma
 from sensors.polar import polar
 from sensors.pulses import REFERENCE_RANGE_M, Pulses, direction, tangents
@@ -174,12 +174,12 @@ class LaserScanner:
         echoes = real._echoes(scene, pulses, beam)
         pulses = self._measured(pulses, beam.received(echoes), random)
         if not beam.records_several:
-            return self._record(pulses)
+            return self._record(pulses, real)
         if self.config.faces == 2:
             raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
         count = beam.count(echoes)
         dr.schedule(count)  # so that it is computed in the kernel of the scan
-        seen = self._record(pulses)
+        seen = self._record(pulses, real)
         return replace(seen, further=self._further(real, scene, random, seen, count)) if np.any(count.numpy() > 1) else seen
 
     def _aimed(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
@@ -252,10 +252,10 @@ class LaserScanner:
         returned = hits.valid & (cos_incidence > 0) & in_reach
         return Echo(hits.distance, cos_incidence, hits.albedo, power, hits.block, returned)
 
-    def _record(self, pulses: Pulses) -> Observation:
-        """The scan's grid."""
+    def _record(self, pulses: Pulses, real: LaserScanner) -> Observation:
+        """The scan's grid; real: the scanner where it really stands."""
         shape = self.shape
-        found = self._recorded(pulses)
+        found = self._recorded(pulses, real)
         if np.isnan(found.depth).all():
             raise InputError(
                 "no pulse returned", where="station, scanner", remedy="check position, rotation, window, range limits and effects"
@@ -270,21 +270,29 @@ class LaserScanner:
             pulse_interval_s=1.0 / self.config.pulse_rate_hz,
             truth={name: channel.reshape(shape) for name, channel in found.truth.items()},
             zenith_rad=self.pattern.zenith_start + self.pattern.zenith_step * np.arange(self.pattern.pulses, dtype=np.float64),
+            offset=found.offset.reshape(*shape, 2),
         )
 
-    def _recorded(self, pulses: Pulses) -> Recorded:
-        """Points from the nominal direction and the recorded range; NaN and WALL where nothing returned."""
+    def _recorded(self, pulses: Pulses, real: LaserScanner) -> Recorded:
+        """Points from the nominal direction and the recorded range; NaN and WALL where nothing returned.
+
+        real: the scanner where it really stands.
+        """
         returned = pulses.returned
         range_m = dr.select(returned, pulses.range_m, np.nan)
         nominal = rotated(self.rotation, direction(pulses.azimuth, pulses.zenith))
-        points = packed(vector(self.position) + range_m * nominal)
+        point = vector(self.position) + range_m * nominal
+        aimed = rotated(real.rotation, direction(pulses.aim_azimuth, pulses.aim_zenith))
+        offset = offset_of(point, vector(real.position) + pulses.true_range * aimed)
+        points = packed(point)
         power = dr.select(returned, pulses.power, np.nan)
         block = dr.select(returned, pulses.block, WALL)
         channels = {"true_range_m": pulses.true_range, "cos_incidence": pulses.cos_incidence} if self.truth else {}
         truth = {name: dr.select(returned, channel, np.nan) for name, channel in channels.items()}
-        dr.eval(points, range_m, power, block, truth)
+        dr.eval(points, offset, range_m, power, block, truth)
         return Recorded(
             points=points.numpy().reshape(-1, 3),
+            offset=offset.numpy().reshape(-1, 2),
             depth=range_m.numpy(),
             intensity=power.numpy(),
             block=block.numpy(),
@@ -304,7 +312,7 @@ class LaserScanner:
             pulses, beam = self._aimed(emitted.at(index), random)
             echo, in_grid = beam.numbered(real._echoes(scene, pulses, beam), dr.opaque(mi.UInt32, number))
             dr.schedule(in_grid)
-            recorded = self._recorded(self._measured(pulses, echo, random.child("return", number)))
+            recorded = self._recorded(self._measured(pulses, echo, random.child("return", number)), real)
             found.append((index.numpy().astype(np.int64), in_grid.numpy().astype(bool), recorded))
         return further_returns(found, seen)
 

@@ -55,7 +55,8 @@ RESOLVED = (
     "simulate --sensor tls --config gap/model_after.yaml",
     "simulate --sensor tls --config runs/mine/run.json",
     "simulate --sensor tls --set scanner=my_scanner.yaml",
-    "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high",
+    "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high --set reconstruction=vertices "
+    "--set noisy_reference=false",
     "simulate --sensor stereo --config my_site.yaml --set sensor=calibration/calibrated.yaml",
     "scarpsim inspect glendale",
     "scarpsim inspect configs/sites/glendale.yaml --set station.distance_m=100 --set cameras.distance_m=100 --out plans/100m",
@@ -63,9 +64,9 @@ RESOLVED = (
     "scarpsim compare my_site.yaml riegl_vz400i",
     "scarpsim compare configs/demo.yaml riegl_vz400i --own-step --epochs 8 --sizes-m 0.04 0.6",
     "scarpsim calibrate maps/*.tif --sensor stereo --config my_site.yaml --out calibration",
-    "scarpsim calibrate maps --config configs/sites/glendale.yaml --sensor stereo --set sensor=glendale_low "
+    "scarpsim calibrate maps --config configs/sites/glendale.yaml --sensor stereo --set sensor=glendale_independent_low "
     "--set difference.gsd_m=0.04 --set calibration.window_px=32 --set calibration.simulations=100",
-    "scarpsim icp-study configs/demo.yaml --sensor stereo --set sensor=glendale_high --set cameras.distance_m=105 "
+    "scarpsim icp-study configs/demo.yaml --sensor stereo --set sensor=glendale_independent_high --set cameras.distance_m=105 "
     "--set cameras.base_m=28",
     "scarpsim gap --identifiability configs/sites/glendale.yaml --sensor tls --out plan",
     "scarpsim dataset configs/datasets/small.yaml --out sets/small --workers 2",

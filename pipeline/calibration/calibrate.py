@@ -24,6 +24,7 @@ from pipeline.report.progress import Progress
 from pipeline.run.site import Site
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from sensors.camera import Side
 from sensors.effects.base import Effect
 from sensors.model import OrientationNoise, Spread
 from sensors.stereo import StereoPair
@@ -215,14 +216,15 @@ def _sight(sensor: Any, windows: Windows) -> FloatArray:
 
 
 def _patterns(simulator: Reobserver, pair: StereoPair) -> Patterns | None:
-    """The maps of one sigma of each orientation parameter of the left camera; None where the model has none."""
+    """The maps of one sigma of each orientation parameter of the left camera, or of both alike; None where the model has none."""
     spreads = {name: getattr(pair.model.noise.orientation, name).sigma for name in OrientationNoise.model_fields}
     moving = {name: sigma for name, sigma in spreads.items() if sigma > 0}
     if not moving:
         return None
     still, maps = simulator.heights(simulator.silent, KeyedRandom(0)), []
     for name, sigma in moving.items():
-        alone = OrientationNoise(**{name: Spread(mean=sigma)}).draw("left", KeyedRandom(0))
+        side: Side = "both" if pair.model.noise.orientation_drawn == "both_alike" else "left"
+        alone = OrientationNoise(**{name: Spread(mean=sigma)}).draw(side, KeyedRandom(0))
         effects: tuple[Effect, ...] = tuple(effect for effect in alone if not effect.is_null)
         model = simulator.silent.model_copy(update={"effects": (*pair.model.effects, *effects)})
         maps.append(still - simulator.heights(model, KeyedRandom(0)))

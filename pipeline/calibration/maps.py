@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from pipeline.change.difference import difference, raster_grid, surface_raster
 from pipeline.config.simulation import SimulationConfig
-from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import register_to
 from pipeline.run.acquisition import look, reconstruct
+from pipeline.run.registered import reference_and_target
 from pipeline.run.site import Site
 from scene.errors import InputError
 from scene.grid import Grid
@@ -37,10 +37,10 @@ def noise_map(
     before, after: one site, with the sensor as it is at each observation. Both draw noise of their own from `random`; the
     second is registered to the first where the config has ICP. grid: of the map; none: over the first one's surface.
     """
-    reference = _surface(config, before, caster, random.child("reference"))
+    surface = _surface(config, before, caster, random.child("reference"))
+    reference, target = reference_and_target(config, surface, caster.mesh, random.child("register", "reference"))
     later = _surface(config, after, caster, random.child("later"))
-    if config.icp is not None:
-        target = ReferenceSurface.build(reference.vertices, reference.vertex_normals())
+    if config.icp is not None and target is not None:
         found = register_to(target, later.vertices, config.icp, random.child("register"))
         later = later.with_vertices(found.apply(later.vertices))
     grid = grid or raster_grid(reference.bounds, config.difference)

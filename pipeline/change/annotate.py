@@ -18,6 +18,9 @@ from scene.config import Config
 from scene.grid import Grid
 from scene.mesh import IntArray
 
+STANDS_OUT, HARDLY_SHOWS = 4.0, 2.0
+"""Signal-to-noise ratios (matched_filter.py) above which a block can be found among the noise of a tile, and below which nothing
+shows where it is."""
 BLOCK_CATEGORY = {"id": 1, "name": "block", "supercategory": "rockfall"}
 
 
@@ -25,6 +28,12 @@ class AnnotationConfig(Config):
     """Which blocks are annotated."""
 
     minimum_area_px: int = Field(4, ge=1, description="blocks that show on fewer pixels of an image are left out")
+    ignore_below: float = Field(
+        HARDLY_SHOWS,
+        ge=0,
+        description="data sets: blocks with a smaller matched-filter signal-to-noise ratio get `ignore: 1`, and training leaves "
+        "them out of the loss; they count in evaluations",
+    )
 
 
 @dataclass(frozen=True)

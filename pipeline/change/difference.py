@@ -36,7 +36,8 @@ class SurfaceRaster:
     """A surface seen from the sensors' side along the wall's normal.
 
     grid: where its pixels lie; heights: (h, w) float32, m, z of the highest surface at each pixel's centre, NaN where there is
-    none; block: (h, w) int32, the label of the vertex nearest to that place, WALL where there is none.
+    none; block: (h, w) int32, the label of the face that is seen there, of a surface that knows only those of its vertices that
+    of the nearest vertex; WALL where there is none.
     """
 
     grid: Grid
@@ -68,7 +69,7 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
 
 
 def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
-    """Look at `mesh` (wall frame) along -z at every pixel centre of `grid`; labels come from its `vertex_block`."""
+    """Look at `mesh` (wall frame) along -z at every pixel centre of `grid`; labels: its `face_block`, else `vertex_block`."""
     dr.flush_malloc_cache()  # what the observation took: a surface of millions of triangles is the peak of an epoch's memory
     return cast_raster(RayCaster(mesh), grid)
 
@@ -77,6 +78,9 @@ def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
     """The same as `surface_raster`, of a mesh already prepared for ray casting."""
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
+    if caster.mesh.face_block is not None:
+        dr.eval(z, hits.block)
+        return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.array(hits.block).reshape(grid.shape))
     if caster.mesh.vertex_block is None:
         return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.full(grid.shape, WALL, dtype=np.int32))
     label = caster.nearest_vertex_label(hits, point, on_device(mi.Int32, caster.mesh.vertex_block))

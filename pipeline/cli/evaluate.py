@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, one_of
+
+if TYPE_CHECKING:
+    from pipeline.detection.evaluate import Overlap
 
 SUMMARY = "compare detections with the truth: precision, recall, F1, mask areas, COCO metrics"
 EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detections.json
@@ -20,7 +24,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--by", action="append", default=[], metavar="KEY", help="a table for each value of this key of the images"
     )
     parser.add_argument(
-        "--iou", type=one_of("segm", "bbox"), default="segm", metavar="segm|bbox", help="overlap of masks or of boxes"
+        "--iou",
+        type=one_of("both", "segm", "bbox"),
+        default="both",
+        metavar="both|segm|bbox",
+        help="overlap of masks (segm), of boxes, or tables of both (default)",
     )
     parser.add_argument(
         "--confidence",
@@ -38,7 +46,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.detection.score_files import as_text, assess, write
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
-    assessment = assess(arguments.truth, arguments.predictions, arguments.by, arguments.iou, confidences)
+    kinds: tuple[Overlap, ...] = ("segm", "bbox") if arguments.iou == "both" else (arguments.iou,)
+    assessment = assess(arguments.truth, arguments.predictions, arguments.by, kinds, confidences)
     if arguments.out:
         write(assessment, arguments.out)
     place = f"\nscores: {arguments.out}" if arguments.out else ""

@@ -18,11 +18,11 @@ from scipy import ndimage
 from pipeline.change.difference import SurfaceRaster, cast_raster, difference, raster_grid, surface_raster
 from pipeline.comparison.covariates import Ground, ground, range_and_incidence, visible
 from pipeline.comparison.sensors_compared import Contestant
-from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import register_to
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import Look, look, reconstruct
 from pipeline.run.epoch import as_observed
+from pipeline.run.registered import reference_and_target, reference_sensor
 from pipeline.run.site import Site, prepare_site
 from scene.blocks import RockfallConfig, place_blocks
 from scene.carve import carve, carved_records
@@ -164,10 +164,9 @@ class _Run:
         self.contestant, self.site, self.config = contestant, site, contestant.config
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, f"{contestant.name}: {where}")
-        self.first = look(self.config, site, caster, random.child("epoch", 0, "observe"))
-        surface = reconstruct(self.config, self.first)
-        normals = surface.vertex_normals() if self.config.icp is not None else None
-        self.target = None if normals is None else ReferenceSurface.build(surface.vertices, normals)
+        self.first = look(self.config, reference_sensor(self.config, site), caster, random.child("epoch", 0, "observe"))
+        keyed = random.child("epoch", 0, "register")
+        surface, self.target = reference_and_target(self.config, reconstruct(self.config, self.first), caster.mesh, keyed)
         self.raster = surface_raster(surface, grid)
         self.changes: list[Raster] = []
         self.points = [_count(self.first)]

@@ -136,11 +136,21 @@ class SimulationConfig(Config):
     )
     stations: StationsConfig = StationsConfig()
     reconstruction: Reconstruction = Field(
-        "direct", description="surface from the sensor's own grid (direct), or by COLMAP from both depth maps (stereo)"
+        "direct",
+        description="surface from the sensor's own grid (direct); stereo: of the wall's own vertices, each with the disparity "
+        "that the pair finds (vertices), or by COLMAP from both depth maps (colmap)",
     )
     surface: SurfaceConfig = SurfaceConfig()
     fusion: FusionConfig = FusionConfig()
     icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: left out")
+    noisy_reference: bool = Field(
+        True, description="whether the reference epoch has the sensor's noise too; effects it has in any case"
+    )
+    icp_target: Literal["reference", "true_wall"] = Field(
+        "reference",
+        description="what ICP registers to: the reconstructed reference, or the wall as it really is (thesis 3.6), to which the "
+        "reference is then registered as well",
+    )
     difference: DifferenceConfig = DifferenceConfig()
     m3c2: M3c2Config | None = Field(None, description="M3C2 distances beside the difference maps; none: left out")
     annotation: AnnotationConfig = AnnotationConfig()

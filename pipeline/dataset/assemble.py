@@ -26,10 +26,11 @@ ANNOTATIONS = "annotations.json"
 
 @dataclass
 class Assembled:
-    """How much a set holds, by split."""
+    """How much a set holds, by split, and what is amiss with it."""
 
     images: dict[str, int] = field(default_factory=dict)
     annotations: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
 
 
 def assemble(folder: Path, *, complete: bool) -> Assembled:
@@ -60,6 +61,7 @@ def assemble(folder: Path, *, complete: bool) -> Assembled:
         if (folder / SHARDS / record_name).exists():
             digests[f"{SHARDS}/{record_name}"] = sha256(folder / SHARDS / record_name)
     write_text(folder / CHECKSUMS, "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items())))
+    result.warnings = statistics.warnings()
     return result
 
 

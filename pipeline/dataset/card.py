@@ -45,10 +45,19 @@ pixel scale give its place on the wall in the wall frame (x along the wall, y up
 `gsd_m` of the image's entry; `row` and `column` are its first pixel in the epoch's difference map.
 
 An annotation has beside COCO's keys: `size_m` (the block's three axes), `volume_m3` (rock removed), `measured_volume_m3` and
-`depth_m` (volume and mean depth that the epoch's map shows of the whole block), `share_in_tile` (of the block's pixels; less
-than 1 where the tile's edge cuts it), `shape`, `sensor`, `wall`, `noise`, `size_class`, `seed`, `epoch` (index in the plan),
+`depth_m` (volume and mean depth that the epoch's map shows of the whole block), `signal_to_noise` (of the matched filter, which
+knows the niche's shape: docs/detector.md), `ignore` (1 where that is below the config's annotation.ignore_below: training leaves
+the block out of its loss, evaluations count it; `iscrowd` stays 0), `share_in_tile` (of the block's pixels; less than 1 where the
+tile's edge cuts it), `shape`, `sensor`, `wall`, `noise`, `size_class`, `seed`, `epoch` (index in the plan),
 `source`.
 """
+
+
+_SURFACES = {
+    "direct": "ray-traced samples, triangulated in the sensor's grid (direct)",
+    "vertices": "the wall's own vertices, each measured by the pair (vertices: the thesis's method 2)",
+    "colmap": "depth maps fused by COLMAP (colmap)",
+}
 
 
 def write_card(
@@ -78,7 +87,10 @@ def _readme(
         yield "**Incomplete: an interrupted job. The command below goes on with it.**\n"
     yield f"Simulated difference maps of rock walls with annotated rockfalls: {tiles:,} tiles, {annotations:,} annotations.\n"
     yield from _table(statistics)
-    yield "Noise: mean over the epochs of the StD of the difference map outside the blocks.\n"
+    yield "Noise: mean over the epochs of the StD of the difference map outside the blocks. S/N > 4: blocks that stand out of"
+    yield "the noise to the matched filter, which knows their shape: about what any detector could find, whatever its training."
+    yield "Niche / box: the share of its bounding box that a niche fills, on average.\n"
+    yield from _surfaces(dataset, statistics)
     yield from (f"![{_in_words(name)}]({name})\n" for name in pictures)
     yield "In the samples red is missing rock, blue a surface that stands further out; the colours end at six times the noise."
     yield "Black outlines are the annotated masks, grey is no data.\n"
@@ -87,14 +99,35 @@ def _readme(
 
 
 def _table(statistics: SetStatistics) -> Iterator[str]:
-    yield "| split | sensor | wall | noise | size | epochs | tiles | blocks a tile | noise, mm |"
-    yield "|---|---|---|---|---|---|---|---|---|"
+    yield "| split | sensor | wall | noise | size | epochs | tiles | blocks a tile | noise, mm | S/N > 4, % | niche / box, % |"
+    yield "|---|---|---|---|---|---|---|---|---|---|---|"
     for key in sorted(statistics.cells, key=lambda cell: (SPLITS.index(cell[0]), cell[1:])):
         cell = statistics.cells[key]
         noise = f"{1e3 * np.mean(cell.noise_m):.1f}" if cell.noise_m else "-"
-        figures = f"{len(cell.noise_m)} | {cell.tiles} | {cell.annotations / max(cell.tiles, 1):.1f} | {noise}"
+        known = cell.annotations and cell.with_ratio
+        bound = f"{100 * cell.stand_out / cell.with_ratio:.0f} | {100 * cell.filled / cell.annotations:.0f}" if known else "- | -"
+        figures = f"{len(cell.noise_m)} | {cell.tiles} | {cell.annotations / max(cell.tiles, 1):.1f} | {noise} | {bound}"
         yield f"| {' | '.join(key)} | {figures} |"
     yield ""
+
+
+def _surfaces(dataset: dict[str, Any], statistics: SetStatistics) -> Iterator[str]:
+    """How the surfaces are made, and where ray-traced samples are too coarse for the smallest blocks."""
+    yield (
+        "Surfaces: " + "; ".join(f"{words}, of {', '.join(whose)}" for words, whose in _reconstructions(dataset).items()) + ".\n"
+    )
+    yield from (f"**{warning}**\n" for warning in statistics.warnings())
+
+
+def _reconstructions(dataset: dict[str, Any]) -> dict[str, list[str]]:
+    """The sensors' walls by how their surfaces are made."""
+    found: dict[str, list[str]] = {}
+    for source in dataset["sources"].values():
+        for sensor in source["config"]["sensors"]:
+            for name, wall in source["config"]["walls"].items():
+                way = wall.get("reconstruction", "direct") if sensor == "stereo" else "direct"
+                found.setdefault(_SURFACES[way], []).append(f"{sensor} {name}")
+    return {words: list(dict.fromkeys(whose)) for words, whose in found.items()}
 
 
 def _in_words(picture: str) -> str:

@@ -105,4 +105,4 @@ def _finish(out: Path, name: str, sources: dict[str, Any], epochs: dict[str, lis
     write_dataset_file(out, name, sources, epochs)
     assembled = assemble(out, complete=True)
     write_dataset_file(out, name, sources, epochs, complete=True)
-    return DatasetSummary(out, images=assembled.images, annotations=assembled.annotations)
+    return DatasetSummary(out, images=assembled.images, annotations=assembled.annotations, warnings=assembled.warnings)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, StringConstraints, ValidationError, field_validator, model_validator
 
@@ -32,16 +32,26 @@ class ScaledModel(Config):
 
     model: SensorModel
     scale: _Factor | dict[str, _Factor] = Field(1.0, description="factor of every sigma and mean of the noise, one or by wall")
+    scaled: Literal["all", "orientation"] = Field(
+        "all", description="what the factor is of: all noise, or a stereo pair's orientation alone, its matching left as it is"
+    )
+
+    @model_validator(mode="after")
+    def _has_an_orientation(self) -> Self:
+        if self.scaled == "orientation" and self.model.sensor != "stereo":
+            raise ValueError("scaled: orientation is of a stereo pair; a laser scanner has none (scaled: all)")
+        return self
 
     def on(self, wall: str) -> StereoModel | TlsModel:
         """The model with its noise scaled for a wall."""
         factor = self.scale[wall] if isinstance(self.scale, dict) else self.scale
-        values = {key: _scaled(value, factor) for key, value in self.model.noise.model_dump().items() if key not in _NO_SIGMA}
+        sigmas = {key: value for key, value in self.model.noise.model_dump().items() if key not in _NO_SIGMA}
+        values = {key: _scaled(value, factor) for key, value in sigmas.items() if self.scaled in ("all", key)}
         noise = self.model.noise.model_validate(self.model.noise.model_dump() | values)
         return self.model.model_copy(update={"noise": noise})
 
 
-_NO_SIGMA = {"regularization_step_px"}
+_NO_SIGMA = {"regularization_step_px", "orientation_drawn"}
 
 
 def _scaled(value: Any, factor: float) -> Any:

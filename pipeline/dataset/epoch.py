@@ -37,10 +37,12 @@ _DRAWS = 5
 
 @dataclass(frozen=True)
 class Stage:
-    """What the epochs of one wall, sensor, noise and reference share. true: raster of the untouched wall, on request."""
+    """What the epochs of one wall, sensor, noise and reference share. true: raster of the untouched wall, on request; spacing_m:
+    of ray-traced samples on the wall, None of a surface of the wall's own vertices."""
 
     site: Site
     reference: Reference
+    spacing_m: float | None
     true: SurfaceRaster | None
 
 
@@ -89,7 +91,10 @@ def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> S
         site = prepare_site(simulation, epoch.sensor, random_of_wall(config, epoch.wall))
     reference = observe_reference(simulation, site, random_of_reference(config, epoch), progress)
     true = cast_raster(reference.caster, reference.raster.grid) if config.truth else None
-    return Stage(site, replace(reference, seen=None), true)
+    grid, samples = reference.raster.grid, len(reference.surface.vertices)
+    by_vertices = reference.seen is not None and reference.seen.vertices is not None
+    spacing = None if by_vertices else float(np.sqrt(grid.width * grid.height / samples) * grid.gsd)
+    return Stage(site, replace(reference, seen=None), spacing, true)
 
 
 def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progress: Progress) -> MadeEpoch:
@@ -111,7 +116,7 @@ def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progr
         cut = [tile for tile in _cut(config, found, grid, truth) if where.holds(tile.tile.column, config.tiles.size_px)]
     if not cut:
         raise no_tile(config, epoch, found.difference, grid)
-    return MadeEpoch({**_record(config, epoch, found, simulation), "draw": draw}, cut)
+    return MadeEpoch({**_record(config, epoch, found, simulation), "draw": draw, "spacing_m": stage.spacing_m}, cut)
 
 
 def no_tile(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np.float32], grid: Grid) -> InputError:
@@ -158,7 +163,7 @@ def _cut(config: DatasetConfig, epoch: Epoch, grid: Grid, truth: NDArray[np.floa
     whole = np.bincount(labels.ravel(), minlength=len(epoch.blocks) + 1)
     size = config.tiles.size_px
     for tile in tiles(epoch.difference, labels, grid, config.tiles):
-        annotations = [_described(each, epoch.blocks, whole) for each in block_annotations(tile.block, config.annotation)]
+        annotations = [_described(each, epoch.blocks, whole, config) for each in block_annotations(tile.block, config.annotation)]
         yield EpochTile(tile, annotations, None if truth is None else _window(truth, tile.row, tile.column, size))
 
 
@@ -168,15 +173,20 @@ def _window(raster: NDArray[np.float32], row: int, column: int, size: int) -> ND
     return np.pad(window, [(0, size - length) for length in window.shape], constant_values=np.nan)
 
 
-def _described(annotation: dict[str, Any], blocks: list[dict[str, Any]], whole: NDArray[np.intp]) -> dict[str, Any]:
+def _described(
+    annotation: dict[str, Any], blocks: list[dict[str, Any]], whole: NDArray[np.intp], config: DatasetConfig
+) -> dict[str, Any]:
     """A COCO annotation with what is known of its block; lengths in m, volumes in m3."""
     block = blocks[annotation["block"] - 1]
+    ratio = block["signal_to_noise"]
     return annotation | {
         "shape": block["shape"],
         "size_m": [round(value, 5) for value in block["size_m"]],
         "depth_m": round(block["measured_mean_depth_m"], 5),
         "volume_m3": round(block["volume_m3"], 8),
         "measured_volume_m3": round(block["measured_volume_m3"], 8),
+        "signal_to_noise": ratio,
+        "ignore": int(ratio is not None and ratio < config.annotation.ignore_below),
         "share_in_tile": round(annotation["area"] / int(whole[annotation["block"]]), 4),
     }
 

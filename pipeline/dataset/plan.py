@@ -66,8 +66,11 @@ def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfi
     level = config.noise[epoch.noise].of(epoch.sensor)
     if level is None:  # the config's own check has been here
         raise InputError(f"has no model of {epoch.sensor}", where=f"noise.{epoch.noise}")
+    wall = config.walls[epoch.wall]
+    if epoch.sensor == "tls" and wall.reconstruction == "vertices":  # of the stereo pair alone
+        wall = wall.model_copy(update={"reconstruction": "direct"})
     changes = {"seed": config.seed, "sensor": (level.on(epoch.wall),), "rockfall": config.sizes[epoch.size].rockfall}
-    return config.walls[epoch.wall].model_copy(update={**changes, "tiles": config.tiles, "annotation": config.annotation})
+    return wall.model_copy(update={**changes, "tiles": config.tiles, "annotation": config.annotation})
 
 
 def blocks_on(config: DatasetConfig, size: str, grid: Grid) -> int:

@@ -46,17 +46,19 @@ class Workers:
 @dataclass
 class DatasetSummary:
     """What a job did. folder: of the set; made: what each epoch took that it made (`worker.fill`); images, annotations: of the
-    whole set, by split; damage: what was wrong with epochs that were there before."""
+    whole set, by split; damage: what was wrong with epochs that were there before; warnings: what is amiss with the set."""
 
     folder: Path
     made: list[dict[str, Any]] = field(default_factory=list)
     images: dict[str, int] = field(default_factory=dict)
     annotations: dict[str, int] = field(default_factory=dict)
     damage: list[Damage] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
     def summary(self) -> str:
         splits = ", ".join(f"{name} {self.images[name]:,} tiles with {self.annotations[name]:,} blocks" for name in self.images)
-        return f"{len(self.made)} epochs made; {splits}\ncard: {self.folder / 'README.md'}"
+        warnings = "".join(f"\nwarning: {each}" for each in self.warnings)
+        return f"{len(self.made)} epochs made; {splits}\ncard: {self.folder / 'README.md'}{warnings}"
 
 
 def make_dataset(
@@ -153,7 +155,7 @@ def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSumm
         assembled = assemble(folder, complete=True)
         write_dataset_file(folder, known["name"], known["sources"], known["epochs"], complete=True)
     remove_leftovers(folder)
-    summary.images, summary.annotations = assembled.images, assembled.annotations
+    summary.images, summary.annotations, summary.warnings = assembled.images, assembled.annotations, assembled.warnings
     return summary
 
 

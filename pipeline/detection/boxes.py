@@ -40,12 +40,22 @@ def anchors(
 def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
     """(..., n, m) of boxes (..., n, 4) and (..., m, 4); 0 where both are empty."""
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
+    common = _common(left, right)
+    return common / ops.maximum(_area(left) + _area(right) - common, 1e-6)
+
+
+def share_inside(left: Tensor, right: Tensor) -> Tensor:
+    """(..., n, m) share of boxes (..., n, 4) that lies in boxes (..., m, 4): COCO's overlap with a crowd; 0 of an empty box."""
+    left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
+    return _common(left, right) / ops.maximum(_area(left), 1e-6)
+
+
+def _common(left: Tensor, right: Tensor) -> Tensor:
     height, width = (
         ops.maximum(ops.minimum(left[..., end], right[..., end]) - ops.maximum(left[..., start], right[..., start]), 0.0)
         for start, end in ((0, 2), (1, 3))
     )
-    common = height * width
-    return common / ops.maximum(_area(left) + _area(right) - common, 1e-6)
+    return height * width
 
 
 def encode(boxes: Tensor, reference: Tensor) -> Tensor:

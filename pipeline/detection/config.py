@@ -98,7 +98,7 @@ class TrainingConfig(Config):
     loss_weights: dict[Loss, Annotated[float, Field(gt=0)]] = Field(
         {}, description="by what losses are multiplied before they are added; 1 for the others, as the thesis has it"
     )
-    flips: bool = Field(True, description="mirror images left-right at random")
+    flips: bool = Field(True, description="mirror images left-right and up-down at random")
     crop_px: int | None = Field(
         None, ge=64, multiple_of=64, description="train on random windows of this side (default: whole images)"
     )

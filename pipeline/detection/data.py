@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,13 @@ class Labelled:
     """A difference map (h, w), m, and its blocks.
 
     labels: (h, w) int32, 1 + the index of the block that a pixel shows (of the later one where two overlap), 0 for none;
-    boxes: (g, 4) float32 y0, x0, y1, x1 px.
+    boxes: (g, 4) float32 y0, x0, y1, x1 px; ignored: (g,) blocks left out of the loss, COCO's `ignore` or `iscrowd`.
     """
 
     difference: NDArray[np.float32]
     labels: NDArray[np.int32]
     boxes: NDArray[np.float32]
+    ignored: NDArray[np.bool_]
 
 
 class CocoFolder:
@@ -68,13 +69,15 @@ class CocoFolder:
         difference = self._difference(index)
         labels = np.zeros(difference.shape, np.int32)
         boxes: list[tuple[float, float, float, float]] = []
+        ignored: list[bool] = []
         for annotation in self._of[self.images[index]["id"]]:
             if annotation["area"] == 0:
                 continue
             x, y, width, height = annotation["bbox"]
             boxes.append((y, x, y + height, x + width))
+            ignored.append(bool(annotation.get("ignore") or annotation.get("iscrowd")))
             labels[coco_mask.decode(annotation["segmentation"]) > 0] = len(boxes)
-        return Labelled(difference, labels, np.array(boxes, np.float32).reshape(-1, 4))
+        return Labelled(difference, labels, np.array(boxes, np.float32).reshape(-1, 4), np.array(ignored, dtype=bool))
 
     def _difference(self, index: int) -> NDArray[np.float32]:
         image = self.images[index]
@@ -106,8 +109,9 @@ def batches(
         for index in group:
             random = np.random.default_rng((training.seed, epoch, 1 + int(index))) if learning else None
             labelled = window(folder.labelled(int(index)), size, random)
-            if random is not None and training.flips and random.random() < 0.5:
-                labelled = mirrored(labelled)
+            if random is not None and training.flips:
+                for axis in (1, 0):
+                    labelled = mirrored(labelled, axis) if random.random() < 0.5 else labelled
             examples.append(network_input(labelled, detector))
         return {name: np.stack([example[name] for example in examples]) for name in examples[0]}
 
@@ -127,16 +131,16 @@ def network_input(labelled: Labelled, config: DetectorConfig) -> Batch:
     if count > config.most_blocks:
         raise InputError(f"an image shows {count} blocks", where="detector.most_blocks", allowed=f"at least {count}")
     boxes, valid = np.zeros((config.most_blocks, 4), np.float32), np.zeros(config.most_blocks, np.float32)
-    boxes[:count], valid[:count] = labelled.boxes, 1
+    boxes[:count], valid[:count] = labelled.boxes, np.where(labelled.ignored, -1, 1)
     image = normalised(labelled.difference, config.normalisation)
     return {"image": image, "boxes": boxes, "valid": valid, "labels": labelled.labels}
 
 
-def mirrored(labelled: Labelled) -> Labelled:
-    """Left and right exchanged."""
-    width = labelled.difference.shape[1]
-    y0, x0, y1, x1 = labelled.boxes.T
-    return Labelled(labelled.difference[:, ::-1], labelled.labels[:, ::-1], np.stack([y0, width - x1, y1, width - x0], axis=1))
+def mirrored(labelled: Labelled, axis: int) -> Labelled:
+    """Up and down (axis 0) or left and right (1) exchanged."""
+    boxes = labelled.boxes.copy()
+    boxes[:, [axis, axis + 2]] = labelled.difference.shape[axis] - labelled.boxes[:, [axis + 2, axis]]
+    return replace(labelled, difference=np.flip(labelled.difference, axis), labels=np.flip(labelled.labels, axis), boxes=boxes)
 
 
 def window(labelled: Labelled, size: int, random: np.random.Generator | None) -> Labelled:
@@ -161,4 +165,5 @@ def window(labelled: Labelled, size: int, random: np.random.Generator | None) ->
         np.pad(labelled.difference[cut], missing, constant_values=np.nan),
         numbers[labels],
         np.clip(shifted, 0, size, dtype=np.float32),
+        labelled.ignored[kept],
     )

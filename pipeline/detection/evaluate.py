@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
+
+from pipeline.change.annotate import STANDS_OUT
 
 CONFIDENCES, THRESHOLDS = (0.9, 0.95, 0.99), (0.25, 0.75)
 Overlap = Literal["segm", "bbox"]
@@ -27,7 +29,9 @@ class Score:
     """One cell of the thesis's tables.
 
     group: what the images or blocks have in common; confidence: lowest score that counts; iou: lowest overlap that counts;
-    area_ratio: mean of predicted over true mask area of the matched, NaN where nothing matched.
+    area_ratio: mean of predicted over true mask area of the matched, NaN where nothing matched; kind: overlap of masks or boxes;
+    stand_out: share of the blocks whose niche stands out from the noise (pipeline/change/matched_filter.py), which is about the
+    largest recall that any detector could reach; NaN where the annotations do not tell.
     """
 
     group: str
@@ -37,6 +41,8 @@ class Score:
     false_positives: int
     false_negatives: int
     area_ratio: float
+    kind: Overlap = "segm"
+    stand_out: float = float("nan")
 
     @property
     def precision(self) -> float:
@@ -93,9 +99,11 @@ def evaluate(
     result = []
     for group, images in groups.items():
         images = list(images)
+        bound = _stand_out([block for image in images for block in blocks.get(image, [])])
         for confidence in confidences:
             pairs = [_image_pairs(blocks.get(image, []), found.get(image, []), confidence, kind) for image in images]
-            result += [_score(group, confidence, threshold, pairs) for threshold in thresholds]
+            scores = (_score(group, confidence, threshold, pairs) for threshold in thresholds)
+            result += [replace(score, kind=kind, stand_out=bound) for score in scores]
     return result
 
 
@@ -173,6 +181,11 @@ def _score(group: str, confidence: float, threshold: float, images: Iterable[_Pa
     every = np.concatenate(ratios) if ratios else np.zeros(0)
     ratio = float(every.mean()) if every.size else float("nan")
     return Score(group, confidence, threshold, hits, predicted - hits, true - hits, ratio)
+
+
+def _stand_out(blocks: Sequence[Mapping[str, Any]]) -> float:
+    known = [block["signal_to_noise"] for block in blocks if isinstance(block.get("signal_to_noise"), int | float)]
+    return _share(sum(ratio > STANDS_OUT for ratio in known), len(known))
 
 
 def _share(part: int, whole: int) -> float:

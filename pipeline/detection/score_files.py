@@ -11,15 +11,21 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.change.annotate import STANDS_OUT
 from pipeline.detection.evaluate import CONFIDENCES, Overlap, Score, coco_metrics, evaluate
 from pipeline.formats.atomic import write_json, write_text
 from pipeline.formats.coco import read_coco, read_detections
 from scene.errors import InputError, nearest
 
+_KINDS: dict[Overlap, str] = {"segm": "masks", "bbox": "boxes"}
+
 
 @dataclass(frozen=True)
 class Assessment:
-    """Scores of every group and pycocotools' figures over all images."""
+    """Scores of every group, by overlap of masks and of boxes, and pycocotools' figures over all images.
+
+    coco: by overlap of masks, of boxes where there are no masks.
+    """
 
     scores: list[Score]
     coco: dict[str, float]
@@ -33,36 +39,43 @@ def assess(
     truth: Path,
     predictions: Path,
     keys: Sequence[str] = (),
-    kind: Overlap = "segm",
+    kinds: Sequence[Overlap] = ("segm", "bbox"),
     confidences: Sequence[float] = CONFIDENCES,
 ) -> Assessment:
     """Compare two COCO files; `keys` of the truth's images, such as noise or wall, make the groups.
 
-    kind: overlap of masks or of boxes; confidences: lowest scores that count, each a column of the tables.
+    kinds: overlap of masks, of boxes (the thesis's), or both; confidences: lowest scores that count, each a column of the tables.
 
     Raises InputError for all that `read_coco` and `read_detections` do, and for keys that do not tell the images apart.
     """
     path = truth / "annotations.json" if truth.is_dir() else truth
-    reference = read_coco(path, masks=kind == "segm")
-    found = read_detections(predictions, reference, masks=kind == "segm")
+    reference = read_coco(path, masks="segm" in kinds)
+    found = read_detections(predictions, reference, masks="segm" in kinds)
     groups = _groups(reference.images, keys, str(path))
-    scores = evaluate(reference.to_dict(), found, groups, confidences, kind=kind)
-    return Assessment(scores, coco_metrics(reference.to_dict(), found, kind))
+    scores = [score for kind in kinds for score in evaluate(reference.to_dict(), found, groups, confidences, kind=kind)]
+    return Assessment(scores, coco_metrics(reference.to_dict(), found, kinds[0]))
 
 
 def as_text(assessment: Assessment) -> str:
-    """Tables in the form of the thesis's, one per group, and COCO's figures."""
+    """Tables in the form of the thesis's, one per group and overlap, and COCO's figures."""
     lines = []
-    groups: dict[str, list[Score]] = {}
+    groups: dict[tuple[str, Overlap], list[Score]] = {}
     for score in assessment.scores:
-        groups.setdefault(score.group, []).append(score)
-    for group, scores in groups.items():
-        lines += ["", group, f"{'confidence':<12}" + "".join(f"{_probability(score.confidence):>9}" for score in scores)]
+        groups.setdefault((score.group, score.kind), []).append(score)
+    by_group = sorted(groups.items(), key=lambda item: [name for name, _ in groups].index(item[0][0]))
+    for (group, kind), scores in by_group:
+        lines += [
+            "",
+            f"{group}, IoU of {_KINDS[kind]}",
+            f"{'confidence':<12}" + "".join(f"{_probability(score.confidence):>9}" for score in scores),
+        ]
         lines.append(f"{'IoU':<12}" + "".join(f"{score.iou:>9.2f}" for score in scores))
         for title, name in (("TP", "true_positives"), ("FP", "false_positives"), ("FN", "false_negatives")):
             lines.append(f"{title:<12}" + "".join(f"{getattr(score, name):>9}" for score in scores))
         for title, name in (("precision", "precision"), ("recall", "recall"), ("F1", "f1"), ("area ratio", "area_ratio")):
             lines.append(f"{title:<12}" + "".join(_cell(getattr(score, name)) for score in scores))
+        if kind == by_group[0][0][1] and not np.isnan(scores[0].stand_out):
+            lines.append(f"blocks that stand out from the noise (S/N > {STANDS_OUT:g}): {100 * scores[0].stand_out:.1f} %")
     coco = "  ".join(f"{name} {value:.3f}" for name, value in assessment.coco.items() if value >= 0)
     return "\n".join([*lines[1:], "", f"COCO: {coco}"])
 

@@ -10,8 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from keras import ops, random
 
-from pipeline.detection.boxes import Tensor, encode, intersection_over_union
+from pipeline.detection.boxes import Tensor, encode, intersection_over_union, share_inside
 from pipeline.detection.config import HeadConfig, ProposalConfig
+
+_IGNORED = 0.5
+"""Share of a box in a block to ignore from which it is no background."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +54,14 @@ def anchor_targets(
 ) -> AnchorTargets:
     """Which anchors are blocks: those near one, and the nearest to each block.
 
-    anchors: (a, 4); blocks: (b, g, 4) with valid (b, g) 1 or 0.
+    anchors: (a, 4); blocks: (b, g, 4) with valid (b, g): 1, 0 for none, -1 for one to ignore, in which no anchor is negative.
     """
-    overlap = intersection_over_union(anchors[None], blocks) * valid[:, None]
+    counted, free = _counted(anchors[None], blocks, valid)
+    overlap = intersection_over_union(anchors[None], blocks) * counted
     best = ops.max(overlap, axis=2)
     nearest = ops.any((overlap >= ops.max(overlap, axis=1, keepdims=True) - 1e-6) & (overlap > 0.05), axis=2)
     positive = ops.cast((best >= config.positive_iou) | nearest, "float32")
-    negative = ops.cast(best < config.negative_iou, "float32") * (1 - positive)
+    negative = ops.cast(best < config.negative_iou, "float32") * (1 - positive) * free
     half = config.sampled_anchors // 2
     chosen, weight = _drawn(positive, half, seed)
     others, other_weight = _drawn(negative, config.sampled_anchors, seed)
@@ -72,21 +76,29 @@ def anchor_targets(
 def box_targets(proposals: Tensor, blocks: Tensor, valid: Tensor, config: HeadConfig, seed: random.SeedGenerator) -> BoxTargets:
     """Which proposals are blocks; the blocks themselves are among the proposals, so that there is always something to learn from.
 
-    proposals: (b, n, 4), empty ones have no area; blocks: (b, g, 4) with valid (b, g).
+    proposals: (b, n, 4), empty ones have no area; blocks: (b, g, 4) with valid (b, g), as in `anchor_targets`.
     """
-    everything = ops.concatenate([proposals, blocks * valid[..., None]], axis=1)
+    everything = ops.concatenate([proposals, blocks * ops.cast(valid > 0, "float32")[..., None]], axis=1)
     sound = ops.cast((everything[..., 2] > everything[..., 0]) & (everything[..., 3] > everything[..., 1]), "float32")
-    overlap = intersection_over_union(everything, blocks) * valid[:, None]
+    counted, free = _counted(everything, blocks, valid)
+    overlap = intersection_over_union(everything, blocks) * counted
     best = ops.max(overlap, axis=2)
     positive = ops.cast(best >= config.positive_iou, "float32") * sound
     count = config.sampled_proposals // 3
     chosen, weight = _drawn(positive, count, seed)
-    others, other_weight = _drawn((1 - positive) * sound, config.sampled_proposals - count, seed)
+    others, other_weight = _drawn((1 - positive) * sound * free, config.sampled_proposals - count, seed)
     block = ops.take_along_axis(ops.argmax(overlap, axis=2), chosen, axis=1)
     boxes = ops.take_along_axis(everything, ops.concatenate([chosen, others], axis=1)[..., None], axis=1)
     wanted = ops.take_along_axis(blocks, block[..., None], axis=1)
     code = ops.where(weight[..., None] > 0, encode(wanted, boxes[:, :count]), 0.0)
     return BoxTargets(boxes, ops.concatenate([weight, other_weight], axis=1), code, block)
+
+
+def _counted(boxes: Tensor, blocks: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """(b, 1, g) 1 for the blocks that count, and (b, n) 0 for boxes that lie in one to ignore by _IGNORED or more, else 1."""
+    ignored = ops.cast(valid < 0, "float32")[:, None]
+    free = ops.max(share_inside(boxes, blocks) * ignored, axis=2) < _IGNORED
+    return ops.cast(valid > 0, "float32")[:, None], ops.cast(free, "float32")
 
 
 def mask_targets(labels: Tensor, boxes: Tensor, block: Tensor, size: int) -> Tensor:

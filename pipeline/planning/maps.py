@@ -11,7 +11,14 @@ import numpy as np
 from pipeline.config.simulation import SimulationConfig
 from pipeline.precision import stereo_geometry as stereo
 from pipeline.precision import tls_geometry as tls
-from pipeline.precision.detectability import PlanningConfig, Sampling, detection_probability, smallest_block
+from pipeline.precision.detectability import (
+    FINDABLE,
+    PlanningConfig,
+    Sampling,
+    detection_probability,
+    smallest_block,
+    smallest_findable,
+)
 from pipeline.precision.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
 from pipeline.run.site import Site
 from scene.errors import InputError
@@ -281,6 +288,8 @@ def _if_any(found: PlanMap) -> list[PlanMap]:
 def _detection_maps(sampling: Sampling, seen: BoolArray, config: PlanningConfig) -> list[PlanMap]:
     title = f"Smallest block seen in {100 * config.probability:g} % of cases"
     maps = [_map("smallest_block_m", title, smallest_block(sampling, config), seen, "cm", 100.0)]
+    findable = f"Smallest block that any detector could see (S/N {FINDABLE:g})"
+    maps.append(_map("smallest_findable_m", findable, smallest_findable(sampling, config), seen, "cm", 100.0))
     for size in config.block_size_m:
         probability = np.where(seen, detection_probability(sampling, size, config), 0.0)
         maps.append(

@@ -74,11 +74,18 @@ def summary(plan: Plan) -> str:
 def answer(plan: Plan) -> str:
     """The sentence that planners ask for: the smallest block that is seen."""
     share = percent(plan.config.probability, 0)
-    middle = next(found for found in plan.maps if found.name == "smallest_block_m").summary(plan.middle())["middle"]
+    middle, least = (_in_the_middle(plan, name) for name in ("smallest_block_m", "smallest_findable_m"))
     name = plan.instrument
-    if middle is None:
+    if middle is None or least is None:
         return f"{name}: in the middle of the wall no block is seen in {share} of cases."
-    return f"{name}: the smallest block seen in {share} of cases in the middle of the wall has sides of {100 * middle:.1f} cm."
+    return (
+        f"{name}: the smallest block seen in {share} of cases in the middle of the wall has sides of {100 * middle:.1f} cm; "
+        f"the smallest that any detector could see, {100 * least:.1f} cm."
+    )
+
+
+def _in_the_middle(plan: Plan, name: str) -> float | None:
+    return next(found for found in plan.maps if found.name == name).summary(plan.middle())["middle"]
 
 
 def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any]) -> None:
@@ -125,7 +132,7 @@ def map_picture(plan: Plan, found: PlanMap) -> bytes:
 
 def _picture(plan: Plan, found: PlanMap) -> _Picture:
     png = map_picture(plan, found)
-    none = found.name == "smallest_block_m"
+    none = found.name in ("smallest_block_m", "smallest_findable_m")
     return _Picture(found.title, png, "not seen, or no block is, however large" if none else "not seen")
 
 

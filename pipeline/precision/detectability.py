@@ -38,17 +38,20 @@ Where the lattice is askew, every line is taken to hold as many points as the ot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from scene.config import Config
 from scene.mesh import FloatArray
 
+FINDABLE = 4.0
+"""Signal-to-noise ratio from which a block can be told from the noise of the whole wall, as in a data set's card."""
 _SMALLEST_M, _LARGEST_M, _HALVINGS = 1e-3, 30.0, 13
 """The search of the smallest block: ln(30000) / 2^13 leaves 0.13 %."""
 
@@ -138,12 +141,37 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
 
 def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
     """(n,) side of the smallest block that is seen with `config.probability`, m; NaN where 30 m are not, or no floor shows."""
+    return _smallest(sampling, lambda side: detection_probability(sampling, side, config) >= config.probability)
+
+
+def smallest_findable(sampling: Sampling, config: PlanningConfig) -> FloatArray:
+    """(n,) side of the smallest block that any detector could see, m: one that knows its place and shape has a ratio of 4.
+
+    Below it noise alone looks as much like a block somewhere on the wall. NaN as in `smallest_block`.
+    """
+    return _smallest(sampling, lambda side: signal_to_noise(sampling, side, config) >= FINDABLE)
+
+
+def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
+    """(n,) f h / tau (steps 2 and 3 of the module) at the mean number of points on the floor, 0 where that is less than one."""
+    depth = config.depth_ratio * np.asarray(side_m)
+    width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))
+    kept = sampling.smooth**2 * _kept(width_a / sampling.grain_a) * _kept(width_b / sampling.grain_b)
+    hit = _hit(width_a, sampling.blur_a) * _hit(width_b, sampling.blur_b)
+    points = width_a * width_b / (sampling.step_a * sampling.step_b)
+    white = 2 * sampling.white**2 / np.maximum(points, 1.0)
+    tau = np.sqrt(np.maximum(white + 2 * kept + config.registration_sigma_m**2, 1e-24))
+    return np.asarray(np.where(points >= 1, hit * depth / tau, 0.0))
+
+
+def _smallest(sampling: Sampling, seen: Callable[[FloatArray], NDArray[np.bool_]]) -> FloatArray:
+    """(n,) the smallest side, m, from which on a block is `seen`, by bisection; NaN where the largest is not."""
     low, high = (np.full(np.shape(sampling.step_a), np.log(limit)) for limit in (_SMALLEST_M, _LARGEST_M))
-    possible = detection_probability(sampling, np.exp(high), config) >= config.probability
+    possible = seen(np.exp(high))
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        seen = detection_probability(sampling, np.exp(middle), config) >= config.probability
-        low, high = np.where(seen, low, middle), np.where(seen, middle, high)
+        enough = seen(np.exp(middle))
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
     return np.where(possible, np.exp(high), np.nan)
 
 

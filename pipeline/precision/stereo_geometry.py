@@ -10,7 +10,7 @@ from pipeline.precision.detectability import Sampling, lattice
 from pipeline.precision.surface import BoolArray, Places, slide, turned
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from sensors.camera import Camera, CameraPair
+from sensors.camera import Camera, CameraPair, Side
 from sensors.effects.base import Stage, apply_stage
 from sensors.effects.matching_noise import NodeNoise
 from sensors.model import OrientationNoise, Spread, StereoModel
@@ -136,13 +136,14 @@ def _intersection(nominal: CameraPair, points: FloatArray) -> _Derivatives:
 def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
     """(n, 3, 3) covariance of recorded points by the noise of both cameras' orientation, wall frame, m2, to first order.
 
-    Each of the 2 x 16 parameters is moved by its standard deviation alone: the real cameras see the point there, the nominal ones
-    intersect.
+    Each of the 16 parameters is moved by its standard deviation alone, in each camera or in both alike: the real cameras see the
+    point there, the nominal ones intersect.
     """
     covariance = np.zeros((len(points), 3, 3))
     noise, nominal = pair.model.noise.orientation, pair.cameras.in_wall_frame(pair.frame)
     geometry = rectify(nominal)
-    for side in ("left", "right"):
+    sides: tuple[Side, ...] = ("both",) if pair.model.noise.orientation_drawn == "both_alike" else ("left", "right")
+    for side in sides:
         for name in type(noise).model_fields:
             sigma = getattr(noise, name).sigma
             if sigma > 0:

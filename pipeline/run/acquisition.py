@@ -18,6 +18,7 @@ from sensors.exchanged import depth_cameras, observe_right, pair_of
 from sensors.observation import Observation
 from sensors.stereo import StereoPair
 from sensors.stereo_matched import MatchedStereoPair
+from sensors.stereo_vertices import observe_vertices
 from sensors.tls import LaserScanner
 
 DepthMaps = tuple[DepthMap, DepthMap]
@@ -27,11 +28,12 @@ DepthMaps = tuple[DepthMap, DepthMap]
 @dataclass(frozen=True)
 class Look:
     """observation: the sensor's, of several stations the first one's; depth_maps: where the config sends them to others; joined:
-    all stations of a laser scanner that has several."""
+    all stations of a laser scanner that has several; vertices: the surface of a pair that measures the wall's own vertices."""
 
     observation: Observation
     depth_maps: DepthMaps | None
     joined: Joined | None = None
+    vertices: TriangleMesh | None = None
 
     @property
     def observations(self) -> tuple[Observation, ...]:
@@ -42,18 +44,26 @@ class Look:
 def look(config: SimulationConfig, site: Site, scene: RayCaster, random: KeyedRandom) -> Look:
     """Observe `scene`; the right depth map costs a second observation and is made only where it is needed.
 
-    Raises InputError where a laser scanner's points should be reconstructed by COLMAP.
+    Raises InputError where a laser scanner's points should be reconstructed by COLMAP, or any but simulated ones by vertices.
     """
     sensor, colmap = site.sensor, config.reconstruction == "colmap"
+    vertices = None
+    if config.reconstruction == "vertices":
+        if not isinstance(sensor, StereoPair):
+            allowed = "direct, for the tls sensor" if isinstance(sensor, LaserScanner) else "direct, colmap, for matcher: sgbm"
+            raise InputError("vertices are measured by the simulated stereo pair", where="reconstruction", allowed=allowed)
+        vertices = observe_vertices(sensor, scene, random)
     seen = sensor.observe(scene, random)
     if not isinstance(sensor, StereoPair | MatchedStereoPair):
         if colmap:
             raise InputError("colmap fuses depth maps", where="reconstruction", allowed="direct, for the tls sensor")
         return Look(seen, None, _join_stations(config, site, scene, seen, random))
     if not (colmap or config.products.metashape):
-        return Look(seen, None)
+        return Look(seen, None, vertices=vertices)
     left, right = depth_cameras(pair_of(sensor))
-    return Look(seen, (DepthMap(left, seen.depth), DepthMap(right, observe_right(sensor, scene, random).depth)))
+    return Look(
+        seen, (DepthMap(left, seen.depth), DepthMap(right, observe_right(sensor, scene, random).depth)), vertices=vertices
+    )
 
 
 def reconstruct(config: SimulationConfig, seen: Look) -> TriangleMesh:
@@ -61,7 +71,9 @@ def reconstruct(config: SimulationConfig, seen: Look) -> TriangleMesh:
     observation = seen.observation
     if seen.joined is not None:
         return seen.joined.surface
-    if config.reconstruction == "direct" or seen.depth_maps is None:
+    if seen.vertices is not None:
+        return seen.vertices
+    if config.reconstruction != "colmap" or seen.depth_maps is None:
         return mesh_observation(observation, config.surface)
     valid = observation.valid
     return colmap_surface(*seen.depth_maps, observation.points[valid], observation.block[valid], config.surface, config.fusion)

@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 
 from pipeline.change.difference import BlockStatistics, SurfaceRaster, block_statistics, difference, raster_grid, surface_raster
 from pipeline.change.m3c2 import M3c2Map, m3c2
+from pipeline.change.matched_filter import signal_to_noise, true_change
 from pipeline.config.simulation import SimulationConfig
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import Registration, register_to
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import Look, look, reconstruct
+from pipeline.run.displacement import displacement
+from pipeline.run.registered import reference_and_target, reference_sensor
 from pipeline.run.site import Site
 from scene.blocks import Blocks, place_blocks
 from scene.carve import Carved, carve, carved_records
@@ -72,10 +75,10 @@ def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom,
         caster = RayCaster(as_observed(config, site.mesh))
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, where)
-        seen = look(config, site, caster, random.child("epoch", 0, "observe"))
+        seen = look(config, reference_sensor(config, site), caster, random.child("epoch", 0, "observe"))
     with progress.stage("epoch 0: mesh"):
-        surface = reconstruct(config, seen)
-        target = None if config.icp is None else ReferenceSurface.build(surface.vertices, surface.vertex_normals())
+        found, keyed = reconstruct(config, seen), random.child("epoch", 0, "register")
+        surface, target = reference_and_target(config, found, caster.mesh, keyed)
     with progress.stage("epoch 0: difference"):
         raster = surface_raster(surface, raster_grid(surface.bounds, config.difference))
     return Reference(seen, caster, surface, raster, target)
@@ -95,7 +98,8 @@ def observe_epoch(
         carved = replace(carved, mesh=as_observed(config, carved.mesh))
         records = carved_records(blocks, carved.removed_volume_m3)
     with progress.stage(f"epoch {number}: observe"):
-        seen = look(config, site, RayCaster(carved.mesh), keyed.child("observe"))
+        after = RayCaster(carved.mesh)
+        seen = look(config, site, after, keyed.child("observe"))
     with progress.stage(f"epoch {number}: mesh"):
         surface = reconstruct(config, seen)
     registration, registered = None, surface
@@ -105,8 +109,11 @@ def observe_epoch(
             registered = surface.with_vertices(registration.apply(surface.vertices))
     with progress.stage(f"epoch {number}: difference"):
         raster = surface_raster(registered, reference.raster.grid)
+        shift = displacement(seen.observations, registration, raster.grid)
+        raster = replace(raster, block=after.labels_down(raster.grid, shift))
         change = difference(reference.raster, raster)
-        measured = measure_blocks(change, raster, len(records))
+        lost = true_change(reference.caster, after, raster.block, raster.grid, shift)
+        measured = measure_blocks(change, raster, signal_to_noise(change, raster.block, lost, len(records)))
         statistics = block_statistics(change, raster.block)
         clouds = None
         if config.m3c2 is not None:
@@ -123,11 +130,13 @@ def as_observed(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:
     return mesh if config.wetness is None else config.wetness.wetted(mesh)
 
 
-def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, count: int) -> list[dict[str, Any]]:
-    """What the difference map shows of each of `count` blocks: area (of its label, with data), volume and mean depth, SI.
+def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: FloatArray) -> list[dict[str, Any]]:
+    """What the difference map shows of each block: area (of its label, with data), volume and mean depth, SI, and the matched
+    filter's signal-to-noise `ratio` (k,).
 
     Volume is the sum of the differences over the label's pixels times the pixel's area.
     """
+    count = len(ratio)
     seen = (raster.block != WALL) & ~np.isnan(change)
     label, depth = raster.block[seen], change[seen].astype(np.float64)
     pixels = np.bincount(label, minlength=count + 1)[1 : count + 1]
@@ -138,8 +147,9 @@ def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, count: in
             "measured_area_m2": float(number * area),
             "measured_volume_m3": float(volume * area),
             "measured_mean_depth_m": float(volume / number) if number else None,
+            "signal_to_noise": None if np.isnan(rho) else round(float(rho), 3),
         }
-        for number, volume in zip(pixels, total, strict=True)
+        for number, volume, rho in zip(pixels, total, ratio, strict=True)
     ]
 
 

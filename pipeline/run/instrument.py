@@ -54,7 +54,8 @@ def _pair_figures(sensor: Sensor, site: Site) -> dict[str, str]:
     smooth = f"{noise.regularization_sigma_px:g} px every {noise.regularization_step_px:g} px (regularization)"
     simulated = f"{noise.parallax_sigma_px:g} px (parallax) and {smooth}"
     matched = "the matcher's own: photographs are rendered and matched (sgbm)"
-    drawn = "; orientation drawn in each epoch" if _is_drawn(noise.orientation) else ""
+    for_whom = " for both cameras alike" if noise.orientation_drawn == "both_alike" else ""
+    drawn = f"; orientation drawn in each epoch{for_whom}" if _is_drawn(noise.orientation) else ""
     return {
         "Sensor": f"stereo pair, {left.width} x {left.height} px, principal distance {left.f_px:,.0f} px, base {base:.2f} m",
         "Noise": f"{matched if isinstance(sensor, MatchedStereoPair) else simulated}{drawn} {_ONE_SIGMA}",

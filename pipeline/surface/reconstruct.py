@@ -1,4 +1,5 @@
-"""From an observation to a surface: `direct`, the sensor's own grid, or `colmap`, an outside reconstruction of the depth maps.
+"""From an observation to a surface: `direct`, the sensor's own grid; `vertices`, the wall's own, each measured by the pair
+(sensors/stereo_vertices.py); or `colmap`, an outside reconstruction of the depth maps.
 
 `colmap` is the analogue of handing depth maps to Metashape. Both depth maps, freed of the lens distortion, go into a COLMAP
 workspace; its stereo fusion joins what agrees in both (Schoenberger et al. 2016, "Pixelwise View Selection for Unstructured
@@ -25,7 +26,7 @@ from scene.config import Config
 from scene.errors import InputError
 from scene.mesh import FloatArray, IntArray, TriangleMesh
 
-Reconstruction = Literal["direct", "colmap"]
+Reconstruction = Literal["direct", "vertices", "colmap"]
 NAMES = ("left.png", "right.png")
 """The images of the workspace; they are grey, for fusion only copies their colours."""
 _LANDMARKS = 200

@@ -99,7 +99,9 @@ def merged(scanners: Sequence[LaserScanner], meshes: Sequence[TriangleMesh], con
 
 def _moved(seen: Observation, found: Registration) -> Observation:
     further = seen.further and replace(seen.further, points=found.apply(seen.further.points))
-    return replace(seen, points=found.apply(seen.points), viewpoint=found.apply(seen.viewpoint), further=further)
+    points = found.apply(seen.points)
+    offset = None if seen.offset is None else seen.offset + (points - seen.points)[..., :2].astype(np.float32)
+    return replace(seen, points=points, viewpoint=found.apply(seen.viewpoint), further=further, offset=offset)
 
 
 def _variance(scanner: LaserScanner, grid: Grid, height_m: float) -> NDArray[np.float32]:

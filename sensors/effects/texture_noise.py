@@ -11,7 +11,6 @@ from scene.backend import mi
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from scene.upload import on_device
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
 from sensors.matches import Matches
 
@@ -52,7 +51,7 @@ class TextureNoise(Effect):
         with np.errstate(divide="ignore"):
             sigma = np.minimum(np.sqrt(self.coefficient / information), LARGEST_SIGMA_PX)
         noise = mi.Float64(random.normals(state.index).x)
-        return replace(state, disparity=state.disparity + on_device(mi.Float64, sigma) * noise)
+        return replace(state, disparity=state.disparity + state.sampled(sigma) * noise)
 
 
 def texture(image: FloatArray, reduction: int) -> FloatArray:

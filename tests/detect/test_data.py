@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pipeline.detect import baseline, events, inference
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from test_model import make_set
 
 from pipeline.cli.main import main
-from pipeline.detection import baseline, events, inference
 from pipeline.detection.config import DetectorConfig, NormalisationConfig, TrainingConfig
-from pipeline.detection.data import CocoFolder, batches, mirrored
+from pipeline.detection.data import CocoFolder, batches, mirrored, network_input
 from pipeline.detection.detections import Detection, cropped, without_doubles
 from pipeline.detection.inference import paste, tile_places
 from pipeline.detection.keras_backend import stderr_dropped
@@ -68,13 +68,29 @@ def test_batches_depend_on_seed_and_epoch_alone(tmp_path):
     assert_array_equal(plain["labels"][0], folder.labelled(0).labels)
 
 
-def test_a_mirrored_map_has_its_blocks_mirrored(tmp_path):
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_mirrored_map_has_its_blocks_mirrored(tmp_path, axis):
     labelled = CocoFolder(make_set(tmp_path, 1, 4, blocks=2)).labelled(0)
-    turned = mirrored(labelled)
+    turned = mirrored(labelled, axis)
     for number, (y0, x0, y1, x1) in enumerate(turned.boxes, start=1):
         rows, columns = np.nonzero(turned.labels == number)
         assert (rows.min(), columns.min(), rows.max() + 1, columns.max() + 1) == (y0, x0, y1, x1)
-    assert_array_equal(mirrored(turned).labels, labelled.labels)
+    assert_array_equal(mirrored(turned, axis).labels, labelled.labels)
+    assert_array_equal(mirrored(turned, axis).boxes, labelled.boxes)
+
+
+def test_blocks_to_ignore_are_marked_as_such_for_the_loss(tmp_path):
+    """COCO's `ignore` and `iscrowd`: -1 where a block counts 1 and an empty place 0."""
+    folder = make_set(tmp_path, 1, 4, blocks=3)
+    path = folder / "annotations.json"
+    content = json.loads(path.read_text())
+    content["annotations"][0]["ignore"] = 1
+    content["annotations"][1]["iscrowd"] = 1
+    path.write_text(json.dumps(content))
+    labelled = CocoFolder(folder).labelled(0)
+    assert labelled.ignored.tolist() == [True, True, False]
+    side = labelled.difference.shape[0]
+    assert network_input(labelled, DetectorConfig(image_px=side, most_blocks=4))["valid"].tolist() == [-1, -1, 1, 0]
 
 
 @pytest.mark.parametrize(("shape", "count"), [((512, 512), 1), ((300, 200), 1), ((513, 512), 2), ((1024, 700), 3 * 2)])

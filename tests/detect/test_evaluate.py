@@ -79,11 +79,24 @@ def test_files_by_name_and_tables(truth, found, tmp_path):
     }
     (tmp_path / "found.json").write_text(json.dumps(renamed))
     assessment = assess(tmp_path, tmp_path / "found.json", ["noise"])
-    assert [score.group for score in assessment.scores[::6]] == ["all", "noise high", "noise low"]
+    assert [score.group for score in assessment.scores[::6]] == 2 * ["all", "noise high", "noise low"]
+    assert [score.kind for score in assessment.scores[::18]] == ["segm", "bbox"]
     assert assessment.scores[0].true_positives == 2
     assert "57.1 %" in as_text(assessment)
     write(assessment, tmp_path / "scores")
-    assert len((tmp_path / "scores" / "scores.csv").read_text().splitlines()) == 1 + 18
+    assert len((tmp_path / "scores" / "scores.csv").read_text().splitlines()) == 1 + 2 * 18
+
+
+def test_the_tables_say_how_many_blocks_stand_out_where_the_truth_knows(truth, found, tmp_path):
+    assert np.isnan(evaluate(truth, found)[0].stand_out)
+    for block, ratio in zip(truth["annotations"], (9.0, 4.0, None), strict=True):
+        block["signal_to_noise"] = ratio
+    assert evaluate(truth, found)[0].stand_out == 0.5
+    (tmp_path / "annotations.json").write_text(json.dumps(truth))
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    lines = as_text(assess(tmp_path, tmp_path / "found.json")).splitlines()
+    assert lines.count("blocks that stand out from the noise (S/N > 4): 50.0 %") == 1
+    assert [line for line in lines if line.startswith("all")] == ["all, IoU of masks", "all, IoU of boxes"]
 
 
 @pytest.mark.parametrize(
@@ -113,5 +126,5 @@ def test_the_tables_have_the_confidences_that_were_asked_for(truth, found, tmp_p
     (tmp_path / "annotations.json").write_text(json.dumps(truth))
     (tmp_path / "found.json").write_text(json.dumps(found))
     assessment = assess(tmp_path, tmp_path / "found.json", confidences=(0.4, 0.995))
-    assert [score.confidence for score in assessment.scores] == [0.4, 0.4, 0.995, 0.995]
+    assert [score.confidence for score in assessment.scores[:4]] == [0.4, 0.4, 0.995, 0.995]
     assert as_text(assessment).splitlines()[1].split() == ["confidence", "0.40", "0.40", "0.995", "0.995"]

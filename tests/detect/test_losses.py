@@ -6,7 +6,7 @@ import keras
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detection.boxes import anchors, encode
+from pipeline.detection.boxes import anchors, encode, share_inside
 from pipeline.detection.config import HeadConfig, ProposalConfig
 from pipeline.detection.losses import binary_cross_entropy, cross_entropy, smooth_l1
 from pipeline.detection.targets import anchor_targets, box_targets, mask_targets
@@ -53,6 +53,25 @@ def test_anchors_near_a_block_and_the_nearest_are_positive():
     negative = np.asarray(found.negative)[0][np.asarray(found.negative_weight)[0] > 0]
     assert not set(negative) & set(positive)
     assert len(negative) + len(positive) == 64
+
+
+def test_in_a_block_to_ignore_nothing_is_sampled():
+    """COCO's crowd: what lies in it by half or more of itself is neither block nor background."""
+    config = ProposalConfig(sampled_anchors=512)
+    places = anchors(64, 64, STRIDES, config.anchor_sizes_px, config.anchor_ratios)
+    blocks = np.array([[[4, 4, 40, 40], [48, 48, 60, 60]]], np.float32)
+    seed = keras.random.SeedGenerator(1)
+    found = anchor_targets(places, blocks, np.array([[-1, 1]], np.float32), config, seed)
+    sampled = np.asarray(found.positive)[0][np.asarray(found.positive_weight)[0] > 0]
+    negative = np.asarray(found.negative)[0][np.asarray(found.negative_weight)[0] > 0]
+    inside = np.asarray(share_inside(places, blocks[0]))[:, 0]
+    assert len(negative) > 0
+    assert inside[negative].max() < 0.5
+    assert inside[sampled].max() < 0.5
+    proposals = np.array([[[6, 6, 38, 38], [48, 48, 60, 61], [2, 44, 20, 60]]], np.float32)
+    chosen = box_targets(proposals, blocks, np.array([[-1, 1]], np.float32), HeadConfig(sampled_proposals=12), seed)
+    boxes = np.asarray(chosen.boxes)[0][np.asarray(chosen.weight)[0] > 0]
+    assert sorted(boxes[:, 0].tolist()) == [2, 48, 48]
 
 
 def test_an_image_without_blocks_gives_background_alone():

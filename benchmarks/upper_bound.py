@@ -1,0 +1,92 @@
+"""What any detector could find: share of blocks with a matched-filter signal-to-noise ratio above 4, by way and placement.
+
+    python benchmarks/upper_bound.py [--width 24 --height 14] [--write]
+
+A Glendale wall, blocks as in configs/datasets/detector_test.yaml, seen by the stereo pair; noise of 2.5, 5 and 7.5 cm. Beside the
+shares: median depth of a niche (rock removed over its outline) and the share of its bounding box that it fills. --write puts the
+table into docs/detector.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.change.annotate import STANDS_OUT, AnnotationConfig, block_annotations
+from pipeline.config.bundled import bundled_config
+from pipeline.config.simulation import SimulationConfig
+from pipeline.dataset.config import load_dataset_config
+from pipeline.dataset.epoch import with_count
+from pipeline.dataset.plan import planned_epochs, simulation_of
+from pipeline.formats.atomic import write_text
+from pipeline.report.progress import Progress
+from pipeline.run.epoch import observe_epoch, observe_reference
+from pipeline.run.site import prepare_site
+from scene.keyed_random import KeyedRandom
+
+DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
+MARKS = "<!-- bound -->", "<!-- end of bound -->"
+WALL = "glendale-b"
+WAYS = (("direct", "medium", "relief"), ("vertices", "medium", "relief"), ("vertices", "medium", "mean_surface"))
+"""Reconstruction, depth map, placement."""
+
+
+def rows(width_m: float, height_m: float) -> Iterator[str]:
+    yield "| reconstruction | placement | size | 2.5 cm | 5 cm | 7.5 cm | median depth | niche / box |"
+    yield "|---|---|---|---|---|---|---|---|"
+    config = load_dataset_config(bundled_config("datasets", "detector_test"))
+    epochs = [each for each in planned_epochs(config) if (each.wall, each.sensor, each.number) == (WALL, "stereo", 1)]
+    for reconstruction, depth_map, placement in WAYS:
+        for size in config.sizes:
+            shares, depths, filled = [], [], []
+            for epoch in (each for each in epochs if each.size == size):
+                simulation = simulation_of(config, epoch)
+                wall = simulation.wall.model_copy(update={"width_m": width_m, "height_m": height_m})
+                rockfall = simulation.rockfall.model_copy(update={"placement": placement})
+                way = {"wall": wall, "rockfall": rockfall, "reconstruction": reconstruction, "depth_map": depth_map}
+                found = observed(simulation.model_copy(update=way), config.sizes[size].blocks_per_m2)
+                shares.append(f"{100 * np.mean(np.array(found[0]) > STANDS_OUT):.0f} %")
+                depths += found[1]
+                filled += found[2]
+            name = f"{reconstruction}, {depth_map}" if reconstruction == "direct" else reconstruction
+            figures = f"{100 * np.median(depths):.1f} cm | {100 * np.mean(filled):.0f} %"
+            yield f"| {name} | {placement} | {size} | {' | '.join(shares)} | {figures} |"
+
+
+def observed(config: SimulationConfig, blocks_per_m2: float) -> tuple[list[float], list[float], list[float]]:
+    """Of each block of one epoch the signal-to-noise ratio, the niche's depth, m, and the share of its box that it fills."""
+    random, progress = KeyedRandom(config.seed), Progress()
+    site = prepare_site(config, "stereo", random)
+    reference = observe_reference(config, site, random, progress)
+    grid = reference.raster.grid
+    count = max(1, round(blocks_per_m2 * grid.width * grid.height * grid.gsd**2))
+    epoch = observe_epoch(with_count(config, count), site, reference, 1, random, progress)
+    ratios = [block["signal_to_noise"] or 0.0 for block in epoch.blocks]
+    shown = list(block_annotations(epoch.raster.block, AnnotationConfig(minimum_area_px=1)))
+    depths = [epoch.blocks[each["block"] - 1]["volume_m3"] / (each["area"] * grid.gsd**2) for each in shown]
+    return ratios, depths, [each["area"] / (each["bbox"][2] * each["bbox"][3]) for each in shown]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--width", type=float, default=24.0)
+    parser.add_argument("--height", type=float, default=14.0)
+    parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
+    arguments = parser.parse_args()
+    table = []
+    for row in rows(arguments.width, arguments.height):
+        print(row, flush=True)
+        table.append(row)
+    if arguments.write:
+        first, last = MARKS
+        text = "\n".join(table)
+        document = re.sub(f"{first}.*{last}", lambda _: f"{first}\n{text}\n{last}", DOCUMENT.read_text(), flags=re.DOTALL)
+        write_text(DOCUMENT, document)
+
+
+if __name__ == "__main__":
+    main()

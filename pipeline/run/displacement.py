@@ -1,0 +1,71 @@
+"""How far an epoch's map is displaced: what carries the outlines of the carved niches to where sensor and ICP put them.
+
+A label is that of the carved wall's face seen along -z. The sensor's samples tell how far the map is displaced: x and y of
+what was recorded and registered, minus where it was. Averaged over cells of some hundred samples this is smooth, and free of
+white noise that would fray the outlines of small niches; a pixel takes the label of the place that it came from.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.registration.register import Registration
+from scene.grid import Grid
+from scene.mesh import FloatArray
+from sensors.observation import Observation
+
+_CELL_M = 0.5
+"""Side of the cells that displacements are averaged over, where samples are dense enough."""
+_LEAST_SAMPLES = 30
+_OUTLIER = 6.0
+"""Samples displaced by more than this many NMAD from the median met another surface than the one they are beside."""
+
+
+def displacement(observations: tuple[Observation, ...], registration: Registration | None, grid: Grid) -> FloatArray:
+    """(h, w, 2) x and y of the map minus the truth at the pixels of `grid`, m; 0 where the samples do not know it."""
+    samples = [_samples(each, registration) for each in observations]
+    place, offset = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    result = np.zeros((*grid.shape, 2))
+    if len(place) == 0:
+        return result
+    area = grid.width * grid.height * grid.gsd**2
+    side = max(_CELL_M, np.sqrt(_LEAST_SAMPLES * area / len(place)))
+    columns, rows = (int(np.ceil(size * grid.gsd / side)) for size in (grid.width, grid.height))
+    column = np.clip(grid.columns(place[:, 0]) * grid.gsd / side, 0, columns - 1).astype(np.int64)
+    row = np.clip(grid.rows(place[:, 1]) * grid.gsd / side, 0, rows - 1).astype(np.int64)
+    cell = row * columns + column
+    count = np.bincount(cell, minlength=rows * columns).reshape(rows, columns)
+    x, y = np.meshgrid(*((np.arange(size) + 0.5) * grid.gsd / side - 0.5 for size in (grid.width, grid.height)))
+    for axis in range(2):
+        total = np.bincount(cell, offset[:, axis], rows * columns).reshape(rows, columns)
+        mean = _filled(np.asarray(total, dtype=np.float64), count)
+        maps = x.astype(np.float32), y.astype(np.float32)
+        result[..., axis] = cv2.remap(mean.astype(np.float32), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return result
+
+
+def _samples(seen: Observation, registration: Registration | None) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) places of the samples in the map, m, and how far each is displaced, without outliers."""
+    if seen.offset is None:
+        return np.empty((0, 2)), np.empty((0, 2))
+    points, offset = seen.points[seen.valid], seen.offset[seen.valid].astype(np.float64)
+    if registration is not None:
+        moved = registration.apply(points)
+        offset += (moved - points)[:, :2]
+        points = moved
+    from_median = np.abs(offset - np.median(offset, axis=0))
+    near = (from_median <= _OUTLIER * 1.4826 * np.median(from_median, axis=0) + 1e-9).all(axis=1)
+    return points[near, :2], offset[near]
+
+
+def _filled(total: FloatArray, count: NDArray[np.signedinteger]) -> FloatArray:
+    """Means of cells; one with too few samples takes the nearest one's."""
+    from scipy import ndimage
+
+    known = count >= _LEAST_SAMPLES / 3
+    if not known.any():
+        return np.full(total.shape, total.sum() / max(int(count.sum()), 1))
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray((total / np.maximum(count, 1))[tuple(nearest)])

@@ -1,0 +1,54 @@
+"""The first epoch: how it is observed, and what later ones are registered to: its surface, or the wall as it really is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from pipeline.config.simulation import SimulationConfig
+from pipeline.registration.closest_points import ReferenceSurface
+from pipeline.registration.register import register_to
+from pipeline.run.site import Site
+from scene.keyed_random import KeyedRandom
+from scene.mesh import TriangleMesh
+from sensors.observation import Sensor
+from sensors.stereo import StereoPair
+from sensors.stereo_matched import MatchedStereoPair
+from sensors.tls import LaserScanner
+
+
+def reference_sensor(config: SimulationConfig, site: Site) -> Site:
+    """The site as the reference epoch is observed from it: without the sensor's noise where the config says so."""
+    if config.noisy_reference:
+        return site
+    sensor = site.sensor
+    if isinstance(sensor, MatchedStereoPair):
+        quiet: Sensor = replace(sensor, pair=_quiet(sensor.pair))
+    elif isinstance(sensor, StereoPair):
+        quiet = _quiet(sensor)
+    elif isinstance(sensor, LaserScanner):
+        quiet = replace(sensor, model=sensor.model.without_noise())
+    else:
+        raise TypeError(f"neither a scanner nor a pair: {type(sensor).__name__}")
+    further = tuple(replace(each, model=each.model.without_noise()) for each in site.further_stations)
+    return replace(site, sensor=quiet, further_stations=further)
+
+
+def _quiet(pair: StereoPair) -> StereoPair:
+    return replace(pair, model=pair.model.without_noise())
+
+
+def reference_and_target(
+    config: SimulationConfig, surface: TriangleMesh, wall: TriangleMesh, random: KeyedRandom
+) -> tuple[TriangleMesh, ReferenceSurface | None]:
+    """The reference surface, wall frame, and the target of the later epochs' ICP, None where the config has none.
+
+    surface: as reconstructed; wall: as it really is. With `icp_target: true_wall` (thesis 3.6) the reference itself is registered
+    to the wall too, else its own misorientation would stand in every difference map.
+    """
+    if config.icp is None:
+        return surface, None
+    if config.icp_target == "reference":
+        return surface, ReferenceSurface.build(surface.vertices, surface.vertex_normals())
+    target = ReferenceSurface.build(wall.vertices, wall.vertex_normals())
+    found = register_to(target, surface.vertices, config.icp, random)
+    return surface.with_vertices(found.apply(surface.vertices)), target
