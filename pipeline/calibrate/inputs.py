@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from pipeline.calibrate.windows import Windows, choose_windows, unchanged
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.measurement import FILE, Measurement, read_measurement
+from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
 from pipeline.run.site import Site, prepare_site
 from scene.errors import InputError
@@ -53,7 +54,7 @@ class Material:
 
 def config_of(paths: Sequence[Path]) -> Path | None:
     """The run.json among the inputs' folders, which is the config of a simulated run; None where there is none."""
-    return next((path / "run.json" for path in paths if (path / "run.json").is_file()), None)
+    return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 
 
 def sensor_of(paths: Sequence[Path], config: SimulationConfig) -> SensorName:
@@ -63,10 +64,8 @@ def sensor_of(paths: Sequence[Path], config: SimulationConfig) -> SensorName:
             raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
         if (path / FILE).is_file():
             return read_measurement(path).sensor
-        if (path / "run.json").is_file():
-            named = json.loads((path / "run.json").read_text()).get("sensor")
-            if named in ("stereo", "tls"):
-                return named
+        if (path / RUN_FILE).is_file():
+            return cast(SensorName, read_run(path / RUN_FILE, "run it again with simulate")["sensor"])
     names = config.sensor_names()
     if len(names) == 1:
         return names[0]

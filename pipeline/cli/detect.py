@@ -49,7 +49,11 @@ def run(arguments: argparse.Namespace) -> Answer:
     out = arguments.out or new_folder(Path("runs"), "detect")
     if arguments.model != BASELINE:
         from pipeline.detect.keras_backend import keras_ready
+        from pipeline.detect.run import detector_folder, find_inputs
+        from pipeline.detect.weights import check_detector
 
+        check_detector(detector_folder(arguments.model))  # a mistake there, or in the inputs, should not wait for TensorFlow
+        find_inputs(arguments.inputs)
         keras_ready()
     with shown_progress(quiet=arguments.quiet) as progress:
         found = detect(arguments.model, arguments.inputs, out, confidences, not arguments.no_pictures, progress)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -105,7 +104,7 @@ def _whole(name: str, overrides: Sequence[str], seed: int | None) -> list[Contes
     config = load_config(path, overrides, None, seed)
     sensors = config.sensor_names()
     if path.suffix == ".json":
-        recorded = json.loads(path.read_text(encoding="utf-8")).get("sensor")
+        recorded = load_yaml(path).get("sensor")
         sensors = (recorded,) if recorded in ("stereo", "tls") else sensors[:1]
     stem = path.parent.name if path.name == "run.json" else path.stem
     return [Contestant(f"{stem}_{sensor}" if len(sensors) > 1 else stem, sensor, config) for sensor in sensors]

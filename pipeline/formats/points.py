@@ -11,6 +11,7 @@ from pipeline.formats.ply import read_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
+from scene.regular_file import check_file
 
 SUFFIXES = (".laz", ".las", ".ply", ".e57", ".xyz", ".txt")
 
@@ -26,7 +27,7 @@ def read_points(path: Path) -> PointCloud:
     infinite, as some programs write what did not return. Raises InputError for a format that is not known, whatever is wrong in
     the file, and coordinates that are none.
     """
-    cloud = _read(path)
+    cloud = _read(check_file(path))
     if not len(cloud.points):
         raise InputError("holds no points", where=str(path), remedy="export it again")
     known = np.where(np.isfinite(cloud.points), np.abs(cloud.points), 0.0)
