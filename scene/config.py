@@ -55,7 +55,8 @@ def load_yaml(path: Path) -> Any:
     if path.suffix == ".json":
         return read_json(path)
     try:
-        return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, remedy="check the path, or give it as .json"))
+        remedy = "check the path and the permissions"
+        return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, remedy=remedy, smaller="give it as .json, which is fast"))
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
         raise InputError(f"is not valid YAML: {problem}", where=str(path)) from None

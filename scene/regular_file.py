@@ -13,9 +13,11 @@ MOST_TEXT_BYTES = 512_000_000
 """Of a text file that is read into memory as a whole."""
 
 
-def check_file(path: Path, *, most_bytes: int | None = None, remedy: str = "check the path") -> Path:
+def check_file(
+    path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str = "give a smaller one"
+) -> Path:
     """`path` itself, if it is a file with data in it or none; InputError for what is not there, a folder, a pipe, a device, a
-    loop of links, a name that cannot be, and a file of more than `most_bytes`."""
+    loop of links, a name that cannot be, and a file of more than `most_bytes`, whose remedy is `smaller`."""
     where = str(path)
     try:
         state = path.stat()
@@ -30,13 +32,15 @@ def check_file(path: Path, *, most_bytes: int | None = None, remedy: str = "chec
         )
     if most_bytes is not None and state.st_size > most_bytes:
         problem = f"has {state.st_size / 1e6:,.0f} MB"
-        raise InputError(problem, where=where, allowed=f"up to {most_bytes / 1e6:,.0f} MB", remedy=remedy)
+        raise InputError(problem, where=where, allowed=f"up to {most_bytes / 1e6:,.0f} MB", remedy=smaller)
     return path
 
 
-def read_text(path: Path, *, most_bytes: int = MOST_TEXT_BYTES, remedy: str = "check the path") -> str:
+def read_text(
+    path: Path, *, most_bytes: int = MOST_TEXT_BYTES, remedy: str = "check the path", smaller: str = "give a smaller one"
+) -> str:
     """The text of a file in UTF-8; raises InputError as `check_file` does, and for other encodings."""
-    check_file(path, most_bytes=most_bytes, remedy=remedy)
+    check_file(path, most_bytes=most_bytes, remedy=remedy, smaller=smaller)
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:

@@ -139,7 +139,6 @@ _TLS: dict[str, Change] = {
     "model effect 1e300": _effects({"name": "tls.range_offset", "offset_m": 1e300}),
     "model effect 1e6": _effects({"name": "tls.range_offset", "offset_m": 1e6}),
     "model effect scale -1": _effects({"name": "tls.range_scale", "scale_ppm": -1e6}),
-    "model effect twice": _effects(*[{"name": "tls.range_offset", "offset_m": 0.001}] * 2),
     "model 10000 effects": _effects(*[{"name": "tls.range_offset", "offset_m": 1e-6}] * 10_000),
     "model effects a mapping": put(MODEL, effects={"name": "tls.range_offset"}),
     "model bomb": text(MODEL, bomb()),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,19 +56,27 @@ def config_of(paths: Sequence[Path]) -> Path | None:
     return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 
 
-def sensor_of(paths: Sequence[Path], config: SimulationConfig) -> SensorName:
-    """Which sensor measured. Raises InputError where neither the inputs nor the config say."""
+def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorName | None) -> SensorName:
+    """Which sensor measured. Raises InputError where the inputs say another than `wanted` (None: any), or nobody says."""
     for path in paths:
         if not path.exists():
             raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
         if (path / FILE).is_file():
-            return read_measurement(path).sensor
+            return _agreed(read_measurement(path).sensor, wanted, path)
         if (path / RUN_FILE).is_file():
-            return cast(SensorName, read_run(path / RUN_FILE, "run it again with simulate")["sensor"])
+            return _agreed(read_run(path / RUN_FILE, "run it again with simulate")["sensor"], wanted, path)
+    if wanted is not None:
+        return wanted
     names = config.sensor_names()
     if len(names) == 1:
         return names[0]
     raise InputError("the maps may be of either sensor", where="calibrate", remedy="add --sensor stereo or --sensor tls")
+
+
+def _agreed(found: SensorName, wanted: SensorName | None, path: Path) -> SensorName:
+    if wanted not in (None, found):
+        raise InputError(f"was measured by {found}, and --sensor is {wanted}", where=str(path), remedy="leave --sensor out")
+    return found
 
 
 def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Material:

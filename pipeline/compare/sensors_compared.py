@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 from pipeline.config.bundled import bundled_config, configs_folder
 from pipeline.config.presets import is_path
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
+from pipeline.formats.result_records import RUN_FILE, read_run
 from scene.config import load_yaml, parse
 from scene.errors import InputError, nearest
 
 _SCENE = ("seed", "wall", "rockfall", "wetness", "texture", "illumination", "difference")
 """What all share: taken from the first."""
+_LONGEST_NAME = 60
 _KINDS = ("", "sites", "scanners", "noise")
 """Subfolders of configs/ whose files can be named."""
 
@@ -61,10 +64,10 @@ def contestants(
 
 def _check_given_once(names: Sequence[str]) -> None:
     """A sensor beside itself says nothing: the same epochs, to the byte."""
-    given: dict[Path, str] = {}
+    given: dict[str, str] = {}
     for name in names:
         path = Path(name) / "run.json" if Path(name).is_dir() else Path(name)
-        file = (path if path.exists() or is_path(name) else _bundled(name)).resolve()
+        file = os.path.realpath(path if path.exists() or is_path(name) else _bundled(name))  # Path.resolve raises at a loop
         if file in given:
             as_what = "" if given[file] == name else f", as {given[file]} and as {name}"
             remedy = "name each sensor once; a copy of the file under another name can have other settings"
@@ -96,17 +99,18 @@ def _whole(name: str, overrides: Sequence[str], seed: int | None) -> list[Contes
     """The sensors of a config file, a run or a bundled config."""
     path = Path(name)
     if path.is_dir():
-        path = path / "run.json"
-        if not path.is_file():
-            raise InputError("holds no run.json", where=name, remedy="name a run's folder or a config file")
+        path = path / RUN_FILE
+        if not path.exists():
+            raise InputError(f"holds no {RUN_FILE}", where=name, remedy="name a run's folder or a config file")
+        read_run(path, "name a config file")
     elif not path.is_file() and not is_path(name):
         path = _bundled(name)
     config = load_config(path, overrides, None, seed)
     sensors = config.sensor_names()
     if path.suffix == ".json":
-        recorded = load_yaml(path).get("sensor")
-        sensors = (recorded,) if recorded in ("stereo", "tls") else sensors[:1]
-    stem = path.parent.name if path.name == "run.json" else path.stem
+        recorded = load_yaml(path)
+        sensors = (read_run(path, "name a config file")["sensor"],) if "config" in recorded else sensors[:1]
+    stem = (path.parent.name if path.name == RUN_FILE else path.stem)[:_LONGEST_NAME]
     return [Contestant(f"{stem}_{sensor}" if len(sensors) > 1 else stem, sensor, config) for sensor in sensors]
 
 
