@@ -89,6 +89,8 @@ def _require_distributed(where: str) -> None:
 def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:
     """The index in `orders` of each that is done, and what it took."""
     with ExitStack() as stack:
+        if not scheduler:
+            stack.enter_context(standstill.workers_watched(standstill.STUCK_S))
         cluster = None if scheduler else _local(stack, count)
         client = _client(stack, cluster) if cluster else _remote(stack, scheduler)
         threads = 0 if scheduler else _threads_each(count)
@@ -108,10 +110,8 @@ def _results(
     """Each future with its result as it is done; nobody keeps it, as Dask would make the epochs of a dead worker again for it."""
     from distributed import KilledWorker, wait
 
-    pending, at_work, pulses = set(futures), time.monotonic(), standstill.Pulses(standstill.STUCK_S)
+    pending, at_work = set(futures), time.monotonic()
     while pending:
-        if cluster:
-            pulses.look([nanny.pid for nanny in list(cluster.workers.values())])
         try:
             done = wait(pending, timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
             results = [(future, future.result(timeout=_CONNECT_S)) for future in done]

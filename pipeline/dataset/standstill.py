@@ -1,7 +1,7 @@
 """Workers that live and do nothing: a deadlock in native code, a stopped process. They are ended, another one begins anew.
 
 What works takes processor time, and be it a hundredth of a second. Whoever cannot look at itself, as its interpreter stands too,
-is looked at by the job (`Pulses`); within a worker the threads that only wait for messages do not count (`ended_if_stuck`).
+is looked at by the job (`workers_watched`); within a worker the threads that wait for messages do not count (`ended_if_stuck`).
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -55,26 +55,33 @@ def ended_if_stuck(seconds: float = STUCK_S) -> Iterator[None]:
         thread.join()
 
 
-@dataclass
-class Pulses:
-    """The processor time of processes, looked at now and then; those that stand still for `seconds` are killed."""
+@contextmanager
+def workers_watched(seconds: float = STUCK_S) -> Iterator[None]:
+    """Kill the worker processes that are started in the block and take no processor time for so long."""
+    import psutil
 
-    seconds: float = STUCK_S
-    _known: dict[int, _Pulse] = field(default_factory=dict)
+    before = {child.pid for child in psutil.Process().children()}
+    known: dict[int, _Pulse] = {}
+    over = threading.Event()
 
-    def look(self, processes: Iterable[int | None]) -> None:
-        """Kill those that stand still, and say so."""
-        import psutil
+    def watch() -> None:
+        while not over.wait(seconds / _LOOKS):
+            for child in psutil.Process().children():
+                with suppress(psutil.Error):  # is gone
+                    used = sum(child.cpu_times()[:2])
+                    is_worker = child.pid not in before and "spawn_main" in " ".join(child.cmdline())
+                    if is_worker and known.setdefault(child.pid, _Pulse()).stands(used, seconds):
+                        _tell(seconds)
+                        del known[child.pid]
+                        child.kill()
 
-        for process in processes:
-            try:
-                used = sum(psutil.Process(process).cpu_times()[:2]) if process else 0.0
-                if process and self._known.setdefault(process, _Pulse()).stands(used, self.seconds):
-                    _tell(self.seconds)
-                    del self._known[process]
-                    psutil.Process(process).kill()
-            except psutil.Error:  # is gone
-                continue
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @dataclass

@@ -225,9 +225,9 @@ def test_clicks_and_zooms() -> None:
     [
         (lambda _: Path("/nowhere"), "there is no such folder"),
         (lambda folder: folder, "holds nothing to look at"),
-        (lambda folder: _written(folder, "run.json", "{"), "is not the record of a finished run"),
-        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "complete": false}'), "not the record of a finished run"),
-        (lambda folder: _written(folder, "gap.json", "[]"), "is no gap.json"),
+        (lambda folder: _written(folder, "run.json", "{"), "run.json: is not JSON"),
+        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "holds no finished epoch"),
+        (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: expected a mapping"),
         (lambda folder: _written(folder, "annotations.json", "{}"), "is no COCO annotation file"),
     ],
 )
@@ -279,11 +279,8 @@ def test_a_name_out_of_a_file_stays_text(run: Path, tmp_path: Path) -> None:
     record["wall"]["name"] = EVIL
     write_json(tmp_path / "run" / "run.json", record)
     app = make_app(open_results(tmp_path / "run"), TOKEN)
-    page = (
-        app.server.test_client()
-        .get("/", headers={"Host": "127.0.0.1", "Cookie": f"{cookie_name('127.0.0.1')}={TOKEN}"})
-        .get_data(as_text=True)
-    )
+    client = app.server.test_client()
+    page = client.get(f"/?token={TOKEN}", headers={"Host": "127.0.0.1"}, follow_redirects=True).get_data(as_text=True)
     (title,) = re.findall(r"<title>(.*?)</title>", page)
     assert html.unescape(title) == f"scarpsim: run: laser scanner, {EVIL}"
     assert "<script>alert" not in page
