@@ -41,10 +41,14 @@ AxisDistributions = Annotated[
 """One distribution from which each axis draws its own value, or a list of three, one per axis (x, y, z)."""
 
 
+MOST_BLOCKS = 20_000
+"""Of an epoch; placing them takes some twenty seconds, carving minutes."""
+
+
 class RockfallConfig(Config):
     """How many blocks fall, how they look and where they may lie."""
 
-    count: int = Field(40, ge=1, description="number of blocks")
+    count: int = Field(40, ge=1, le=MOST_BLOCKS, description="number of blocks")
     shape: Literal["cube", "sphere", "mixed"] = Field("mixed", description="primitive; mixed draws one for each block")
     size_m: AxisDistributions = Field(
         Gaussian(mean=0.4, sigma=0.1, minimum=0.15), description="lengths of a block's three axes; a list gives each axis its own"
@@ -139,7 +143,8 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
     Raises InputError where blocks are larger than the wall or find no room.
     """
     caster = caster or RayCaster(mesh)
-    solids = [_shaped(config, random.child("block", index)) for index in range(config.count)]
+    with np.errstate(over="ignore", invalid="ignore"):  # of sizes that are no block's, which is said next
+        solids = [_shaped(config, random.child("block", index)) for index in range(config.count)]
     _require_fit(solids, mesh)
     zone = safe_zone(caster, config.safe_zone_offset_m)
     search = _Search(config, zone, solids, random)

@@ -14,12 +14,13 @@ class InputError(ValueError):
 
     def __init__(self, what: str, *, where: str = "", allowed: str = "", remedy: str = "") -> None:
         self.what, self.where, self.allowed, self.remedy = what, where, allowed, remedy
+        where, what, allowed, remedy = (one_line(part) for part in (where, what, allowed, remedy))
         parts = [f"{where}: {what}" if where else what]
         if allowed:
             parts.append(f"allowed: {allowed}")
         if remedy:
             parts.append(remedy)
-        super().__init__(" ".join("; ".join(parts).splitlines()))
+        super().__init__("; ".join(parts))
 
 
 class OutsideError(RuntimeError):
@@ -27,6 +28,16 @@ class OutsideError(RuntimeError):
 
     Commands print it as one message and exit with 1.
     """
+
+
+_LONGEST = 600
+"""Characters of a part of a message: a name or a value from a file can have any length."""
+
+
+def one_line(part: str) -> str:
+    """On one line, without control characters (a terminal would obey them), its middle left out where it is long."""
+    line = "".join(each if each.isprintable() else "\ufffd" for each in " ".join(part.splitlines()))
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 3 :]}"
 
 
 def nearest(word: str, words: Iterable[str]) -> str:

@@ -15,6 +15,7 @@ from scene.config import Config
 from scene.errors import InputError, nearest
 from scene.mesh import TriangleMesh
 from scene.ply import read_elements
+from scene.regular_file import check_file
 from scene.rounding import check_rounding
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
@@ -105,8 +106,9 @@ def _extent(mesh: TriangleMesh) -> float:
 def _read(path: Path) -> TriangleMesh:
     """The file's triangles as they are, in the file's unit; all meshes of a scene joined."""
     where, kind = str(path), _format(path)
-    if not path.is_file():
+    if not path.exists():
         raise InputError("there is no such file", where=where, remedy="check the path")
+    check_file(path)
     if kind == "ply" and (plain := _plain_ply(path)) is not None:
         return plain
     import trimesh

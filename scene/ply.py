@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.errors import InputError
+from scene.regular_file import check_file
 
 _LONGEST_HEADER = 65536
 _TYPES = {
@@ -37,6 +38,7 @@ def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
 
     Raises InputError for a missing or damaged file and for lists of different lengths.
     """
+    check_file(path)
     try:
         with path.open("rb") as file:
             order, elements = _header(file)

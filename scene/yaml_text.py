@@ -26,6 +26,10 @@ _SCALARS = {
 }
 
 
+_MOST_MERGED = 10_000
+_LONGEST_NUMBER = 400
+
+
 class _Loader(yaml.SafeLoader):
     """SafeLoader with the core schema's scalars."""
 
@@ -33,15 +37,27 @@ class _Loader(yaml.SafeLoader):
 
     def integer(self, node: yaml.ScalarNode) -> int:
         text = self.construct_scalar(node)
+        if len(text) > _LONGEST_NUMBER:
+            raise _wrong(node, f"a number of {len(text):,} digits")
         return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
 
     def mapping(self, node: yaml.MappingNode) -> dict[Hashable, Any]:
         seen: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"the key '{key.value}' stands there twice", key.start_mark)
+                raise _wrong(key, f"the key '{key.value:.80}' stands there twice")
             seen.add(str(key.value))
         return self.construct_mapping(node, deep=True)
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """As PyYAML does, which puts what `<<` names into the mapping: a few lines can ask for any number of keys."""
+        super().flatten_mapping(node)
+        if len(node.value) > _MOST_MERGED:
+            raise _wrong(node, f"more than {_MOST_MERGED:,} keys in one mapping")
+
+
+def _wrong(node: yaml.Node, problem: str) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
 for _tag, (_pattern, _first) in _SCALARS.items():

@@ -13,7 +13,7 @@ The equations use arithmetic only, so they serve NumPy arrays and Dr.Jit arrays 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -24,7 +24,10 @@ from scene.errors import InputError
 from scene.frame import WallFrame
 from scene.mesh import FloatArray
 
-Vector3 = tuple[float, float, float]
+_FARTHEST_M = 1e8
+"""No coordinate system of a survey reaches farther."""
+Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Side = Literal["left", "right", "both"]
 

@@ -32,6 +32,9 @@ from sensors.effects.regularization_noise import RegularizationNoise
 from sensors.effects.tangential_distortion import TangentialDistortion
 from sensors.pulses import PulseGeometry
 
+MOST_EFFECTS = 100
+"""Each adds to the kernel that observes, which is compiled anew."""
+
 
 class TlsNoise(Config):
     """A laser scanner's white noise, as a datasheet states it."""
@@ -46,7 +49,9 @@ class TlsModel(Config):
 
     sensor: Literal["tls"] = "tls"
     noise: TlsNoise = TlsNoise()
-    effects: tuple[TlsEffect, ...] = Field((), description="effects of the catalogue beyond the base noise")
+    effects: tuple[TlsEffect, ...] = Field(
+        (), max_length=MOST_EFFECTS, description="effects of the catalogue beyond the base noise"
+    )
 
     @model_validator(mode="after")
     def _one_beam(self) -> TlsModel:
@@ -163,7 +168,9 @@ class StereoModel(Config):
 
     sensor: Literal["stereo"] = "stereo"
     noise: StereoNoise = StereoNoise()
-    effects: tuple[StereoEffect, ...] = Field((), description="effects of the catalogue beyond the base noise")
+    effects: tuple[StereoEffect, ...] = Field(
+        (), max_length=MOST_EFFECTS, description="effects of the catalogue beyond the base noise"
+    )
 
     def without_noise(self) -> StereoModel:
         """The same effects alone."""

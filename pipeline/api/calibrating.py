@@ -45,7 +45,7 @@ def calibrate(
     inputs = paths(measured)
     given = config_of(inputs) if config is None else config
     resolved = configure(given, sensor, seed=seed, model=model, **overrides)
-    which = sensor or sensor_of(inputs, resolved)
+    which = sensor_of(inputs, resolved, sensor)
     with python_progress(progress) as shown:
         result = Calibration(fitting.calibrate(resolved, which, inputs, shown, with_greedy=greedy), tuple(inputs))
         if out is not None:

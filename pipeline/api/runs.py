@@ -20,9 +20,9 @@ from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.atomic import new_folder
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.laz import read_laz
+from pipeline.formats.result_records import RUN_FILE
 from pipeline.report.notebook_progress import python_progress
 from pipeline.report.page import millimetres
-from pipeline.run.simulation import RUN_FILE
 from scene.errors import InputError
 from scene.frame import WallFrame
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from pipeline.calibration.windows import Windows, choose_windows, unchanged
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.measurement import FILE, Measurement, read_measurement
+from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
 from pipeline.run.site import Site, prepare_site
 from scene.errors import InputError
@@ -53,24 +53,30 @@ class Material:
 
 def config_of(paths: Sequence[Path]) -> Path | None:
     """The run.json among the inputs' folders, which is the config of a simulated run; None where there is none."""
-    return next((path / "run.json" for path in paths if (path / "run.json").is_file()), None)
+    return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 
 
-def sensor_of(paths: Sequence[Path], config: SimulationConfig) -> SensorName:
-    """Which sensor measured. Raises InputError where neither the inputs nor the config say."""
+def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorName | None) -> SensorName:
+    """Which sensor measured. Raises InputError where the inputs say another than `wanted` (None: any), or nobody says."""
     for path in paths:
         if not path.exists():
             raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
         if (path / FILE).is_file():
-            return read_measurement(path).sensor
-        if (path / "run.json").is_file():
-            named = json.loads((path / "run.json").read_text()).get("sensor")
-            if named in ("stereo", "tls"):
-                return named
+            return _agreed(read_measurement(path).sensor, wanted, path)
+        if (path / RUN_FILE).is_file():
+            return _agreed(read_run(path / RUN_FILE, "run it again with simulate")["sensor"], wanted, path)
+    if wanted is not None:
+        return wanted
     names = config.sensor_names()
     if len(names) == 1:
         return names[0]
     raise InputError("the maps may be of either sensor", where="calibrate", remedy="add --sensor stereo or --sensor tls")
+
+
+def _agreed(found: SensorName, wanted: SensorName | None, path: Path) -> SensorName:
+    if wanted not in (None, found):
+        raise InputError(f"was measured by {found}, and --sensor is {wanted}", where=str(path), remedy="leave --sensor out")
+    return found
 
 
 def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Material:

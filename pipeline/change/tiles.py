@@ -14,11 +14,13 @@ from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import WALL, IntArray
 
+MOST_TILES = 100_000
+
 
 class TileConfig(Config):
     """How a raster is cut."""
 
-    size_px: int = Field(512, ge=1, description="side of a tile")
+    size_px: int = Field(512, ge=8, le=65_536, description="side of a tile")
     overlap_px: int = Field(0, ge=0, description="pixels that neighbouring tiles share; less than size_px")
     minimum_valid_share: float = Field(0.5, ge=0, le=1, description="tiles with a smaller share of pixels with data are left out")
 
@@ -54,11 +56,16 @@ def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: Tile
     """Cut a raster (h, w) with its labels (h, w) row by row, leaving out tiles with too few data.
 
     Every pixel falls into a tile; the last row and column of tiles reach beyond the raster and are filled with NaN, so that all
-    tiles are of one size and, without overlap, no pixel is in two of them. Raises InputError where the shapes differ.
+    tiles are of one size and, without overlap, no pixel is in two of them. Raises InputError where the shapes differ, and for
+    more than MOST_TILES.
     """
     if not values.shape == block.shape == grid.shape:
         raise InputError(f"raster {values.shape}, labels {block.shape} and grid {grid.shape} differ in shape", where="tiles")
     size = config.size_px
+    count = len(starts_of_tiles(grid.height, config)) * len(starts_of_tiles(grid.width, config))
+    if count > MOST_TILES:
+        problem = f"{count:,} tiles of a map of {grid.width} x {grid.height} px"
+        raise InputError(problem, where="tiles", allowed=f"up to {MOST_TILES:,}", remedy="raise size_px or lower overlap_px")
     for row in starts_of_tiles(grid.height, config):
         for column in starts_of_tiles(grid.width, config):
             window = np.s_[row : row + size, column : column + size]

@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     out = empty_folder(arguments.out or new_folder(Path("runs"), "calibrate"))
     path = given or bundled_config("", "demo")
     config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)
-    sensor = arguments.sensor or sensor_of(arguments.measured, config)
+    sensor = sensor_of(arguments.measured, config, arguments.sensor)
     with shown_progress(quiet=arguments.quiet) as progress:
         progress.plan({"report": 5.0})
         result = calibrate(config, sensor, arguments.measured, progress, with_greedy=not arguments.no_greedy)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from pipeline.cli.answer import Answer, recorded
-from pipeline.cli.parser import add_output_options, at_least, one_of
+from pipeline.cli.parser import add_output_options, at_least, between, one_of
 
 SUMMARY = "compare sensors on one wall and the same blocks: noise, level of detection, smallest block, completeness"
 EXAMPLE = """  scarpsim compare my_site.yaml
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sizes-m",
-        type=float,
+        type=between(0.001, 1000.0),
         nargs=2,
         default=(0.05, 0.8),
         metavar=("FIRST", "LAST"),

@@ -49,6 +49,11 @@ def run(arguments: argparse.Namespace) -> Answer:
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
     out = arguments.out or new_folder(Path("runs"), "detect")
     if arguments.model != BASELINE:
+        from pipeline.detection.run import detector_folder, find_inputs
+        from pipeline.detection.weights import check_detector
+
+        check_detector(detector_folder(arguments.model))  # a mistake there, or in the inputs, should not wait for TensorFlow
+        find_inputs(arguments.inputs)
         load_keras(quiet=arguments.quiet)
     with shown_progress(quiet=arguments.quiet) as progress:
         found = detect(arguments.model, arguments.inputs, out, confidences, not arguments.no_pictures, progress)

@@ -13,6 +13,8 @@ SUMMARY = "find the settings of ICP that suit a run, against the true transform"
 EXAMPLE = """  scarpsim icp-study runs/my_site
   scarpsim icp-study my_site.yaml --sensor stereo --epochs 2 --offset-m 0.05 --out study"""
 
+MOST_EPOCHS, MOST_REPEATS = 99, 99
+"""More epochs and draws say nothing new of a setting; each is some forty registrations."""
 MOST_OFFSET_M = 100.0
 """More than any epoch is off that somebody set up with a map in hand, and than ICP could take."""
 
@@ -24,10 +26,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="of a config (default: its first)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument(
-        "--epochs", type=at_least(1, at_most=9999), default=1, metavar="N", help="epochs to register (default: 1)"
+        "--epochs", type=at_least(1, at_most=MOST_EPOCHS), default=1, metavar="N", help="epochs to register (default: 1)"
     )
     parser.add_argument(
-        "--repeats", type=at_least(1, at_most=9999), default=3, metavar="N", help="random subsets for each ratio (default: 3)"
+        "--repeats",
+        type=at_least(1, at_most=MOST_REPEATS),
+        default=3,
+        metavar="N",
+        help="random subsets for each ratio (default: 3)",
     )
     parser.add_argument(
         "--offset-m", type=float, default=0.03, metavar="M", help="put each epoch off by a known motion first (default: 0.03)"

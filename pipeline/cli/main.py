@@ -35,7 +35,7 @@ from pipeline.cli import (
 from pipeline.cli import simulate as simulate_command
 from pipeline.cli.answer import Answer, as_json
 from pipeline.cli.parser import Parser
-from scene.errors import InputError, OutsideError, nearest
+from scene.errors import InputError, OutsideError, nearest, one_line
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 _BAD_PLACES = {
@@ -43,6 +43,9 @@ _BAD_PLACES = {
     errno.EDQUOT: "make room, or choose another folder with --out",
     errno.EACCES: "check the permissions, or choose another folder with --out",
     errno.EROFS: "choose another folder with --out",
+    errno.ENAMETOOLONG: "give a shorter name",
+    errno.ELOOP: "give the file or folder itself",
+    errno.ENOTDIR: "give a path that leads through folders",
 }
 """What a person can do about an operating system's error, by its number."""
 
@@ -164,7 +167,13 @@ def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str
     if isinstance(error, ImportError):
         return f"a library does not load ({error}); `scarpsim doctor` says what is missing", FAILED
     if isinstance(error, OSError) and error.errno in _BAD_PLACES:
-        return f"{error.filename or 'output'}: {error.strerror}; {_BAD_PLACES[error.errno]}", WRONG_INPUT
+        where = one_line(str(error.filename or "output"))
+        return f"{where}: {error.strerror}; {_BAD_PLACES[error.errno]}", WRONG_INPUT
+    if (
+        isinstance(error, MemoryError) or type(error).__name__ == "ResourceExhaustedError"
+    ):  # TensorFlow's, which is not loaded here
+        problem = one_line(str(error)) or "no more is given"
+        return f"needs more memory than there is ({problem}); take larger pixels or steps, or less at a time", WRONG_INPUT
     return _unexpected(error, show=arguments.debug), FAILED
 
 

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="go on with the interrupted run in the folder --out")
     parser.add_argument(
-        "--threads", type=at_least(1), metavar="N", help="threads to use (default: all; the results are the same)"
+        "--threads", type=at_least(1, at_most=1024), metavar="N", help="threads to use (default: all; the results are the same)"
     )
     add_output_options(parser)
 

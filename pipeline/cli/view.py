@@ -18,7 +18,9 @@ _PORT = 8050
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run, a result of scarpsim gap, or a split of a data set")
     parser.add_argument("--detections", type=Path, metavar="FOLDER", help="result of scarpsim detect on the run")
-    parser.add_argument("--port", type=at_least(0), default=_PORT, metavar="N", help="of the page; 0: any (default: %(default)s)")
+    parser.add_argument(
+        "--port", type=at_least(0, at_most=65_535), default=_PORT, metavar="N", help="of the page; 0: any (default: %(default)s)"
+    )
     parser.add_argument("--no-browser", action="store_true", help="only say the address, open no browser")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from pipeline.config.bundled import bundled_config, named_configs
 from pipeline.config.overrides import Override
 from pipeline.config.presets import is_path
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
+from pipeline.formats.result_records import RUN_FILE, read_run
 from scene.config import load_yaml, parse
 from scene.errors import InputError, nearest
 
@@ -20,6 +21,7 @@ Given = str | tuple[str, SimulationConfig]
 Overrides = Sequence[str | Override]
 _SCENE = ("seed", "wall", "rockfall", "wetness", "texture", "illumination", "difference")
 """What all share: taken from the first."""
+_LONGEST_NAME = 60
 _KINDS = ("", "sites", "scanners", "noise")
 """Subfolders of configs/ whose files can be named."""
 
@@ -67,12 +69,12 @@ def contestants(
 
 def _check_given_once(names: Sequence[Given]) -> None:
     """A sensor beside itself says nothing: the same epochs, to the byte."""
-    given: dict[Path, str] = {}
+    given: dict[str, str] = {}
     for name in names:
         if not isinstance(name, str):
             continue
         path = Path(name) / "run.json" if Path(name).is_dir() else Path(name)
-        file = (path if path.exists() or is_path(name) else _bundled(name)).resolve()
+        file = os.path.realpath(path if path.exists() or is_path(name) else _bundled(name))  # Path.resolve raises at a loop
         if file in given:
             as_what = "" if given[file] == name else f", as {given[file]} and as {name}"
             remedy = "name each sensor once; a copy of the file under another name can have other settings"
@@ -113,17 +115,18 @@ def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[Contesta
         return _each_sensor(*name, name[1].sensor_names())
     path = Path(name)
     if path.is_dir():
-        path = path / "run.json"
-        if not path.is_file():
-            raise InputError("holds no run.json", where=name, remedy="name a run's folder or a config file")
+        path = path / RUN_FILE
+        if not path.exists():
+            raise InputError(f"holds no {RUN_FILE}", where=name, remedy="name a run's folder or a config file")
+        read_run(path, "name a config file")
     elif not path.is_file() and not is_path(name):
         path = _bundled(name)
     config = load_config(path, overrides, None, seed)
     sensors = config.sensor_names()
     if path.suffix == ".json":
-        recorded = json.loads(path.read_text(encoding="utf-8")).get("sensor")
-        sensors = (recorded,) if recorded in ("stereo", "tls") else sensors[:1]
-    stem = path.parent.name if path.name == "run.json" else path.stem
+        recorded = load_yaml(path)
+        sensors = (read_run(path, "name a config file")["sensor"],) if "config" in recorded else sensors[:1]
+    stem = (path.parent.name if path.name == RUN_FILE else path.stem)[:_LONGEST_NAME]
     return _each_sensor(stem, config, sensors)
 
 

@@ -186,6 +186,13 @@ class SimulationConfig(Config):
             raise ValueError("holds two models of one sensor")
         return models
 
+    @field_validator("station")
+    @classmethod
+    def _apart(cls, stations: StationConfig | tuple[StationConfig, ...]) -> StationConfig | tuple[StationConfig, ...]:
+        if isinstance(stations, tuple) and len(set(stations)) < len(stations):
+            raise ValueError("holds two stations at the same place")
+        return stations
+
     def sensor_names(self) -> tuple[SensorName, ...]:
         """The sensors that the config has a model of; both where it has none, as then all is default."""
         return tuple(model.sensor for model in self.sensor) or ("stereo", "tls")

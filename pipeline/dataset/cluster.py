@@ -15,9 +15,11 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
+from pipeline.dataset import standstill
 from pipeline.dataset.worker import Order, fill_run
 from scene.errors import InputError, OutsideError
 
@@ -27,8 +29,8 @@ if TYPE_CHECKING:
 Run = list[Order]
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _CONNECT_S = 20
-_LOOK_S, _LOST_S = 5.0, 15.0
-"""How often it is asked who works, and how long nobody may."""
+_LOOK_S, _LOST_S, _EMPTY_S = 5.0, 15.0, 45.0
+"""How often it is asked who works, how long nobody may, and how long a scheduler of the user's may have no workers."""
 _CLOSE_S = 20.0
 _STARTS = 3
 """Times that local workers are started, all of which died."""
@@ -87,6 +89,8 @@ def _require_distributed(where: str) -> None:
 def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:
     """The index in `orders` of each that is done, and what it took."""
     with ExitStack() as stack:
+        if not scheduler:
+            stack.enter_context(standstill.workers_watched(standstill.STUCK_S))
         cluster = None if scheduler else _local(stack, count)
         client = _client(stack, cluster) if cluster else _remote(stack, scheduler)
         threads = 0 if scheduler else _threads_each(count)
@@ -94,7 +98,8 @@ def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int
         given = runs([replace(order, threads=threads) for order in orders], count or max(len(client.nthreads()), 1))
         keys = [f"epochs-{run[0].job}-{run[0].source}-{run[0].index:06d}" for run in given]
         run_of = dict(zip(keys, given, strict=True))
-        for future, taken in _results(client, client.map(fill_run, given, key=keys), cluster):
+        work = partial(standstill.unless_stuck, fill_run, standstill.STUCK_S) if cluster else fill_run
+        for future, taken in _results(client, client.map(work, given, key=keys), cluster):
             for order, each in zip(run_of[future.key], taken, strict=True):
                 yield index[order.source, order.index], each
 
@@ -111,9 +116,10 @@ def _results(
             done = wait(pending, timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
             results = [(future, future.result(timeout=_CONNECT_S)) for future in done]
         except TimeoutError:
-            at_work = time.monotonic() if (_has_workers(cluster) if cluster else _answers(client)) else at_work
-            if time.monotonic() - at_work > _LOST_S:
-                raise _LostError("all workers have died" if cluster else "the scheduler does not answer any more") from None
+            lost, patience = _lost(client, cluster)
+            at_work = at_work if lost else time.monotonic()
+            if time.monotonic() - at_work > patience:
+                raise _LostError(lost) from None
             continue
         except KilledWorker as error:
             remedy = "see that each has 2.5 GB of memory or more, then the same command goes on"
@@ -127,13 +133,15 @@ def _results(
             yield future, taken
 
 
-def _answers(client: Client) -> bool:
-    """Whether the user's scheduler does; its workers may come and go."""
+def _lost(client: Client, cluster: LocalCluster | None) -> tuple[str, float]:
+    """Who is gone, in words ("": nobody), and how long that may be so, s: workers of a user's cluster come and go."""
+    if cluster:
+        return "" if _has_workers(cluster) else "all workers have died", _LOST_S
     try:
-        client.sync(client.scheduler.ncores, callback_timeout=_LOOK_S)
+        workers = client.sync(client.scheduler.ncores, callback_timeout=_LOOK_S)
     except (OSError, TimeoutError):
-        return False
-    return True
+        return "the scheduler does not answer any more", _LOST_S
+    return "" if workers else "the scheduler has no workers", _EMPTY_S
 
 
 def _has_workers(cluster: LocalCluster) -> bool:

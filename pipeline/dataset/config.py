@@ -73,7 +73,9 @@ class NoiseLevel(Config):
 class SizeClass(Config):
     """Blocks of one class of sizes."""
 
-    blocks_per_m2: float = Field(gt=0, description="blocks on the area of the wall; gives rockfall.count, whatever that says")
+    blocks_per_m2: float = Field(
+        gt=0, le=1e6, description="blocks on the area of the wall; gives rockfall.count, whatever that says"
+    )
     rockfall: RockfallConfig = RockfallConfig()
 
 

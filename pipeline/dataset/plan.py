@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pipeline.change.tiles import TileConfig, starts_of_tiles
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
+from scene.blocks import MOST_BLOCKS
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
@@ -74,9 +75,14 @@ def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfi
 
 
 def blocks_on(config: DatasetConfig, size: str, grid: Grid) -> int:
-    """How many blocks fall from a wall whose difference maps have the pixels of `grid`."""
+    """How many blocks fall from a wall whose difference maps have the pixels of `grid`; raises InputError for too many."""
     area = grid.width * grid.height * grid.gsd**2
-    return max(1, round(config.sizes[size].blocks_per_m2 * area))
+    count = config.sizes[size].blocks_per_m2 * area
+    if count > MOST_BLOCKS:
+        problem = f"asks for {count:,.3g} blocks on {area:,.0f} m2"
+        allowed = f"up to {MOST_BLOCKS / area:.3g}, {MOST_BLOCKS:,} blocks"
+        raise InputError(problem, where=f"sizes.{size}.blocks_per_m2", allowed=allowed)
+    return max(1, round(count))
 
 
 def random_of_wall(config: DatasetConfig, wall: str) -> KeyedRandom:

@@ -14,10 +14,12 @@ from pipeline.dataset.plan import Split
 from pipeline.formats.atomic import write_json, write_text
 from scene.config import parse
 from scene.errors import InputError
+from scene.regular_file import read_json, read_text
 
 SCHEMA = 1
 SHARDS = "shards"
 Record = dict[str, Any]
+_REMEDY = "put it back from a copy, or make the set again in another folder"
 _Fingerprint = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")]
 _Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -90,12 +92,9 @@ class _Shard(BaseModel):
 def read_dataset_file(folder: Path) -> Record:
     """dataset.json of a data set; raises InputError where the folder is none, and where the file is not as it was written."""
     path = folder / DATASET_FILE
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError:
-        raise InputError("is not a data set: it has no dataset.json", where=str(folder), remedy="check the path") from None
-    except (ValueError, RecursionError):
-        raise _damaged(path) from None
+    if not path.exists():
+        raise InputError("is not a data set: it has no dataset.json", where=str(folder), remedy="check the path")
+    values = read_json(path, remedy=_REMEDY)
     parse(_DatasetFile, values, str(path))
     if values.pop("sha256", "") != _digest(_text(values)):
         raise _damaged(path)
@@ -124,11 +123,11 @@ def write_shard(folder: Path, name: str, record: Record) -> None:
 def read_shard(folder: Path, name: str) -> Record | None:
     """An epoch's record; None where there is none, or a damaged one."""
     try:
-        digest, _, text = (folder / SHARDS / name).read_text(encoding="utf-8").partition("\n")
+        digest, _, text = read_text(folder / SHARDS / name).partition("\n")
         text = text.removesuffix("\n")
         record = dict(json.loads(text)) if _digest(text) == digest else None
         found = None if record is None else _Shard.model_validate(record)
-    except (OSError, ValueError, TypeError, RecursionError, ValidationError):
+    except (ValueError, TypeError, RecursionError, ValidationError):  # ValueError: an InputError is one
         return None
     return record if found and shard_name(found.source, found.epoch.index) == name else None
 
@@ -142,5 +141,4 @@ def _digest(text: str) -> str:
 
 
 def _damaged(path: Path) -> InputError:
-    remedy = "put it back from a copy, or make the set again in another folder"
-    return InputError("is damaged: it is not as it was written", where=str(path), remedy=remedy)
+    return InputError("is damaged: it is not as it was written", where=str(path), remedy=_REMEDY)

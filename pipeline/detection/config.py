@@ -23,7 +23,7 @@ class NormalisationConfig(Config):
     """
 
     method: Literal["minmax", "fixed", "level_of_detection"] = Field("fixed", description="how values are scaled")
-    scale_m: float = Field(0.05, gt=0, description="the difference that becomes asinh(1) = 0.88; for `fixed`")
+    scale_m: float = Field(0.05, ge=1e-6, le=1e6, description="the difference that becomes asinh(1) = 0.88; for `fixed`")
     validity_channel: bool = Field(True, description="a second channel: 1 where there are data, 0 where not")
 
     @property
@@ -35,30 +35,39 @@ class NormalisationConfig(Config):
 class ProposalConfig(Config):
     """The region proposal network (Ren et al. 2015)."""
 
-    anchor_sizes_px: tuple[float, ...] = Field(
+    anchor_sizes_px: tuple[Annotated[float, Field(gt=0, le=1e4)], ...] = Field(
         (8, 16, 32, 64, 128), min_length=5, max_length=5, description="one per pyramid level"
     )
-    anchor_ratios: tuple[float, ...] = Field((0.5, 1.0, 2.0), min_length=1, description="height over width")
+    anchor_ratios: tuple[Annotated[float, Field(ge=0.01, le=100)], ...] = Field(
+        (0.5, 1.0, 2.0), min_length=1, max_length=12, description="height over width"
+    )
     convolution_px: Literal[1, 3] = Field(3, description="side of the head's hidden convolution; 1 takes a ninth of the time")
     positive_iou: float = Field(0.6, gt=0, le=1, description="an anchor this near a block is a block")
     negative_iou: float = Field(0.3, ge=0, lt=1, description="an anchor this far from every block is background")
-    sampled_anchors: int = Field(256, ge=4, description="anchors per image that enter the loss, at most half of them positive")
-    candidates: int = Field(1000, ge=1, description="best anchors per image that go into the suppression")
+    sampled_anchors: int = Field(
+        256, ge=4, le=100_000, description="anchors per image that enter the loss, at most half of them positive"
+    )
+    candidates: int = Field(1000, ge=1, le=5000, description="best anchors per image that go into the suppression")
     suppression_iou: float = Field(0.7, gt=0, le=1, description="of two proposals that overlap more the better one stays")
-    proposals: int = Field(256, ge=1, description="proposals per image after the suppression")
+    proposals: int = Field(256, ge=1, le=5000, description="proposals per image after the suppression")
 
 
 class HeadConfig(Config):
     """The heads on the proposals (He et al. 2017)."""
 
     mask_size_px: Literal[28, 56, 112] = Field(56, description="side of a mask within its box")
-    sampled_proposals: int = Field(96, ge=3, description="proposals per image that enter the loss, a third of them positive")
+    sampled_proposals: int = Field(
+        96, ge=3, le=5000, description="proposals per image that enter the loss, a third of them positive"
+    )
     positive_iou: float = Field(0.5, gt=0, le=1, description="a proposal this near a block is a block")
-    hidden_units: int = Field(256, ge=1, description="units of the two dense layers of the box head")
-    detections: int = Field(150, ge=1, description="most blocks found in one image")
+    hidden_units: int = Field(256, ge=1, le=8192, description="units of the two dense layers of the box head")
+    detections: int = Field(150, ge=1, le=5000, description="most blocks found in one image")
     suppression_iou: float = Field(0.4, gt=0, le=1, description="of two detections that overlap more the better one stays")
     score_shift: float = Field(
-        0.0, description="added to the log odds of a block; `scarpsim train` sets it so that a score of 0.95 finds blocks best"
+        0.0,
+        ge=-100,
+        le=100,
+        description="added to the log odds of a block; `scarpsim train` sets it so that a score of 0.95 finds blocks best",
     )
 
 
@@ -69,10 +78,10 @@ class DetectorConfig(Config):
         "light", description="light and fine are for CPUs, fine for blocks of a few pixels"
     )
     pyramid_channels: int = Field(
-        64, ge=8, multiple_of=8, description="channels of the feature pyramid and of the heads; 256 in the papers"
+        64, ge=8, le=1024, multiple_of=8, description="channels of the feature pyramid and of the heads; 256 in the papers"
     )
-    image_px: int = Field(512, ge=64, multiple_of=64, description="side of the images that it is made for")
-    most_blocks: int = Field(100, ge=1, description="most blocks of one training image")
+    image_px: int = Field(512, ge=64, le=4096, multiple_of=64, description="side of the images that it is made for")
+    most_blocks: int = Field(100, ge=1, le=5000, description="most blocks of one training image")
     normalisation: NormalisationConfig = NormalisationConfig()
     proposal: ProposalConfig = ProposalConfig()
     head: HeadConfig = HeadConfig()
@@ -87,24 +96,24 @@ class DetectorConfig(Config):
 class TrainingConfig(Config):
     """How the network learns."""
 
-    epochs: int = Field(350, ge=1, description="most passes over the training images")
-    batch: int = Field(2, ge=1, description="images per step")
+    epochs: int = Field(350, ge=1, le=100_000, description="most passes over the training images")
+    batch: int = Field(2, ge=1, le=1024, description="images per step")
     optimizer: Literal["adamw", "sgd"] = Field("adamw", description="sgd has a momentum of 0.9")
-    learning_rate: float = Field(1e-3, gt=0, description="after the warm-up")
+    learning_rate: float = Field(1e-3, gt=0, le=100, description="after the warm-up")
     schedule: Literal["constant", "cosine"] = Field("cosine", description="cosine falls to a hundredth over the epochs")
-    warm_up_steps: int = Field(200, ge=0, description="steps over which the learning rate rises from zero")
-    weight_decay: float = Field(1e-4, ge=0, description="pull of the weights towards zero")
-    clip_norm: float = Field(5.0, gt=0, description="largest norm of a gradient")
-    loss_weights: dict[Loss, Annotated[float, Field(gt=0)]] = Field(
+    warm_up_steps: int = Field(200, ge=0, le=10**9, description="steps over which the learning rate rises from zero")
+    weight_decay: float = Field(1e-4, ge=0, le=1000, description="pull of the weights towards zero")
+    clip_norm: float = Field(5.0, gt=0, le=1e9, description="largest norm of a gradient")
+    loss_weights: dict[Loss, Annotated[float, Field(gt=0, le=1e6)]] = Field(
         {}, description="by what losses are multiplied before they are added; 1 for the others, as the thesis has it"
     )
     flips: bool = Field(True, description="mirror images left-right and up-down at random")
     crop_px: int | None = Field(
         None, ge=64, multiple_of=64, description="train on random windows of this side (default: whole images)"
     )
-    stop_window: int = Field(10, ge=2, description="epochs over which the slope of the validation loss is averaged")
+    stop_window: int = Field(10, ge=2, le=100_000, description="epochs over which the slope of the validation loss is averaged")
     stop_slope: float = Field(0.0, ge=0, description="stop once the loss falls by less than this per epoch; 0: never")
-    seed: int = Field(1, ge=0, description="of weights, order, flips and samples")
+    seed: int = Field(1, ge=0, lt=2**63, description="of weights, order, flips and samples")
 
 
 class TrainConfig(Config):

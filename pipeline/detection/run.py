@@ -35,14 +35,18 @@ class Input:
     image: dict[str, Any]
 
 
+def detector_folder(model: str) -> Path:
+    """Where a detector lies: `default` (the weights that come with scarpsim), or a folder that `scarpsim train` made."""
+    return configs_folder() / "detectors" / DEFAULT if model == DEFAULT else Path(model)
+
+
 def detector(model: str) -> Detector:
-    """By name: `baseline`, `default` (the weights that come with scarpsim), or a folder that `scarpsim train` made."""
+    """By name: `baseline`, or as `detector_folder` has it."""
     if model == BASELINE:
         return baseline.detect
-    folder = configs_folder() / "detectors" / DEFAULT if model == DEFAULT else Path(model)
     from pipeline.detection import inference, weights
 
-    network = weights.load(folder)
+    network = weights.load(detector_folder(model))
     return lambda difference: inference.detect(network, difference, LOWEST_SCORE)
 
 

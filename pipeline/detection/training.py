@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,27 @@ from pipeline.detection.model import LOSSES, MaskRCNN, total_loss
 from pipeline.detection.operating_point import set_operating_point
 from pipeline.detection.schedule import has_settled, learning_rate
 from pipeline.formats.atomic import write_json, writing
+from pipeline.formats.inside import inside
 from pipeline.report.progress import Progress
+from scene.config import Config, parse
 from scene.errors import InputError
+from scene.regular_file import read_json
 
 CHECKPOINT, BEST = "checkpoint", "best"
 _STATE, _OPTIMIZER = "state.json", "optimizer.npz"
+
+
+_NO_CHECKPOINT = "train anew, with another --out"
+
+
+class _State(Config):
+    """state.json of a checkpoint: the names of its files, and the losses of the epochs before it."""
+
+    weights: str
+    optimizer: str
+    config: dict[str, Any]
+    training: list[dict[str, float]]
+    validation: list[dict[str, float]]
 
 
 @dataclass
@@ -117,14 +133,20 @@ def _begun(out: Path, config: TrainConfig, model: MaskRCNN, *, resume: bool) -> 
         raise InputError(
             "holds a training already", where=str(out), remedy="add --resume to go on with it, or choose another --out"
         )
-    state = json.loads(path.read_text(encoding="utf-8"))
-    if state["config"] != config.model_dump(mode="json"):
+    state = parse(_State, read_json(path, remedy=_NO_CHECKPOINT), str(path))
+    if state.config != config.model_dump(mode="json"):
         raise InputError("holds a training with another config", where=str(out), remedy="use its config, or choose another --out")
-    model.load_weights(out / CHECKPOINT / state["weights"])
-    with np.load(out / CHECKPOINT / state["optimizer"]) as values:
-        for number, variable in enumerate(_further_state(model)):
-            variable.assign(values[str(number)])
-    return History(state["training"], state["validation"])
+    try:
+        weights.load_weights(model, inside(path.parent, state.weights, path))
+        with np.load(inside(path.parent, state.optimizer, path), allow_pickle=False) as values:
+            for number, variable in enumerate(_further_state(model)):
+                variable.assign(values[str(number)])
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        problem = f"its checkpoint is damaged ({' '.join(str(error).split())[:200]})"
+        raise InputError(problem, where=str(out), remedy=_NO_CHECKPOINT) from None
+    return History(state.training, state.validation)
 
 
 def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> None:

@@ -9,6 +9,7 @@ from pipeline.formats.colmap import read_colmap
 from pipeline.formats.metashape import MetashapeCameras, read_calibration, read_metashape, read_root
 from pipeline.formats.opencv import read_opencv, read_opencv_text
 from scene.errors import InputError
+from scene.regular_file import check_file
 from sensors.camera import Camera, CameraPair
 
 _COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
@@ -75,6 +76,7 @@ def _is_opencv_yaml(path: Path) -> bool:
 
 
 def _start(path: Path) -> bytes:
+    check_file(path)
     try:
         with path.open("rb") as file:
             return file.read(4096).lstrip()

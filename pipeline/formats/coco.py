@@ -6,7 +6,6 @@ programs, its `segmentation` in compressed run lengths, and `bbox`, `area` and `
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,9 @@ from pipeline.formats.coco_masks import BEYOND_PX, FORMS, run_lengths
 from pipeline.formats.geotiff import MOST_PIXELS
 from scene.config import Config, parse
 from scene.errors import InputError
+from scene.regular_file import read_json
 
+_REMEDY = "give the folder of a split, such as my_set/train, of a run, or a COCO file"
 Id = Annotated[int, Field(ge=0, lt=2**63)]
 Entry = dict[str, Any]
 
@@ -81,7 +82,7 @@ def read_coco(path: Path, *, masks: bool = True) -> Coco:
     Raises InputError, naming the annotation, for wrong types and numbers, ids that are there twice or belong to nothing, images
     of more than MOST_PIXELS, boxes and polygons outside their image, and run lengths that are not its image's.
     """
-    content = _read_json(path)
+    content = read_json(path, remedy=_REMEDY)
     if not isinstance(content, Mapping):
         raise _no_coco(path, "it is no mapping")
     for name in ("images", "annotations", "categories"):
@@ -105,7 +106,7 @@ def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entr
     Detections that list their images are joined by file name, others (pycocotools' plain list) by image id. Raises InputError as
     `read_coco` does, and for scores that are no numbers from 0 to 1, and images that the truth does not have.
     """
-    content = _read_json(path)
+    content = read_json(path, remedy=_REMEDY)
     entries = content.get("annotations") if isinstance(content, Mapping) else content
     if not isinstance(entries, list):
         raise InputError("is no list of COCO detections", where=str(path), remedy="give a detections.json of scarpsim detect")
@@ -161,16 +162,6 @@ class _Masks:
         mask = run_lengths(segmentation, height, width, where)
         box = coco_mask.toBbox(mask).tolist() if box is None else box
         return {"iscrowd": 0, **entry, "segmentation": mask, "bbox": box, "area": int(coco_mask.area(mask))}
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        remedy = "give the folder of a split, such as my_set/train, of a run, or a COCO file"
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON ({error})", where=str(path), remedy="make it again") from None
 
 
 def _no_coco(path: Path, problem: str) -> InputError:

@@ -19,6 +19,7 @@ from pipeline.formats.atomic import write_bytes, write_text
 from pipeline.formats.opencv import OpencvInterior, shared_distortion
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from scene.regular_file import read_text
 from sensors.camera import Camera
 
 MODELS = {
@@ -101,11 +102,8 @@ def read_map(path: Path) -> NDArray[np.float32]:
 
 def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]:
     """The words of every `stride`-th line that is no comment, and where it stands; lines of fewer words are errors."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        remedy = "export the model as text (colmap model_converter --output_type TXT)"
-        raise InputError(f"cannot be read ({error})", where=str(path), remedy=remedy) from None
+    remedy = "export the model as text (colmap model_converter --output_type TXT)"
+    lines = read_text(path, remedy=remedy).splitlines()
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if not line.startswith("#")]
     if stride == 1:
         numbered = [(number, line) for number, line in numbered if line.strip()]

@@ -20,6 +20,7 @@ from pipeline.formats.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from scene.regular_file import check_file
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -75,8 +76,7 @@ def read_e57(path: Path) -> list[E57Scan]:
 
     Raises InputError for a missing or damaged file and one without points.
     """
-    if not path.is_file():
-        raise InputError("is not there", where=str(path), remedy="check the path")
+    check_file(path)
     try:
         image = libe57.ImageFile(str(path), "r")
         try:

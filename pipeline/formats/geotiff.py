@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pipeline.formats.atomic import writing
 from scene.errors import InputError
 from scene.grid import Grid
+from scene.regular_file import check_file
 
 _PIXEL_SCALE, _TIEPOINT, _GEO_KEYS, _GEO_ASCII, _NODATA = 33550, 33922, 34735, 34737, 42113
 _ASCII, _SHORT, _DOUBLE = 2, 3, 12
@@ -24,6 +25,7 @@ _MASK_PAGE = 4
 """TIFF's NewSubfileType of a transparency mask."""
 MOST_PIXELS = 250_000_000
 """Of an image that is read, 1 GB as float32: a small compressed file can claim any size."""
+_LARGEST = 1e9
 _CITATION = "wall frame: x along the wall, y up the wall, z towards the sensors, metres"
 _MODEL_TYPE, _RASTER_TYPE, _CITATION_KEY, _LINEAR_UNITS = 1024, 1025, 1026, 3076
 _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
@@ -112,6 +114,7 @@ def _write(
 
 
 def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
+    check_file(path)
     try:
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
@@ -131,7 +134,17 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
     nodata = str(tags.get(_NODATA, "nan")).strip("\0 ")
     if nodata.lower() not in ("nan", ""):
         raster = np.where(raster == np.float32(nodata), np.float32(np.nan), raster)
+    _check_values(raster, path)
     return raster, tags
+
+
+def _check_values(raster: NDArray[np.float32], path: Path) -> None:
+    """Raise InputError for infinite and huge values, with which some programs mark pixels without data."""
+    known = np.isnan(raster) | (np.abs(raster) <= _LARGEST)
+    if not known.all():
+        problem = f"has {int((~known).sum()):,} pixels of infinite or huge values, such as {raster[~known][0]:g}"
+        remedy = "write NaN where there are no data, or name the value in the tag GDAL_NODATA"
+        raise InputError(problem, where=str(path), allowed=f"up to {_LARGEST:g}", remedy=remedy)
 
 
 def _check_size(page: tifffile.TiffPage, path: Path) -> None:

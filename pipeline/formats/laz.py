@@ -19,6 +19,7 @@ from pipeline.formats.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from scene.regular_file import check_file
 
 _CHUNK = 1_000_000
 """Points in memory at a time while writing; a multiple of the 50,000 of a LAZ chunk."""
@@ -90,6 +91,7 @@ def read_laz(path: Path) -> PointCloud:
     channels `return_number` and `number_of_returns`, or `scan_angle_rad` (from straight down), hold them. Raises InputError for a
     missing, truncated or foreign file.
     """
+    check_file(path)
     try:
         _check_extent(path)
         las = laspy.read(path)

@@ -15,7 +15,7 @@ from pydantic import Discriminator, Field, Tag, field_validator
 from pipeline.change.areas import Area, in_areas
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import read_cameras_yaml
-from pipeline.formats.measurement_checks import Fit, check_frame, check_inside, check_pulses, finite
+from pipeline.formats.measurement_checks import Fit, Sweep, check_frame, check_inside, check_pulses, finite
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
@@ -30,7 +30,7 @@ from sensors.camera import CameraPair, Matrix3, Vector3, check_rotation
 from sensors.model import StereoModel, TlsModel
 
 FILE = "measurement.yaml"
-Sweep = tuple[float, float, float]
+MOST_EPOCHS = 1000
 
 
 class ScannerPose(Config):
@@ -75,7 +75,7 @@ class MeasurementConfig(Config):
 
     sensor: Literal["tls", "stereo"]
     reference: Path = Field(description="the surface as known, world frame, m")
-    points: Path | list[Path] = Field(description="point cloud; several epochs: a list")
+    points: Path | Annotated[list[Path], Field(max_length=MOST_EPOCHS)] = Field(description="point cloud; several epochs: a list")
     frame: Literal["scanner", "world"] = Field("world", description="of the points")
     scanner: ScannerPose | None = None
     pattern: ScanPattern | None = None
@@ -90,6 +90,8 @@ class MeasurementConfig(Config):
     def _some(cls, points: Path | list[Path]) -> Path | list[Path]:
         if points == []:
             raise ValueError("names no file; give a path, or a list of one path an epoch")
+        if isinstance(points, list) and len(set(points)) < len(points):
+            raise ValueError("names a file twice; give a path of its own for each epoch")
         return points
 
 
@@ -250,7 +252,7 @@ def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, wher
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
     """Raise InputError where the points (`cloud`: as read) fit neither pattern nor reference."""
     if config.pattern is not None:
-        check_pulses(config.pattern.azimuth_rad, config.pattern.zenith_rad, len(cloud.points), where)
+        check_pulses(config.pattern.azimuth_rad, config.pattern.zenith_rad, len(cloud.points), len(_files(config)), where)
     here, other = found.fit, None
     if not here.good and config.scanner is not None:
         unsaid: Literal["scanner", "world"] = "world" if config.frame == "scanner" else "scanner"

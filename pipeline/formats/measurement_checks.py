@@ -15,6 +15,7 @@ from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 
+Sweep = tuple[float, float, float]
 _SAMPLE = 20_000
 _FEWEST_HITS, _FEWEST_NEAR = 0.01, 0.25
 """Share of the points whose rays must meet the reference, and of these the share that must lie near it."""
@@ -24,6 +25,8 @@ _FEWEST_INSIDE = 0.5
 """Share of the points that must lie within the pattern's angles."""
 _PULSES_PER_POINT, _FEW_PULSES = 100.0, 1e6
 """A pattern has no more pulses than so many for each point, or than so many in all."""
+_POINTS_PER_PULSE = 4.0
+"""On average; more echoes than that come from no scene."""
 _ONE_PLACE_M = 1e-6
 _LEAST_SIGMA = {"tls": (1e-6, "m", "range_sigma_m"), "stereo": (2e-4, "px", "parallax_sigma_px")}
 """By sensor: a smaller predicted spread is none; its unit; the key that says more."""
@@ -111,10 +114,16 @@ def check_near(here: Fit) -> None:
     raise InputError(problem, where="measurement.yaml", allowed=allowed, remedy=remedy)
 
 
-def check_pulses(azimuth: tuple[float, float, float], zenith: tuple[float, float, float], points: int, where: str) -> None:
-    """Raise InputError for a pattern (start, stop, step) of far more pulses than points."""
-    pulses = float(np.prod([(stop - start) / step + 1 for start, stop, step in (azimuth, zenith)]))
+def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where: str) -> None:
+    """Raise InputError for a pattern (start, stop, step) of far more pulses than points, or of too few for them."""
+    pulses = float(np.prod([(stop - start) // step + 1 for start, stop, step in (azimuth, zenith)]))
     most = max(_PULSES_PER_POINT * points, _FEW_PULSES)
+    if points > _POINTS_PER_PULSE * pulses * epochs:
+        raise InputError(
+            f"'pattern' has {pulses:,.0f} pulses, too few for {points:,} points", where=where,
+            allowed=f"at least one for {_POINTS_PER_PULSE:g} points of an epoch",
+            remedy="check the steps (third value, rad), or leave `pattern` out",
+        )  # fmt: skip
     if pulses > most:
         raise InputError(
             f"'pattern' has {pulses:.3g} pulses, for {points:,} points", where=where, allowed=f"at most {most:.3g}",
@@ -122,7 +131,7 @@ def check_pulses(azimuth: tuple[float, float, float], zenith: tuple[float, float
         )  # fmt: skip
 
 
-def check_inside(points: FloatArray, azimuth: tuple[float, float, float], zenith: tuple[float, float, float], where: str) -> None:
+def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) -> None:
     """Raise InputError where a pattern does not hold the points (n, 3), scanner frame."""
     x, y, z = points.T
     angle = np.arccos(np.clip(z / np.maximum(np.linalg.norm(points, axis=1), _ONE_PLACE_M), -1, 1))

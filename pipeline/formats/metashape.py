@@ -20,6 +20,7 @@ from pipeline.formats.atomic import write_bytes
 from pipeline.formats.geocentric import Projection, is_geocentric
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from scene.regular_file import MOST_TEXT_BYTES, check_file
 from sensors.camera import Camera
 
 _TAGS = {"f": "f_px", "cx": "cx_px", "cy": "cy_px"} | {name: name for name in ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")}
@@ -113,6 +114,7 @@ def write_calibration(path: Path, camera: Camera) -> None:
 
 def read_root(path: Path) -> ElementTree.Element:
     """The root of an XML file; raises InputError for a file that is none, or that declares entities."""
+    check_file(path, most_bytes=MOST_TEXT_BYTES)
     try:
         text = path.read_bytes()
     except OSError as error:

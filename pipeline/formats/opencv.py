@@ -20,6 +20,7 @@ import numpy as np
 from pipeline.formats.atomic import writing
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from scene.regular_file import check_file
 from sensors.camera import INTERIOR, Camera
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -121,6 +122,7 @@ def write_opencv(path: Path, camera: Camera) -> None:
 
 def read_opencv_text(path: Path) -> Camera:
     """Read width, height, the nine elements of the camera matrix by rows and 4 to 14 distortion coefficients as plain numbers."""
+    check_file(path)
     try:
         values = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
     except OSError as error:

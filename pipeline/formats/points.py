@@ -12,6 +12,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
 from scene.plug_ins import plugged
+from scene.regular_file import check_file
 
 PLUG_INS = "scarpsim.readers"
 """The group of entry points by which other packages add readers: named like the suffix, without its dot."""
@@ -29,7 +30,7 @@ def read_points(path: Path) -> PointCloud:
     infinite, as some programs write what did not return. Raises InputError for a format that is not known, whatever is wrong in
     the file, and coordinates that are none.
     """
-    cloud = _read(path)
+    cloud = _read(check_file(path))
     if not len(cloud.points):
         raise InputError("holds no points", where=str(path), remedy="export it again")
     known = np.where(np.isfinite(cloud.points), np.abs(cloud.points), 0.0)

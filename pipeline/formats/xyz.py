@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.formats.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
+from scene.regular_file import check_file
 
 _CHUNK = 200_000
 """Points in memory as text at a time while writing."""
@@ -45,6 +46,7 @@ def read_xyz(path: Path) -> PointCloud:
     intensity, if it is the last one, and others are `column_4`, `column_5` ... A line with nothing but a count is passed over.
     Intensity is as the file has it. Raises InputError for a missing file and lines that are not numbers.
     """
+    check_file(path)
     try:
         _check_lines(path)
         before, names, separator = _layout(path)

@@ -12,7 +12,6 @@ RMS of the inliers alone cannot choose the outlier threshold: it grows with the 
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,13 +23,13 @@ from scipy import stats
 
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.ply import read_ply
+from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, fit, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.products import epoch_folder
-from pipeline.run.simulation import RUN_FILE
 from pipeline.run.site import prepare_site
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
@@ -157,14 +156,10 @@ class Surfaces:
 def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, list[Surfaces]]:
     """Config, sensor, reference and the first `epochs` epochs of a run. Raises InputError where it has no record of so many."""
     path = folder / RUN_FILE
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"holds no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
-    try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-        sensor, records = run["sensor"], [(record["epoch"], _applied(record)) for record in run.get("epochs", [])]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        problem = f"is not the record of a run ({' '.join(repr(error).split())})"
-        raise InputError(problem, where=str(path), remedy="run it again with simulate") from None
+    run = read_run(path, "run it again with simulate")
+    sensor, records = run["sensor"], [(record["epoch"], _applied(record)) for record in run.get("epochs", [])]
     if len(records) < 2:
         raise InputError("has no epoch after the reference", where=str(folder), remedy="finish it with simulate --resume")
     if epochs >= len(records):

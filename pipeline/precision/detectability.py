@@ -71,7 +71,7 @@ class PlanningConfig(Config):
     )
     probability: float = Field(0.95, gt=0, lt=1, description="share of cases in which the smallest block is to be seen")
     block_size_m: tuple[Annotated[float, Field(ge=_SMALLEST_M, le=_LARGEST_M)], ...] = Field(
-        (0.1, 0.2, 0.5), min_length=1, description="sides of the blocks of curves and maps [m]"
+        (0.1, 0.2, 0.5), min_length=1, max_length=50, description="sides of the blocks of curves and maps [m]"
     )
 
 

@@ -12,9 +12,7 @@ import shutil
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import BaseModel, ConfigDict, StringConstraints
+from typing import Any
 
 from pipeline.change.annotate import merge
 from pipeline.config.simulation import CamerasFile, SensorName, SimulationConfig
@@ -22,6 +20,7 @@ from pipeline.formats.atomic import noting, write_json
 from pipeline.formats.checksum import sha256
 from pipeline.formats.crs import wkt_of
 from pipeline.formats.lock import is_free, locked
+from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
 from pipeline.run.epoch import STAGES, observe_epoch, observe_reference
@@ -37,12 +36,10 @@ from pipeline.run.products import (
 from pipeline.run.report import write_run_report
 from pipeline.run.site import Site, prepare_site
 from scene.backend import VARIANT
-from scene.config import parse
 from scene.errors import InputError
 from scene.imported import ImportedWall
 from scene.keyed_random import KeyedRandom
 
-RUN_FILE = "run.json"
 SCHEMA = 1
 
 
@@ -53,13 +50,6 @@ class RunSummary:
     folder: Path
     report: Path
     epochs: list[dict[str, Any]]
-
-
-class _RunFile(BaseModel):
-    """What a later call wants of run.json. products: checksums of each finished epoch's files, by the name of its folder."""
-
-    model_config = ConfigDict(extra="allow")
-    products: dict[Annotated[str, StringConstraints(pattern=r"^epoch_\d+$")], Checksums] = {}
 
 
 @dataclass
@@ -161,25 +151,15 @@ def _claim(run: _Run, resume: bool) -> None:
             raise InputError("the folder exists and is not empty", where=f"--out {out}", remedy=remedy)
         write_json(path, {**identity, "complete": False})
         return
-    earlier = _read(path)
+    earlier = read_run(path, "the run cannot be gone on with; choose another --out")
     _require_same(earlier, identity, out)
     _remove_unfinished(out)
-    known = parse(_RunFile, earlier, str(path)).products
+    known: dict[str, Checksums] = earlier.get("products", {})
     run.products = {
         name: checksums
         for name, checksums in known.items()
         if f"{name}/{EPOCH_RECORD}" in checksums and is_whole(out, checksums, path)
     }
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        found = None
-    if not isinstance(found, dict):
-        raise InputError("is damaged: the run cannot be gone on with", where=str(path), remedy="choose another --out")
-    return found
 
 
 def _require_same(earlier: dict[str, Any], identity: dict[str, Any], out: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from pipeline.formats.laz import read_laz
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.result_records import GAP_FILE, read_gap
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, Points, Window, inside
 from scene.errors import InputError
 from scene.frame import WallFrame
@@ -34,13 +34,8 @@ class GapResults:
 
     def __init__(self, folder: Path) -> None:
         """Raises InputError where a file of the diagnosis is absent or damaged."""
-        try:
-            self._record = json.loads((folder / "gap.json").read_text(encoding="utf-8"))
-            self.title = (
-                f"{folder.name}: {INSTRUMENTS[self._record['sensor']]}, verdict: {self._record['verdict'].replace('_', ' ')}"
-            )
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"is no gap.json ({error!r})", where=str(folder), remedy="run scarpsim gap again") from None
+        self._record = read_gap(folder / GAP_FILE)
+        self.title = f"{folder.name}: {INSTRUMENTS[self._record['sensor']]}, verdict: {self._record['verdict'].replace('_', ' ')}"
         self._clouds = {step: read_laz(folder / f"{step}.laz") for step in self.steps}
         before = self._clouds["before"].points
         if len(before) < 3:

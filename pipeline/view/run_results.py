@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +16,7 @@ from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.laz import read_laz
 from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
 from pipeline.run.products import epoch_folder
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, Points, Window, centres, cut, inside
@@ -35,15 +35,11 @@ class RunResults:
     def __init__(self, folder: Path, detections: Path | None = None) -> None:
         """Raises InputError where run.json is damaged, no epoch is finished, or the detections are of other maps."""
         self.folder = folder
-        try:
-            record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-            self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
-            self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
-        except (ValueError, KeyError, TypeError) as error:
-            problem = f"is not the record of a finished run ({error!r})"
-            raise InputError(problem, where=str(folder / "run.json"), remedy="go on with it by simulate --resume") from None
-        if not self._epochs:
+        record = read_run(folder / RUN_FILE, "go on with it by simulate --resume")
+        self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
+        if not self._epochs or "wall" not in record or any("statistics" not in each for each in self._epochs.values()):
             raise InputError("holds no finished epoch", where=str(folder), remedy="go on with it by simulate --resume")
+        self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
         self.steps = {key: f"epoch {key}" for key in self._epochs}
         self.surfaces = {"surface": "as measured", "reference": "reference, as measured", "truth": "as it really is"}
         self._found = _detections(detections) if detections else {}

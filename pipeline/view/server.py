@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hmac
 import html
+import secrets
 import threading
 import webbrowser
 from collections.abc import Callable, Sequence
@@ -21,6 +23,7 @@ from pipeline.view.tile_results import TileResults
 from scene.errors import InputError
 
 HOST = "127.0.0.1"
+_NO_TOKEN = "Take the whole address that scarpsim view said, with its token."
 _OWN_NAMES = {"127.0.0.1", "localhost"}
 _POLICY = {
     "default-src": "'none'",
@@ -53,8 +56,8 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
     raise InputError("holds nothing to look at", where=str(folder), allowed=allowed)
 
 
-def make_app(results: Results) -> dash.Dash:
-    """The page on `results`."""
+def make_app(results: Results, token: str) -> dash.Dash:
+    """The page on `results`, for those who know the token."""
     app = dash.Dash(
         __name__,
         serve_locally=True,
@@ -65,14 +68,15 @@ def make_app(results: Results) -> dash.Dash:
     app.layout = layout(results)
     register_callbacks(app, results, threading.Lock())
     app.server.before_request(_refuse_other_names)
+    app.server.before_request(_refuse_strangers(token))
     app.server.after_request(_with_headers(app.csp_hashes()))
     return app
 
 
-def make_page_server(results: Results, port: int) -> BaseWSGIServer:
+def make_page_server(results: Results, port: int, token: str) -> BaseWSGIServer:
     """The page's server at `port` (0: any that is free); raises InputError where the port is taken."""
     try:
-        return make_server(HOST, port, make_app(results).server, threaded=True, request_handler=_Silent)
+        return make_server(HOST, port, make_app(results, token).server, threaded=True, request_handler=_Silent)
     except (OSError, SystemExit, OverflowError):
         remedy = "choose another, or 0 for any that is free"
         raise InputError(f"port {port} cannot be used", where="--port", remedy=remedy) from None
@@ -80,8 +84,9 @@ def make_page_server(results: Results, port: int) -> BaseWSGIServer:
 
 def serve(folder: Path, detections: Path | None, port: int, *, open_browser: bool) -> None:
     """Show a folder until interrupted."""
-    server = make_page_server(open_results(folder, detections), port)
-    address = f"http://{HOST}:{server.server_port}/"
+    token = secrets.token_urlsafe(24)
+    server = make_page_server(open_results(folder, detections), port, token)
+    address = f"http://{HOST}:{server.server_port}/?token={token}"
     print(f"{address} shows {folder}; Ctrl-C ends it", flush=True)  # noqa: T201  (what the command is asked for)
     if open_browser:
         webbrowser.open(address)
@@ -97,6 +102,27 @@ def _refuse_other_names() -> Any:
     """A page elsewhere that reaches this one under a name of its own gets nothing."""
     name = flask.request.host.rpartition(":")[0] or flask.request.host
     return None if name in _OWN_NAMES else flask.abort(403)
+
+
+def cookie_name(host: str) -> str:
+    """Of the page at a host and port: a browser sends its cookies to all ports of a machine."""
+    return f"scarpsim_view_{host.rpartition(':')[2]}"
+
+
+def _refuse_strangers(token: str) -> Callable[[], Any]:
+    """Whoever comes with the address that the command said gets a cookie, and with it all else; another user of the machine,
+    who finds the port, gets nothing."""
+
+    def refuse() -> Any:
+        given = flask.request.args.get("token", "")
+        if hmac.compare_digest(given.encode(), token.encode()):
+            answer = flask.redirect(flask.request.path)  # the token leaves the address, and so the browser's history
+            answer.set_cookie(cookie_name(flask.request.host), token, httponly=True, samesite="Strict")
+            return answer
+        known = flask.request.cookies.get(cookie_name(flask.request.host), "")
+        return None if hmac.compare_digest(known.encode(), token.encode()) else flask.abort(403, _NO_TOKEN)
+
+    return refuse
 
 
 def _with_headers(inline: Sequence[str]) -> Callable[[flask.Response], flask.Response]:

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from pipeline.detect import baseline, events, inference
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from test_model import make_set
 
 from pipeline.cli.main import main
+from pipeline.detection import baseline, events, inference
 from pipeline.detection.config import DetectorConfig, NormalisationConfig, TrainingConfig
 from pipeline.detection.data import CocoFolder, batches, mirrored, network_input
 from pipeline.detection.detections import Detection, cropped, without_doubles

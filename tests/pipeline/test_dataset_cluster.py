@@ -18,9 +18,11 @@ import psutil
 import pytest
 from tiny_dataset import ROOT, TINY
 
+from pipeline.dataset import standstill
 from pipeline.dataset.worker import Order
 from scene.errors import OutsideError
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 pytest.importorskip("cryptography")
 cluster = pytest.importorskip("pipeline.dataset.cluster")
@@ -35,6 +37,23 @@ def quickly(orders: Sequence[Order]) -> list[dict[str, Any]]:
 def deadly(orders: Sequence[Order]) -> list[dict[str, Any]]:
     os.kill(os.getpid(), signal.SIGKILL)
     return []
+
+
+def deadlocked(orders: Sequence[Order]) -> list[dict[str, Any]]:
+    """Waits in native code, without the interpreter's lock, for what nobody gives; the worker's own threads go on."""
+    lock = threading.Lock()
+    lock.acquire()
+    lock.acquire()
+    return []
+
+
+def slowly(orders: Sequence[Order]) -> list[dict[str, Any]]:
+    """Takes processor time; a file says that it does."""
+    Path(os.environ["AT_WORK"]).touch()
+    end = time.monotonic() + 1.0
+    while time.monotonic() < end:
+        sum(range(10_000))
+    return quickly(orders)
 
 
 def spawned() -> list[psutil.Process]:
@@ -115,6 +134,50 @@ def test_an_epoch_that_kills_its_workers_ends_the_job(monkeypatch: pytest.Monkey
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
     with pytest.raises(OutsideError, match="the same command goes on"):
         list(cluster.fill_on_cluster(ORDERS, 1, ""))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["at its start", "at work"])
+def test_a_stopped_worker_is_replaced(
+    moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """SIGSTOP, as of a process that stands still with its interpreter; the work is done by the next."""
+    monkeypatch.setenv("AT_WORK", str(tmp_path / "at_work"))
+    monkeypatch.setattr(cluster, "fill_run", slowly)
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
+    monkeypatch.setattr(standstill, "STUCK_S", 4.0)
+
+    def stopped() -> None:
+        while not (spawned() if moment == "at its start" else (tmp_path / "at_work").exists()):
+            time.sleep(0.05)
+        spawned()[0].send_signal(signal.SIGSTOP)
+
+    stop = threading.Thread(target=stopped)
+    stop.start()
+    found = list(cluster.fill_on_cluster(ORDERS, 1, ""))
+    stop.join()
+    assert sorted(each["index"] for each in found) == [0, 1, 2, 3]
+    assert "took no processor time" in capfd.readouterr().err
+
+
+def test_a_deadlocked_worker_ends_the_job(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(cluster, "fill_run", deadlocked)
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
+    monkeypatch.setattr(standstill, "STUCK_S", 1.0)
+    once = dask.config.set({"distributed.scheduler.allowed-failures": 0})
+    with once, pytest.raises(OutsideError, match="the same command goes on"):
+        list(cluster.fill_on_cluster(ORDERS, 1, ""))
+    assert "took no processor time for 1 s" in capfd.readouterr().err
+
+
+def test_a_cluster_of_the_users_without_workers_ends_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
+    monkeypatch.setattr(cluster, "_EMPTY_S", 1.0)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty,
+        pytest.raises(OutsideError, match="the scheduler has no workers; what was finished is kept"),
+    ):
+        list(cluster.fill_on_cluster(ORDERS, 0, empty.scheduler_address))
 
 
 def test_a_scheduler_that_dies_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,7 @@ from pipeline.run.simulation import simulate
 from pipeline.view.figures import map_figure, wall_figure
 from pipeline.view.page import clicked, zoom
 from pipeline.view.results import Item, Layer, Patch, Window, cut
-from pipeline.view.server import make_app, make_page_server, open_results
+from pipeline.view.server import cookie_name, make_app, make_page_server, open_results
 from scene.config import parse
 from scene.errors import InputError
 from scene.grid import Grid
@@ -46,6 +46,7 @@ SMALL: dict[str, Any] = {
     "difference": {"gsd_m": 0.03},
 }
 MANY = 10**9
+TOKEN = "a-token_of-24-bytes"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 OUTSIDE = re.compile(r"""(?:src|href)=["'](?:https?:)?//""")
 
@@ -224,9 +225,9 @@ def test_clicks_and_zooms() -> None:
     [
         (lambda _: Path("/nowhere"), "there is no such folder"),
         (lambda folder: folder, "holds nothing to look at"),
-        (lambda folder: _written(folder, "run.json", "{"), "is not the record of a finished run"),
-        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "complete": false}'), "not the record of a finished run"),
-        (lambda folder: _written(folder, "gap.json", "[]"), "is no gap.json"),
+        (lambda folder: _written(folder, "run.json", "{"), "run.json: is not JSON"),
+        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "holds no finished epoch"),
+        (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: expected a mapping"),
         (lambda folder: _written(folder, "annotations.json", "{}"), "is no COCO annotation file"),
     ],
 )
@@ -242,7 +243,7 @@ def _written(folder: Path, name: str, text: str) -> Path:
 
 @pytest.fixture
 def address(run: Path) -> Iterator[str]:
-    server = make_page_server(open_results(run), 0)
+    server = make_page_server(open_results(run), 0, TOKEN)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     yield f"http://127.0.0.1:{server.server_port}"
@@ -250,9 +251,13 @@ def address(run: Path) -> Iterator[str]:
     thread.join()
 
 
-def get(address: str, host: str | None = None) -> str:
-    request = urllib.request.Request(address, headers={"Host": host} if host else {})
-    with urllib.request.urlopen(request, timeout=30) as answer:
+def asked(address: str, **headers: str) -> urllib.request.Request:
+    host = address.removeprefix("http://").partition("/")[0]
+    return urllib.request.Request(address, headers={"Cookie": f"{cookie_name(host)}={TOKEN}", **headers})
+
+
+def get(address: str, **headers: str) -> str:
+    with urllib.request.urlopen(asked(address, **headers), timeout=30) as answer:
         return str(answer.read().decode())
 
 
@@ -273,8 +278,9 @@ def test_a_name_out_of_a_file_stays_text(run: Path, tmp_path: Path) -> None:
     record = json.loads((run / "run.json").read_text())
     record["wall"]["name"] = EVIL
     write_json(tmp_path / "run" / "run.json", record)
-    app = make_app(open_results(tmp_path / "run"))
-    page = app.server.test_client().get("/", headers={"Host": "127.0.0.1"}).get_data(as_text=True)
+    app = make_app(open_results(tmp_path / "run"), TOKEN)
+    client = app.server.test_client()
+    page = client.get(f"/?token={TOKEN}", headers={"Host": "127.0.0.1"}, follow_redirects=True).get_data(as_text=True)
     (title,) = re.findall(r"<title>(.*?)</title>", page)
     assert html.unescape(title) == f"scarpsim: run: laser scanner, {EVIL}"
     assert "<script>alert" not in page
@@ -282,7 +288,7 @@ def test_a_name_out_of_a_file_stays_text(run: Path, tmp_path: Path) -> None:
 
 def test_the_page_runs_its_own_scripts_only(address: str) -> None:
     """Every script in the page itself is named by its hash, none is allowed that is not, on any answer."""
-    with urllib.request.urlopen(address, timeout=30) as answer:
+    with urllib.request.urlopen(asked(address), timeout=30) as answer:
         page, policy = answer.read().decode(), answer.headers["Content-Security-Policy"]
     allowed = dict(part.strip().split(" ", 1) for part in policy.split(";"))
     without_comments = re.sub(r"<!--.*?-->", "", page, flags=re.DOTALL)
@@ -292,16 +298,34 @@ def test_the_page_runs_its_own_scripts_only(address: str) -> None:
     assert set(allowed["script-src"].split()) == {"'self'", *hashes}
     assert allowed["default-src"] == allowed["frame-ancestors"] == allowed["base-uri"] == allowed["form-action"] == "'none'"
     assert "http" not in policy
-    with urllib.request.urlopen(f"{address}/_dash-layout", timeout=30) as answer:
+    with urllib.request.urlopen(asked(f"{address}/_dash-layout"), timeout=30) as answer:
         assert answer.headers["Content-Security-Policy"] == policy
 
 
 def test_the_page_answers_to_this_machine_s_names_only(address: str) -> None:
     with pytest.raises(urllib.error.HTTPError, match="403"):
-        get(address, "evil.example")
+        get(address, Host="evil.example")
     assert address.startswith("http://127.0.0.1:")
     with pytest.raises(InputError, match="cannot be used"):
-        make_page_server(open_results_of_nothing(), int(address.rpartition(":")[2]))
+        make_page_server(open_results_of_nothing(), int(address.rpartition(":")[2]), TOKEN)
+
+
+def test_the_page_answers_to_those_who_know_the_token_only(address: str) -> None:
+    """Not to another user of the machine who finds the port; the address of the command gives a cookie and leaves no token."""
+    name = cookie_name(address)
+    for place in ("/", "/_dash-layout", "/_dash-update-component", "/?token=", "/?token=another", "/assets/page.css"):
+        for cookie in ("", f"{name}=", f"{name}=another", f"{name}0={TOKEN}"):
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                get(f"{address}{place}", Cookie=cookie)
+    jar = urllib.request.HTTPCookieProcessor()
+    opener = urllib.request.build_opener(jar)
+    with opener.open(f"{address}/?token={TOKEN}", timeout=30) as answer:
+        assert answer.geturl() == f"{address}/"
+    (cookie,) = jar.cookiejar
+    assert cookie.has_nonstandard_attr("HttpOnly")
+    assert cookie.get_nonstandard_attr("SameSite") == "Strict"
+    with opener.open(f"{address}/_dash-layout", timeout=30) as answer:
+        assert answer.status == 200
 
 
 def open_results_of_nothing() -> Any:
@@ -340,7 +364,7 @@ def test_a_browser_draws_the_page(address: str, tmp_path: Path) -> None:
     flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags.append(f"--user-data-dir={tmp_path}")
     offline = ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--virtual-time-budget=60000", "--timeout=90000"]
-    command = [str(CHROMIUM), *flags, *offline, "--enable-logging=stderr", "--dump-dom", address]
+    command = [str(CHROMIUM), *flags, *offline, "--enable-logging=stderr", "--dump-dom", f"{address}/?token={TOKEN}"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=True)
     page = done.stdout
     assert "Content Security Policy" not in done.stderr, "the policy stops something of the page's own"

@@ -1,0 +1,163 @@
+"""One bad input: what is spoilt, the command that gets it, and whether its answer is a good one.
+
+A good answer is exit status 0 or 2, no traceback, one line of error after a 2, no file left behind or changed by it, less than
+2 GB and 20 s. The seconds are the lesser of the wall's and the processor's clock: a busy machine is not the program's fault.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+MOST_SECONDS, MOST_GB = 20.0, 2.0
+_KILL_S, _KILL_GB = 75.0, 4.0
+_LONGEST_LINE = 1500
+
+
+@dataclass(frozen=True)
+class Case:
+    """A bad input. name: as in the list of found ones, where it is from there; needs: the materials that are copied into the
+    folder; spoil: makes the folder's files bad; words: of the command; codes: exit statuses that are right."""
+
+    name: str
+    words: tuple[str, ...]
+    needs: tuple[str, ...] = ()
+    spoil: Callable[[Path], object] = lambda folder: None
+    codes: tuple[int, ...] = (0, 2)
+
+    @property
+    def command(self) -> str:
+        return self.words[0]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command did. problems: empty for a good answer; line: the last that it printed."""
+
+    case: Case
+    code: int
+    seconds: float
+    gigabytes: float
+    line: str
+    problems: tuple[str, ...]
+
+
+def tried(case: Case, materials: Path, folder: Path, *, here: bool = False) -> Outcome:
+    """Spoil copies of the materials in `folder`, which is made, and run the command there as a process of its own.
+
+    here: in this process, which is faster; its memory is not looked at, and it is stopped by an alarm.
+    """
+    folder.mkdir(parents=True)
+    for name in case.needs:
+        source = materials / name
+        shutil.copytree(source, folder / name, symlinks=True) if source.is_dir() else shutil.copy(source, folder / name)
+    case.spoil(folder)
+    before = _files(folder)
+    code, seconds, gigabytes, out, error = (_run_here if here else _run)(case.words, folder)
+    lines = [line for line in error.splitlines() if line.strip()]
+    last = (lines or out.splitlines() or [""])[-1]
+    problems = _problems(case, code, seconds, gigabytes, out, lines)
+    if code != 0 and _files(folder) != before:
+        changed = sorted(set(_files(folder).items()) ^ set(before.items()))
+        problems.append(f"files were left or changed: {', '.join(dict.fromkeys(name for name, _ in changed))[:200]}")
+    return Outcome(case, code, seconds, gigabytes, last[:400], tuple(problems))
+
+
+def _problems(case: Case, code: int, seconds: float, gigabytes: float, out: str, lines: list[str]) -> list[str]:
+    problems = []
+    if code not in case.codes:
+        problems.append(f"exit status {code}")
+    if any("Traceback" in line or "Warning:" in line for line in lines):
+        problems.append("a traceback or a warning")
+    if code == 2 and (len(lines) != 1 or not lines[0].startswith("error: ") or len(lines[0]) > _LONGEST_LINE):
+        problems.append(f"{len(lines)} lines of error")
+    if code == 2 and out.strip():
+        problems.append("output beside an error")
+    if seconds > MOST_SECONDS:
+        problems.append(f"{seconds:.0f} s")
+    if gigabytes > MOST_GB:
+        problems.append(f"{gigabytes:.1f} GB")
+    return problems
+
+
+def _files(folder: Path) -> dict[str, tuple[int, int, int]]:
+    """Size, time of change and kind of all that a folder holds, by name; links are not followed."""
+    found = {}
+    for base, folders, files in os.walk(folder):
+        for name in [*folders, *files]:
+            path = Path(base, name)
+            state = path.lstat()
+            is_folder = path.is_dir() and not path.is_symlink()
+            found[str(path.relative_to(folder))] = (0, 0, 0) if is_folder else (state.st_size, state.st_mtime_ns, state.st_mode)
+    return found
+
+
+def _run(words: tuple[str, ...], folder: Path) -> tuple[int, float, float, str, str]:
+    """Exit status, seconds, peak memory of the largest process (GB), stdout and stderr."""
+    program = "from pipeline.cli.main import main; raise SystemExit(main())"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TF_CPP_MIN_LOG_LEVEL": "3", "TMPDIR": str(folder.parent)}
+    out, error = folder.with_suffix(".out"), folder.with_suffix(".err")
+    began = time.monotonic()
+    with out.open("wb") as to_out, error.open("wb") as to_error:
+        process = subprocess.Popen(
+            [sys.executable, "-c", program, *words],
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=to_out,
+            stderr=to_error,
+            start_new_session=True,
+        )
+        while True:
+            ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+            if ended:
+                break
+            if time.monotonic() - began > _KILL_S or _resident_gb(process.pid) > _KILL_GB:
+                os.killpg(process.pid, signal.SIGKILL)
+                _, status, usage = os.wait4(process.pid, 0)
+                break
+            time.sleep(0.02)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    wall = time.monotonic() - began
+    own = usage.ru_utime + usage.ru_stime
+    seconds = wall if process.returncode == -signal.SIGKILL else min(wall, own)
+    texts = [path.read_text(encoding="utf-8", errors="replace") for path in (out, error)]
+    return process.returncode, seconds, usage.ru_maxrss / 1e6, texts[0], texts[1]
+
+
+def _run_here(words: tuple[str, ...], folder: Path) -> tuple[int, float, float, str, str]:
+    """As `_run`, in this process."""
+    from pipeline.cli.main import main
+
+    def too_long(*_: object) -> None:
+        raise TimeoutError(f"no end within {_KILL_S:g} s")
+
+    began = time.monotonic(), time.process_time()
+    before = signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(int(_KILL_S))
+    try:
+        with chdir(folder), redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as error:
+            code = main(list(words))
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    seconds = min(time.monotonic() - began[0], time.process_time() - began[1])
+    return code, seconds, 0.0, out.getvalue(), error.getvalue()
+
+
+def _resident_gb(process: int) -> float:
+    try:
+        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e9

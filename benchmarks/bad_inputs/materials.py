@@ -1,0 +1,84 @@
+"""Good inputs of every command, made once; each bad input is a copy of them with something spoilt."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchmarks.gap_challenge.cases import Case, make
+from pipeline.change.annotate import run_length_encoding
+from pipeline.cli.main import main
+from pipeline.config.bundled import configs_folder
+
+SITE: dict[str, Any] = {
+    "seed": 3,
+    "epochs": 2,
+    "wall": {"style": "glendale", "width_m": 8.0, "height_m": 5.0, "resolution_m": 0.1, "seed": 1},
+    "rockfall": {"count": 4, "size_m": 0.5},
+    "cameras": {"distance_m": 20.0, "base_m": 5.0},
+    "depth_map": "low",
+    "station": {"distance_m": 20.0},
+    "scanner": {"azimuth_step_rad": 0.003, "zenith_step_rad": 0.003},
+    "difference": {"gsd_m": 0.05},
+    "icp": {"max_iteration": 5},
+    "calibration": {"windows": 6, "window_px": 16, "simulations": 60},
+}
+SET: dict[str, Any] = {
+    "name": "tiny",
+    "seed": 3,
+    "sensors": ["tls"],
+    "walls": {"ledge": {key: value for key, value in SITE.items() if key not in ("seed", "epochs", "calibration")}},
+    "noise": {
+        "low": {
+            "stereo": {"model": {"sensor": "stereo", "noise": {"parallax_sigma_px": 0.2}}},
+            "tls": {"model": {"sensor": "tls"}, "scale": {"ledge": 2.0}},
+        }
+    },
+    "sizes": {"large": {"blocks_per_m2": 0.35, "rockfall": {"size_m": {"kind": "uniform", "low": 0.4, "high": 0.6}}}},
+    "tiles": {"size_px": 48, "minimum_valid_share": 0.3},
+    "parts": [{"walls": ["ledge"], "noise": ["low"], "sizes": ["large"], "train": 1, "val": 1, "test": 1}],
+}
+WIDTH, HEIGHT = 48, 32
+
+
+def make_materials(folder: Path) -> None:
+    """site.yaml, set.yaml; run/, set/, measurement/, pair/, detector/, diagnosis/; truth.json, found.json. Raises RuntimeError
+    where a command fails on them."""
+    folder.mkdir(parents=True)
+    (folder / "site.yaml").write_text(yaml.safe_dump(SITE))
+    (folder / "set.yaml").write_text(yaml.safe_dump(SET))
+    _coco(folder)
+    shutil.copytree(configs_folder() / "detectors/default", folder / "detector")
+    for name, sensor in (("measurement", "tls"), ("pair", "stereo")):
+        make(Case(0, (7, 1), "one", sensor, (), 4_000, 4_000), folder / name, folder / f"{name}_truth.json")
+    _called("simulate", "--sensor", "tls", "--config", str(folder / "site.yaml"), "--out", str(folder / "run"))
+    _called("dataset", str(folder / "set.yaml"), "--out", str(folder / "set"))
+    _called("gap", str(folder / "measurement"), "--out", str(folder / "diagnosis"))
+
+
+def _called(*words: str) -> None:
+    if main([*words, "--quiet"]):
+        raise RuntimeError(f"a good input fails: scarpsim {' '.join(words)}")
+
+
+def _coco(folder: Path) -> None:
+    """truth.json, of two images with two blocks each, and found.json, the same with scores."""
+    import numpy as np
+
+    images = [
+        {"id": 1 + number, "file_name": f"{number}.tif", "width": WIDTH, "height": HEIGHT, "noise": "low"} for number in range(2)
+    ]
+    annotations = []
+    for number in range(4):
+        x, y = 4 + 20 * (number % 2), 6
+        rle = run_length_encoding(np.ones((8, 10), bool), y, x, (HEIGHT, WIDTH))
+        shape = {"segmentation": rle, "bbox": [x, y, 10, 8], "area": 80, "iscrowd": 0}
+        annotations.append({"id": 1 + number, "image_id": 1 + number // 2, "category_id": 1, **shape})
+    content = {"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "block"}]}
+    (folder / "truth.json").write_text(json.dumps(content))
+    scored = [{**each, "score": 0.97} for each in annotations]
+    (folder / "found.json").write_text(json.dumps({**content, "annotations": scored}))

@@ -1,0 +1,95 @@
+"""Bad inputs, each to its command: how many are answered well.
+
+    python benchmarks/bad_inputs/run.py [--only WORD ...] [--jobs 2] [--table docs/robustness.md]
+
+Each runs as a process of its own, some seconds long, on copies of small good inputs that are made first. Prints those that are
+answered badly (see case.py for what that is), and counts by command; exit status 1 where
+there are any. --table writes the counts into the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks.bad_inputs import coco_cases, dataset_cases, gap_cases, site_cases
+from benchmarks.bad_inputs.case import Case, Outcome, tried
+from benchmarks.bad_inputs.materials import make_materials
+
+BEGIN, END = "<!-- bad inputs: begin -->", "<!-- bad inputs: end -->"
+
+
+def all_cases() -> list[Case]:
+    return [*gap_cases.cases(), *coco_cases.cases(), *dataset_cases.cases(), *site_cases.cases()]
+
+
+def run(
+    cases: Sequence[Case], jobs: int, materials: Path | None = None, *, here: bool = False, show: bool = False
+) -> list[Outcome]:
+    """Try each case, in the order given; prints the bad answers, with show all, as they come."""
+    with tempfile.TemporaryDirectory(prefix="bad_inputs_") as name:
+        folder = Path(name)
+        if materials is None:
+            materials = folder / "materials"
+            make_materials(materials)
+        elif not materials.exists():
+            make_materials(materials)
+
+        def one(numbered: tuple[int, Case]) -> Outcome:
+            number, case = numbered
+            place = folder / str(number)
+            found = tried(case, materials, place, here=here)
+            shutil.rmtree(place, ignore_errors=True)
+            return found
+
+        found = []
+        with ThreadPoolExecutor(jobs) as pool:
+            for outcome in map(one, enumerate(cases)) if here else pool.map(one, enumerate(cases)):
+                found.append(outcome)
+                if outcome.problems or show:
+                    print(said(outcome), flush=True)
+        return found
+
+
+def said(outcome: Outcome) -> str:
+    took = f"{outcome.code:>4} {outcome.seconds:6.1f} s {outcome.gigabytes:5.2f} GB"
+    return f"{took} [{outcome.case.name}] {', '.join(outcome.problems) or 'well'}: {outcome.line}"
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """Markdown: inputs tried and answered well, by command."""
+    tried_, good = Counter(each.case.command for each in outcomes), Counter(o.case.command for o in outcomes if not o.problems)
+    rows = [f"| `{name}` | {count} | {good[name]} |" for name, count in sorted(tried_.items())]
+    total = f"| all | {len(outcomes)} | {sum(good.values())} |"
+    return "\n".join(["| command | bad inputs | answered well |", "|---|---|---|", *rows, total])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="bad inputs, each to its command")
+    parser.add_argument("--only", nargs="+", default=[], help="cases whose names hold one of these words")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--materials", type=Path, help="keep the good inputs here, or take those that are here")
+    parser.add_argument("--table", type=Path, help="a page with the two marks between which the table goes")
+    parser.add_argument("--show", action="store_true", help="print the good answers too")
+    parser.add_argument("--here", action="store_true", help="in this process: faster, and memory is not looked at")
+    arguments = parser.parse_args()
+    cases = [case for case in all_cases() if not arguments.only or any(word in case.name for word in arguments.only)]
+    outcomes = run(cases, arguments.jobs, arguments.materials, here=arguments.here, show=arguments.show)
+    print(table(outcomes))
+    if arguments.table:
+        page = arguments.table.read_text(encoding="utf-8")
+        before, after = page.split(BEGIN)[0], page.split(END)[1]
+        arguments.table.write_text(f"{before}{BEGIN}\n{table(outcomes)}\n{END}{after}", encoding="utf-8")
+    return 1 if any(each.problems for each in outcomes) else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

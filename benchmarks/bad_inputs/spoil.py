@@ -1,0 +1,192 @@
+"""Small changes to files, each a function that takes a case's folder."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+import yaml
+
+from pipeline.formats.laz import write_laz
+from pipeline.formats.ply import read_ply
+from pipeline.formats.points import read_points
+
+Change = Callable[[Path], object]
+Array = np.ndarray[Any, np.dtype[np.float64]]
+NAN, INFINITE = math.nan, math.inf
+GONE = object()
+"""Value of a key that is taken out."""
+
+
+def both(*changes: Change) -> Change:
+    """One after the other."""
+
+    def change(folder: Path) -> None:
+        for each in changes:
+            each(folder)
+
+    return change
+
+
+def text(name: str, content: str | bytes) -> Change:
+    """A file with this content."""
+
+    def change(folder: Path) -> None:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
+
+
+def put(name: str, /, **values: Any) -> Change:
+    """A YAML or JSON file with values at places `a__b__0`; GONE takes a key out."""
+
+    def change(folder: Path) -> None:
+        path = folder / name
+        content = yaml.safe_load(path.read_text()) if path.suffix == ".yaml" else json.loads(path.read_text())
+        for place, value in values.items():
+            _place(content, place.split("__"), value)
+        dumped = yaml.safe_dump(content) if path.suffix == ".yaml" else json.dumps(content)
+        path.write_text(dumped)
+
+    return change
+
+
+def _place(content: Any, keys: list[str], value: Any) -> None:
+    for key in keys[:-1]:
+        content = content[int(key)] if isinstance(content, list) else content[key]
+    last = int(keys[-1]) if isinstance(content, list) else keys[-1]
+    if value is GONE:
+        del content[last]
+    else:
+        content[last] = copy.deepcopy(value)
+
+
+def whole(name: str, value: Any) -> Change:
+    """A JSON or YAML file that holds `value` alone."""
+    return text(name, json.dumps(value))
+
+
+def gone(name: str) -> Change:
+    return lambda folder: (folder / name).unlink()
+
+
+def cut(name: str, share: float = 0.5) -> Change:
+    """The first part of the file."""
+
+    def change(folder: Path) -> None:
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: int(len(data) * share)])
+
+    return change
+
+
+def at(name: str, place: int, form: str, value: float) -> Change:
+    """Some bytes of a file replaced; form: as `struct` has it."""
+
+    def change(folder: Path) -> None:
+        data = bytearray((folder / name).read_bytes())
+        struct.pack_into(form, data, place, value)
+        (folder / name).write_bytes(data)
+
+    return change
+
+
+def instead(name: str, make: Callable[[Path], object]) -> Change:
+    """Something else in the place of a file or at a new name: a folder, a pipe, a link."""
+
+    def change(folder: Path) -> None:
+        (folder / name).unlink(missing_ok=True)
+        make(folder / name)
+
+    return change
+
+
+def link(target: str) -> Callable[[Path], object]:
+    return lambda path: path.symlink_to(target)
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def points(move: Callable[[Array], Array], /, **keys: Any) -> Change:
+    """measurement/ with other points, (n, 3), scanner frame, to (m, 3), as XYZ; keys: of measurement.yaml."""
+
+    def change(folder: Path) -> None:
+        found = read_points(folder / "measurement/scan.ply").points
+        np.savetxt(folder / "measurement/scan.xyz", move(found), fmt="%.17g")
+        put("measurement/measurement.yaml", points="scan.xyz", **keys)(folder)
+
+    return change
+
+
+def as_laz(*changes: Change) -> Change:
+    """measurement/ with its points as scan.laz, then changed."""
+
+    def change(folder: Path) -> None:
+        cloud = read_points(folder / "measurement/scan.ply")
+        write_laz(folder / "measurement/scan.laz", cloud.points, intensity=cloud.intensity, gps_time=cloud.gps_time)
+        put("measurement/measurement.yaml", points="scan.laz")(folder)
+        both(*changes)(folder)
+
+    return change
+
+
+def mesh(name: str, move: Callable[[Array], Array], faces: Callable[[Any], Any] = lambda faces: faces) -> Change:
+    """A PLY mesh with other vertices (n, 3), as text."""
+
+    def change(folder: Path) -> None:
+        found = read_ply(folder / name)
+        write_mesh(folder / name, move(found.vertices), faces(found.faces))
+
+    return change
+
+
+def write_mesh(path: Path, vertices: Array, faces: Any) -> None:
+    head = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in vertices)
+    path.write_text(head + rows + "".join(f"3 {a} {b} {c}\n" for a, b, c in faces))
+
+
+def claiming_tiff(path: Path, height: int = 30000, width: int = 30000) -> None:
+    """A file of some hundred bytes that says that it holds an image of that size."""
+    tifffile.imwrite(path, np.zeros((64, 64), np.float32), compression="zlib", tile=(64, 64))
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        tags = file.pages.first.tags
+        for name, value in (("ImageLength", height), ("ImageWidth", width)):
+            tags[name].overwrite(value, dtype="I")
+
+
+def map_of(values: Any) -> Callable[[Path], object]:
+    """A GeoTIFF of 0.05 m with these values (h, w)."""
+    from pipeline.formats.geotiff import write_geotiff
+    from scene.grid import Grid
+
+    raster = np.asarray(values, np.float32)
+    return lambda path: write_geotiff(path, raster, Grid(0.0, 2.0, 0.05, raster.shape[1], raster.shape[0]))
+
+
+def bomb(levels: int = 10) -> str:
+    """Lines that stand for 9 to the power of `levels` values."""
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]" for level in range(1, levels + 1)]
+    return "\n".join([*lines, f"wall: *a{levels}", ""])
+
+
+def merge_bomb(levels: int = 10) -> str:
+    """Lines whose merge keys, followed one by one, stand for 9 to the power of `levels` mappings."""
+    lines = ["a0: &a0 {k0: 1}"]
+    lines += [f"a{level}: &a{level} {{<<: [{', '.join([f'*a{level - 1}'] * 9)}], k{level}: 1}}" for level in range(1, levels + 1)]
+    return "\n".join([*lines, f"wall: {{<<: *a{levels}}}", ""])

@@ -1,0 +1,88 @@
+"""run.json and gap.json as commands read them: of the right types, as far as they are used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from scene.config import parse
+from scene.regular_file import read_json
+
+RUN_FILE, GAP_FILE = "run.json", "gap.json"
+_Box = Annotated[list[float], Field(min_length=6, max_length=6)]
+_Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class _Record(BaseModel):
+    """Part of a file that holds more."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True)
+
+
+class _Registration(_Record):
+    rotation: Annotated[list[_Vector], Field(min_length=3, max_length=3)]
+    translation_m: _Vector
+
+
+class _Statistics(_Record):
+    sigma_m: float = Field(gt=0)
+
+
+class _Block(_Record):
+    label: int
+    shape: str
+    size_m: _Vector
+    volume_m3: float
+    bbox_m: _Box
+    position_m: _Vector
+    measured_area_m2: float
+    measured_volume_m3: float
+    measured_mean_depth_m: float | None
+
+
+class _Epoch(_Record):
+    epoch: int = Field(ge=0, le=9999)
+    registration: _Registration | None = None
+    statistics: _Statistics | None = None
+    blocks: list[_Block] = []
+
+
+class _Wall(_Record):
+    name: str
+
+
+class _Run(_Record):
+    """schema: of the file; products: checksums of each finished epoch's files."""
+
+    sensor: Literal["stereo", "tls"]
+    config: dict[str, Any]
+    wall: _Wall | None = None
+    epochs: list[_Epoch] = Field([], max_length=10_000)
+    products: dict[Annotated[str, StringConstraints(pattern=r"^epoch_\d+$")], dict[str, str]] = {}
+
+
+class _Change(_Record):
+    bbox_m: _Box
+    volume_m3: float
+
+
+class _Gap(_Record):
+    sensor: Literal["stereo", "tls"]
+    verdict: str
+    scene_changes: list[_Change] = []
+
+
+def read_run(path: Path, remedy: str) -> dict[str, Any]:
+    """The record of a run, finished or not. Raises InputError, which ends with `remedy`, for a file that is none."""
+    values = read_json(path, remedy=remedy)
+    parse(_Run, values, str(path))
+    return dict(values)
+
+
+def read_gap(path: Path) -> dict[str, Any]:
+    """The record of a diagnosis; raises InputError for a file that is none."""
+    values = read_json(path, remedy="run scarpsim gap again")
+    parse(_Gap, values, str(path))
+    return dict(values)
