@@ -139,7 +139,7 @@ def _guessed_names(values: FloatArray) -> list[str]:
     sample = values[:: max(len(values) // _SAMPLE, 1)]
     bytes_alike = [bool(np.all((column == np.rint(column)) & (column >= 0) & (column <= 255))) for column in sample.T]
     for first in (count - 3, 3):  # behind the intensity, or before it
-        if first >= 3 and all(bytes_alike[first : first + 3]):
+        if 3 <= first <= count - 3 and all(bytes_alike[first : first + 3]):
             names[first : first + 3] = _COLOURS
             rest = [index for index in range(3, count) if names[index] not in _COLOURS]
             if len(rest) == 1:

@@ -83,17 +83,19 @@ def half_of(scan: RawScan, station: Station) -> Reference:
 
 
 def _noise_along_lines(geometry: ScanGeometry, rows: NDArray[np.bool_]) -> float | None:
-    """Robust standard deviation of a range, m, from r1 - 2 r2 + r3 of neighbours in a line, equally far apart; None without any.
+    """Robust standard deviation of a range, m, about the chord of its neighbours in a line; None without any.
 
-    Relief that is not straight between neighbours counts as noise, steps of depth do not.
+    Neighbours at r1 and r3, an angle t to either side, put the one between them at 2 r1 r3 cos t / (r1 + r3). Relief between
+    neighbours counts as noise, steps of depth do not.
     """
     line, pulse, distance = geometry.line[rows], geometry.pulse[rows], geometry.range_m[rows]
     order = np.lexsort((pulse, line))
     line, pulse, distance = line[order], pulse[order], distance[order]
     step = np.diff(pulse)
     together = (line[2:] == line[:-2]) & (step[1:] == step[:-1]) & (step[1:] > 0) & (step[1:] <= 2)
-    second = (distance[2:] - 2 * distance[1:-1] + distance[:-2])[together]
-    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6)) if len(second) > 100 else None
+    chord = 2 * distance[2:] * distance[:-2] * np.cos(step[1:] * geometry.pulses.step) / (distance[2:] + distance[:-2])
+    off = (distance[1:-1] - chord)[together]
+    return float(1.4826 * np.median(np.abs(off)) / np.sqrt(1.5)) if len(off) > 100 else None
 
 
 def _halves(scan: RawScan, station: Station) -> tuple[NDArray[np.bool_], str]:

@@ -74,7 +74,7 @@ def triangulated(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray
     smoothed = any(each.step_m > _COARSE_M for each in rounded_axes(points))
     vertices = _averaged(points[kept], edges) if smoothed else points[kept]
     mesh = TriangleMesh(vertices[used], number[faces])
-    return SeenSurface(mesh, spacing, _roughness(distance, edges), smoothed)
+    return SeenSurface(mesh, spacing, _roughness(local, faces, edges), smoothed)
 
 
 def _averaged(points: FloatArray, edges: NDArray[np.int32]) -> FloatArray:
@@ -139,11 +139,16 @@ def _towards(faces: NDArray[np.int32], local: FloatArray) -> NDArray[np.int32]:
     return faces
 
 
-def _roughness(distance: FloatArray, edges: NDArray[np.int32]) -> float:
-    """Robust spread of a vertex's range about the mean of its neighbours': with k of them noise s gives s sqrt(1 + 1 / k)."""
+def _roughness(local: FloatArray, faces: NDArray[np.int32], edges: NDArray[np.int32]) -> float:
+    """Robust spread along the rays of a vertex about the mean of its neighbours; noise s and k of them give s sqrt(1 + 1 / k)."""
     ends = np.concatenate([edges, edges[:, ::-1]])
-    count = np.bincount(ends[:, 0], minlength=len(distance))
-    mean = np.bincount(ends[:, 0], distance[ends[:, 1]], minlength=len(distance)) / np.maximum(count, 1)
+    count = np.bincount(ends[:, 0], minlength=len(local))
     inner = count >= 8  # four neighbours, each edge seen from two triangles
-    off = (distance - mean)[inner] / np.sqrt(1 + 2 / count[inner])
-    return float(1.4826 * np.median(np.abs(off - np.median(off)))) if inner.any() else float("nan")
+    if not inner.any():
+        return float("nan")
+    sums = [np.bincount(ends[:, 0], column[ends[:, 1]], minlength=len(local)) for column in local.T]
+    apart = (local - np.stack(sums, axis=1) / np.maximum(count, 1)[:, None])[inner]
+    normal = TriangleMesh(local, faces).vertex_normals()[inner]
+    facing = np.einsum("ni,ni->n", local[inner], normal) / np.linalg.norm(local[inner], axis=1)
+    off = np.einsum("ni,ni->n", apart, normal) / np.minimum(facing, -0.1) / np.sqrt(1 + 2 / count[inner])
+    return float(1.4826 * np.median(np.abs(off - np.median(off))))
