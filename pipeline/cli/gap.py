@@ -7,20 +7,26 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.measurement import add_source_arguments, built
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
+from scene.errors import InputError
 
 SUMMARY = "find where a measurement and the model disagree, name the effect, add it, show the gap shrink"
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
+  scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis
   scarpsim gap --identifiability my_site.yaml --sensor tls --out plans/gap"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "measurement",
+        nargs="+",
         type=Path,
         metavar="MEASUREMENT",
-        help="folder with measurement.yaml; with --identifiability also the config of a simulation",
+        help="folder with measurement.yaml, or raw scans with --reference and --scanner; with --identifiability also the config "
+        "of a simulation",
     )
+    add_source_arguments(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument("--seed", type=at_least(0), default=1, metavar="N", help="seed of the null distributions (default: 1)")
     parser.add_argument(
@@ -54,6 +60,17 @@ def run(arguments: argparse.Namespace) -> Answer:
     return _identifiability(arguments, out) if arguments.identifiability else _diagnosis(arguments, out)
 
 
+def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
+    """The folder to read; of raw scans it is built first, under the one of the results."""
+    given: list[Path] = arguments.measurement
+    if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")) and not arguments.reference:
+        return given[0]
+    if not arguments.reference:
+        remedy = "add --reference (a mesh, a cloud, or half) and --scanner, or name the folder of a measurement"
+        raise InputError("is a raw file, without what it is to be compared with", where=str(given[0]), remedy=remedy)
+    return built(arguments, given, out / "measurement").folder
+
+
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
     from pipeline.formats.measurement import read_measurement
     from pipeline.gap.decisions import read_decisions
@@ -72,7 +89,7 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
 
         progress.plan(weights)
         begin_next()
-        measurement = read_measurement(arguments.measurement)
+        measurement = read_measurement(_measurement_folder(arguments, out))
         found = diagnose(measurement, arguments.seed, begin_next, decisions)
         report = write(out, found, measurement)
     return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "gap.json"))
@@ -83,7 +100,9 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> Answer:
     from pipeline.gap.survey.identifiability import identifiability, table
     from pipeline.gap.survey.surveys import surveys
 
-    wanted = surveys(arguments.measurement, arguments.overrides, arguments.sensor)
+    if len(arguments.measurement) > 1:
+        raise InputError(f"got {len(arguments.measurement)} names", where="--identifiability", allowed="one")
+    wanted = surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
     told = "\n\n".join(f"{in_words(each)}\n{table(each)}" for each in found)

@@ -84,6 +84,9 @@ class MeasurementConfig(Config):
         (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]"
     )
     model: Path = Field(description="what the simulation believes about the sensor today")
+    notes: tuple[str, ...] = Field(
+        (), description="what the report should say of the measurement, such as what a reference cannot show"
+    )
 
     @field_validator("points")
     @classmethod
@@ -238,7 +241,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
         station=_station(config, frame),
         cameras=cameras,
         stable_areas=config.stable_areas,
-        notes=tuple(f"{Path(name).name}: {note}" for name, texts in said for note in texts if note),
+        notes=(*config.notes, *(f"{Path(name).name}: {note}" for name, texts in said for note in texts if note)),
     )
     _check(found, cloud, config, where)
     return found

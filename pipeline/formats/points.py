@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.formats.laz import read_laz
 from pipeline.formats.ply import read_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.ptx import PtxScan, read_ptx
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
 from scene.plug_ins import plugged
@@ -16,7 +17,8 @@ from scene.regular_file import check_file
 
 PLUG_INS = "scarpsim.readers"
 """The group of entry points by which other packages add readers: named like the suffix, without its dot."""
-SUFFIXES = (".laz", ".las", ".ply", ".e57", ".xyz", ".txt")
+TEXT = (".xyz", ".txt", ".asc", ".csv", ".pts")
+SUFFIXES = (".laz", ".las", ".ply", ".e57", ".ptx", *TEXT)
 
 
 _LARGEST_M = 1e8
@@ -44,15 +46,18 @@ def read_points(path: Path) -> PointCloud:
 
 
 def _read(path: Path) -> PointCloud:
-    match path.suffix.lower():
+    suffix = path.suffix.lower()
+    if suffix in TEXT:
+        return read_xyz(path)
+    match suffix:
         case ".laz" | ".las":
             return read_laz(path)
         case ".ply":
             return read_ply_points(path)
-        case ".xyz" | ".txt":
-            return read_xyz(path)
         case ".e57":
             return _read_e57(path)
+        case ".ptx":
+            return joined([placed(scan) for scan in read_ptx(path)])
     further = plugged(PLUG_INS, "a function of a path that returns a PointCloud", callable, [each[1:] for each in SUFFIXES])
     reader = further.get(path.suffix.lower()[1:])
     if reader is None:
@@ -67,7 +72,17 @@ def _read(path: Path) -> PointCloud:
 def _read_e57(path: Path) -> PointCloud:
     from pipeline.formats.e57 import read_e57  # the library takes a tenth of a second to load
 
-    clouds = [scan.placed for scan in read_e57(path)]
+    return joined([scan.placed for scan in read_e57(path)])
+
+
+def placed(scan: PtxScan) -> PointCloud:
+    """The cloud of a PTX scan in the file's world frame."""
+    points = np.einsum("ij,nj->ni", scan.rotation, scan.cloud.points) + scan.position
+    return PointCloud(points, scan.cloud.intensity, None, scan.cloud.extra)
+
+
+def joined(clouds: list[PointCloud]) -> PointCloud:
+    """The scans of one file as one cloud."""
     if len(clouds) == 1:
         return clouds[0]
     shared = set.intersection(*(set(cloud.extra) for cloud in clouds))

@@ -1,9 +1,11 @@
-"""XYZ text: one point a line, columns x y z [intensity ...], with or without a line of column names."""
+"""XYZ text, PTS and CSV: one point a line, columns x y z [intensity ...], with or without a line of column names."""
 
 from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.formats.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
+from scene.mesh import FloatArray
 from scene.regular_file import check_file
 
 _CHUNK = 200_000
@@ -20,6 +23,26 @@ _CHUNK = 200_000
 _HEADER_LINES = 100
 _LONGEST_LINE = 65_536
 _COMMENT = ("#", "//")
+_SAMPLE = 10_000
+_COLOURS = ["red", "green", "blue"]
+SKIPPED = "-"
+"""A column of this name is left out."""
+_SYNONYMS = {
+    "e": "x", "east": "x", "easting": "x", "x_m": "x", "x[m]": "x", "n": "y", "north": "y", "northing": "y", "y_m": "y",
+    "y[m]": "y", "h": "z", "height": "z", "elevation": "z", "alt": "z", "z_m": "z", "z[m]": "z", "i": "intensity",
+    "reflectance": "intensity", "amplitude": "intensity", "scalar_intensity": "intensity", "r": "red", "g": "green", "b": "blue",
+    "time": "gps_time", "gpstime": "gps_time", "timestamp": "gps_time",
+}  # fmt: skip
+"""Words that programs write above a column, in lower case, and its name here."""
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """values: (n, k); names: of the k columns; told: whether the file names them, otherwise they are guessed."""
+
+    values: FloatArray
+    names: list[str]
+    told: bool
 
 
 def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
@@ -39,29 +62,46 @@ def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
             file.write(line * len(lists[0]) % tuple(values))
 
 
-def read_xyz(path: Path) -> PointCloud:
+def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
     """Read points; separators are spaces, tabs, commas or semicolons.
 
-    Names are taken from the last line before the numbers, behind `#` or `//` or bare; without names a fourth column is the
-    intensity, if it is the last one, and others are `column_4`, `column_5` ... A line with nothing but a count is passed over.
-    Intensity is as the file has it. Raises InputError for a missing file and lines that are not numbers.
+    columns: a name for each column, x, y and z among them; by default as `read_table` finds them. A line with nothing but a count
+    is passed over. Intensity is as the file has it. Raises InputError for a missing file and lines that are not numbers.
+    """
+    table = read_table(path)
+    names = list(columns) or table.names
+    if len(names) != table.values.shape[1] or not set("xyz") <= set(names):
+        raise InputError(
+            f"has {table.values.shape[1]} columns, named {', '.join(names)}", where=str(path),
+            allowed="a name for each, x, y and z among them", remedy="name them with --columns, as x,y,z,intensity",
+        )  # fmt: skip
+    channels = {name: np.ascontiguousarray(table.values[:, index]) for index, name in enumerate(names) if name != SKIPPED}
+    points = np.stack([channels.pop(name) for name in "xyz"], axis=1)
+    return PointCloud(points, channels.pop("intensity", None), channels.pop("gps_time", None), channels)
+
+
+def read_table(path: Path) -> TextTable:
+    """The numbers of a file and the names of its columns.
+
+    Names are taken from the last line before the numbers, behind `#` or `//` or bare, and other words for them understood
+    (Easting, H, Reflectance ...). Without names a fourth column is the intensity, of more whole numbers from 0 to 255 in threes
+    are colours, and what is left alone beside them is the intensity; others are `column_4`, `column_5` ...
     """
     check_file(path)
     try:
         _check_lines(path)
         before, names, separator = _layout(path)
-        table = np.loadtxt(path, delimiter=separator, skiprows=before, ndmin=2, comments=None, encoding="utf-8")
+        values = np.loadtxt(path, delimiter=separator, skiprows=before, ndmin=2, comments=None, encoding="utf-8")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
     except ValueError as error:
         raise InputError(f"is not XYZ text ({_plain(error)})", where=str(path), remedy="one point a line: x y z ...") from None
-    if table.size == 0 or table.shape[1] < 3:
-        problem = "holds no points" if table.size == 0 else f"has {table.shape[1]} columns"
+    if values.size == 0 or values.shape[1] < 3:
+        problem = "holds no points" if values.size == 0 else f"has {values.shape[1]} columns"
         raise InputError(problem, where=str(path), remedy="one point a line: x y z ...")
-    names = names if len(names) == table.shape[1] and set("xyz") <= set(names) else _default_names(table.shape[1])
-    columns = {name: np.ascontiguousarray(table[:, index]) for index, name in enumerate(names)}
-    points = np.stack([columns.pop(name) for name in "xyz"], axis=1)
-    return PointCloud(points, columns.pop("intensity", None), columns.pop("gps_time", None), columns)
+    understood = [_SYNONYMS.get(name, name) for name in names]
+    named = len(names) == values.shape[1] and set("xyz") <= set(understood) and len(set(understood)) == len(understood)
+    return TextTable(values, understood, True) if named else TextTable(values, _guessed_names(values), False)
 
 
 def _check_lines(path: Path) -> None:
@@ -92,8 +132,22 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _default_names(count: int) -> list[str]:
-    return [*"xyz", "intensity"] if count == 4 else [*"xyz", *(f"column_{number}" for number in range(4, count + 1))]
+def _guessed_names(values: FloatArray) -> list[str]:
+    """Names for the columns (n, k) of a file that has none."""
+    count = values.shape[1]
+    if count == 4:
+        return [*"xyz", "intensity"]
+    names = [*"xyz", *(f"column_{number}" for number in range(4, count + 1))]
+    sample = values[:: max(len(values) // _SAMPLE, 1)]
+    bytes_alike = [bool(np.all((column == np.rint(column)) & (column >= 0) & (column <= 255))) for column in sample.T]
+    for first in (count - 3, 3):  # behind the intensity, or before it
+        if 3 <= first <= count - 3 and all(bytes_alike[first : first + 3]):
+            names[first : first + 3] = _COLOURS
+            rest = [index for index in range(3, count) if names[index] not in _COLOURS]
+            if len(rest) == 1:
+                names[rest[0]] = "intensity"
+            break
+    return names
 
 
 def _form(name: str, column: NDArray[Any], decimals: int) -> str:

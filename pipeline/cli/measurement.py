@@ -1,0 +1,103 @@
+"""`scarpsim measurement`: the folder that `gap` takes, out of raw scans and a surface to compare them with."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options, at_least, one_of
+
+if TYPE_CHECKING:
+    from pipeline.measurement.build import Request, Understood
+
+SUMMARY = "build the folder that gap takes out of raw scans and a reference; say what was understood"
+EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner riegl_vz400i --out my_measurement
+  scarpsim measurement scan.laz --reference half --scanner leica_p50 --position 12.1,40.3,2.5 --out my_measurement"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scans", nargs="+", type=Path, metavar="SCAN", help="raw scan: las, laz, e57, ply, ptx, pts, xyz, csv; several: epochs"
+    )
+    add_source_arguments(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="new folder of the measurement")
+    add_output_options(parser)
+
+
+def add_source_arguments(parser: argparse.ArgumentParser) -> None:
+    """What a raw scan needs beside itself; `gap` takes the same."""
+    parser.add_argument(
+        "--reference", metavar="FILE|half", help="the surface as known: a mesh, a cloud, another epoch; half: of the scan itself"
+    )
+    parser.add_argument("--scanner", metavar="PRESET", help="what is believed about the scanner, such as riegl_vz400i, or a file")
+    parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
+    parser.add_argument(
+        "--position", type=numbers(3), metavar="X,Y,Z", help="where the scanner stood, m, in the points' frame, if no header says"
+    )
+    parser.add_argument(
+        "--unit", type=one_of("m", "cm", "mm", "ft"), default="m", metavar="m|cm|mm|ft", help="of the scan (default: m)"
+    )
+    parser.add_argument(
+        "--reference-unit", type=one_of("m", "cm", "mm", "ft"), default="m", metavar="m|cm|mm|ft", help="(default: m)"
+    )
+    parser.add_argument(
+        "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
+    )
+    parser.add_argument("--scan", type=at_least(1), metavar="N", help="take one scan of a file that holds several")
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    found = built(arguments, arguments.scans, arguments.out)
+    return Answer(f"{found.summary()}\npicture: {found.folder / 'understood.png'}", found.to_dict)
+
+
+def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Understood:
+    """Build the folder that the arguments ask for."""
+    from pipeline.measurement.build import build
+
+    return build(_request(arguments, scans), out)
+
+
+def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
+    from pipeline.measurement.build import Request
+    from scene.errors import InputError
+
+    if arguments.reference is None:
+        remedy = "name a mesh, a cloud or another epoch, or say half"
+        raise InputError("is missing", where="--reference", remedy=remedy)
+    return Request(
+        scans,
+        arguments.reference,
+        arguments.scanner,
+        arguments.model,
+        arguments.position,
+        arguments.unit,
+        arguments.reference_unit,
+        arguments.columns,
+        arguments.scan,
+    )
+
+
+def words(text: str) -> list[str]:
+    """An argument's type: words between commas."""
+    return [word.strip().lower() for word in text.split(",")]
+
+
+def numbers(count: int) -> Callable[[str], Any]:
+    """An argument's type: so many finite numbers between commas."""
+
+    def check(text: str) -> tuple[float, ...]:
+        import math
+
+        try:
+            found = tuple(float(word) for word in text.split(","))
+        except ValueError:
+            found = ()
+        if len(found) != count or not all(map(math.isfinite, found)):
+            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: {count} numbers between commas")
+        return found
+
+    return check

@@ -1,0 +1,53 @@
+"""What was understood of raw files, as a picture: the set-up from above, and the scan as the scanner sees it."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pipeline.report.figures import FAMILY, SEQUENTIAL, dress, png_bytes
+from scene.mesh import FloatArray, TriangleMesh
+from sensors.polar import polar
+
+_DOTS = 15_000
+
+
+def picture(points: FloatArray, mesh: TriangleMesh, position: FloatArray, rotation: FloatArray, title: str) -> bytes:
+    """PNG of points (n, 3) and the reference, both m in one frame, with the scanner (position, rotation to that frame)."""
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    above, seen = figure.subplots(1, 2)
+    origin = np.floor(position / 1000) * 1000 if np.abs(position).max() > 1e4 else np.zeros(3)
+    few, known = (each[:: max(len(each) // _DOTS, 1)] - origin for each in (points, mesh.vertices))
+    here = position - origin
+    above.scatter(*known[:, :2].T, s=0.5, color="#b5b5b5", linewidths=0, label="reference")
+    above.scatter(*few[:, :2].T, s=0.5, color=FAMILY[0], linewidths=0, label="scan")
+    above.plot(here[0], here[1], marker="*", markersize=13, color=FAMILY[1], linestyle="none", label="scanner")
+    _fan(above, few, here)
+    above.set_aspect("equal", adjustable="datalim")
+    shift = "" if not origin.any() else f" less {origin[0]:,.0f}", f" less {origin[1]:,.0f}" if origin.any() else ""
+    dress(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
+    above.set_title("from above")
+    above.legend(markerscale=1, loc="best", fontsize=8)
+    distance, azimuth, zenith = polar(np.einsum("ij,ni->nj", rotation, few - here))
+    middle = float(np.angle(np.mean(np.exp(1j * azimuth))))
+    azimuth = middle + np.angle(np.exp(1j * (azimuth - middle)))
+    dots = seen.scatter(np.degrees(azimuth), np.degrees(zenith), c=distance, s=0.8, cmap=SEQUENTIAL, linewidths=0)
+    seen.invert_yaxis()
+    dress(seen, "azimuth, degrees", "zenith angle, degrees")
+    seen.set_title("as the scanner sees it")
+    figure.colorbar(dots, ax=seen, label="range, m")
+    figure.suptitle(title)
+    return png_bytes(figure)
+
+
+def _fan(axes: object, points: FloatArray, here: FloatArray) -> None:
+    """The edges of the window from above, unless it is a full circle."""
+    angle = np.sort(np.arctan2(points[:, 1] - here[1], points[:, 0] - here[0]))
+    gaps = np.diff(angle, append=angle[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < np.pi / 6:
+        return
+    reach = float(np.quantile(np.linalg.norm(points[:, :2] - here[:2], axis=1), 0.9))
+    for edge in (angle[widest], angle[(widest + 1) % len(angle)]):
+        end = here[:2] + reach * np.array([np.cos(edge), np.sin(edge)])
+        axes.plot([here[0], end[0]], [here[1], end[1]], color=FAMILY[1], linewidth=0.8)  # type: ignore[attr-defined]

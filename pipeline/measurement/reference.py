@@ -1,0 +1,115 @@
+"""The surface that a scan is compared with: a mesh, a cloud that is meshed here, or one half of the scan itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.points import SUFFIXES
+from pipeline.formats.scan_geometry import ScanGeometry
+from pipeline.measurement.scans import RawScan, read_scans
+from pipeline.measurement.station import Station
+from pipeline.measurement.triangulation import BETWEEN, SeenSurface, triangulated
+from scene.errors import InputError
+from scene.imported import read_mesh
+from scene.mesh import TriangleMesh
+from scene.ply import read_elements
+
+HALF = "half"
+_MUCH_FINER = 0.6
+"""Pulses that lie so much closer along a line than lines do are halved instead of the lines."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The surface as known, points' frame, m, with its standard error (0: taken as exact) and what is to be said of it.
+
+    rows: (k,) the points of the scan that are compared with it, None for all.
+    """
+
+    mesh: TriangleMesh
+    error_m: float
+    words: tuple[str, ...]
+    limits: tuple[str, ...]
+    rows: NDArray[Any] | None = None
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a file holds points without triangles."""
+    if path.suffix.lower() != ".ply":
+        return path.suffix.lower() in SUFFIXES
+    faces = read_elements(path).get("face")
+    return faces is None or not faces or not len(next(iter(faces.values())))
+
+
+def from_file(path: Path, unit: str, station: Station) -> Reference:
+    """A reference out of a file. Raises InputError where it cannot be used."""
+    if not path.is_file():
+        raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, or the word {HALF}")
+    if not is_cloud(path):
+        mesh, notes = read_mesh(path, unit)
+        words = (f"mesh {path.name}: {len(mesh.faces):,} triangles, taken as exact", *notes)
+        limit = "an error of the mesh (its noise, chords across curved rock, cut edges) looks like one of the sensor"
+        return Reference(mesh, 0.0, words, (limit,))
+    scans = read_scans(path, unit)
+    points = np.concatenate([scan.cloud.points for scan in scans])
+    surface = triangulated(points, station.position, station.rotation, str(path))
+    said = f"cloud {path.name}: {len(points):,} points, meshed as seen from the scanner, {len(surface.mesh.faces):,} triangles"
+    limits = (
+        "the reference is a measurement itself: errors that both share (same scanner, same place) cannot be seen, and rock that "
+        "moved between the two is told from errors only where it has edges",
+    )
+    return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits)
+
+
+def half_of(scan: RawScan, station: Station) -> Reference:
+    """Every other line (or pulse, where these are much finer) as the surface, with the rest to be compared with it."""
+    even, what = _halves(scan, station)
+    surface = triangulated(scan.cloud.points[even], station.position, station.rotation, scan.name)
+    said = f"half of the scan itself ({what}): {int(even.sum()):,} points, {len(surface.mesh.faces):,} triangles"
+    limits = (
+        "both halves are of one scan: nothing that changes slowly over the wall can be seen (offset, scale, index, eccentricity, "
+        "incidence, cyclic error), only noise, tails, and what differs from one line or pulse to the next",
+    )
+    noise = None if station.geometry is None else _noise_along_lines(station.geometry, even)
+    if noise is None or surface.smoothed:
+        return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, np.flatnonzero(~even))
+    told = f"along its lines points scatter by {1e3 * noise:.2g} mm: {1e3 * noise * BETWEEN:.2g} mm are carried as its error"
+    return Reference(surface.mesh, float(noise * BETWEEN), (said, told), limits, np.flatnonzero(~even))
+
+
+def _noise_along_lines(geometry: ScanGeometry, rows: NDArray[np.bool_]) -> float | None:
+    """Robust standard deviation of a range, m, about the chord of its neighbours in a line; None without any.
+
+    Neighbours at r1 and r3, an angle t to either side, put the one between them at 2 r1 r3 cos t / (r1 + r3). Relief between
+    neighbours counts as noise, steps of depth do not.
+    """
+    line, pulse, distance = geometry.line[rows], geometry.pulse[rows], geometry.range_m[rows]
+    order = np.lexsort((pulse, line))
+    line, pulse, distance = line[order], pulse[order], distance[order]
+    step = np.diff(pulse)
+    together = (line[2:] == line[:-2]) & (step[1:] == step[:-1]) & (step[1:] > 0) & (step[1:] <= 2)
+    chord = 2 * distance[2:] * distance[:-2] * np.cos(step[1:] * geometry.pulses.step) / (distance[2:] + distance[:-2])
+    off = (distance[1:-1] - chord)[together]
+    return float(1.4826 * np.median(np.abs(off)) / np.sqrt(1.5)) if len(off) > 100 else None
+
+
+def _halves(scan: RawScan, station: Station) -> tuple[NDArray[np.bool_], str]:
+    geometry = station.geometry
+    if geometry is None:
+        return np.arange(len(scan.cloud.points)) % 2 == 0, "every second point of the file, as no lines were found"
+    if geometry.pulses.step < _MUCH_FINER * geometry.lines.step:
+        return geometry.pulse % 2 == 0, "every second pulse of each line, which lie closer than lines do"
+    return geometry.line % 2 == 0, "every second line"
+
+
+def _of_noise(surface: SeenSurface) -> str:
+    smoothed = ", vertices averaged with their neighbours as the coordinates are rounded" if surface.smoothed else ""
+    return (
+        f"its points scatter by {1e3 * surface.roughness_m:.2g} mm about their neighbours, {1e3 * surface.spacing_m:.2g} mm away "
+        f"(noise and relief){smoothed}: {1e3 * surface.error_m:.2g} mm are carried as its error"
+    )

@@ -1,0 +1,154 @@
+"""A surface through the points of a cloud as one place sees them: Delaunay triangles over azimuth and zenith angle.
+
+Unlike Poisson's, it passes through the points and invents nothing behind them; it is a surface for rays from (near) that place
+only. Edges are cut at steps of depth like those of grid triangulation (`pipeline.surface.mesh`): longer in range than a step, and
+nearly along the line of sight. Of the points of one cell of a fine raster of directions the median range is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.errors import InputError
+from scene.mesh import FloatArray, TriangleMesh
+from scene.rounding import rounded_axes
+from sensors.polar import polar
+
+_STEP_M, _STEP_SHARE = 0.1, 0.02
+"""A smaller step of range is never cut: m, and share of the range."""
+_GRAZING_RAD = 0.15
+_LONGEST = 6.0
+"""An edge longer than so many typical ones bridges a hole and is cut; along and across lines have their own."""
+_MOST_POINTS = 2_000_000
+_COARSE_M = 5e-3
+"""Rounding to larger steps tilts triangles: their vertices are averaged."""
+BETWEEN, _OF_SEVEN = np.sqrt(1 / 2), np.sqrt(1 / 7)
+"""Noise in the middle between two vertices, in that of one; and of a mean of a point and its six neighbours."""
+
+
+@dataclass(frozen=True)
+class SeenSurface:
+    """mesh: in the points' frame, counter-clockwise seen from the viewpoint; spacing_m: median length of its edges; roughness_m:
+    robust standard deviation of a point about the mean of its neighbours, of noise and of relief between neighbours; smoothed:
+    whether each vertex is the mean of its own and its neighbours' points, since the coordinates are rounded coarsely."""
+
+    mesh: TriangleMesh
+    spacing_m: float
+    roughness_m: float
+    smoothed: bool
+
+    @property
+    def error_m(self) -> float:
+        """Standard deviation of the surface between its vertices, as far as its own points tell."""
+        return float(np.nan_to_num((_OF_SEVEN if self.smoothed else BETWEEN) * self.roughness_m))
+
+
+def triangulated(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray, where: str) -> SeenSurface:
+    """The surface through points (n, 3), m, seen from `viewpoint` (3,) m with `rotation` (3, 3), scanner to the points' frame.
+
+    Raises InputError where no triangle is left.
+    """
+    from scipy.spatial import Delaunay, QhullError
+
+    local = np.einsum("ij,ni->nj", rotation, points - viewpoint)
+    distance, azimuth, zenith = polar(local)
+    kept = _one_per_direction(distance, azimuth, zenith)
+    local, distance, azimuth, zenith = local[kept], distance[kept], azimuth[kept], zenith[kept]
+    plane = _plane(azimuth, zenith)
+    try:
+        faces = Delaunay(plane).simplices.astype(np.int32)
+    except (QhullError, ValueError):
+        raise InputError("the points lie in one line of sight, of which no surface can be made", where=where) from None
+    faces = faces[_whole(local, distance, plane, faces)]
+    if not len(faces):
+        raise InputError("no triangle is left between the points", where=where, remedy="give a denser cloud, or a mesh")
+    faces = _towards(faces, local)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    spacing = float(np.median(np.linalg.norm(local[edges[:, 0]] - local[edges[:, 1]], axis=1)))
+    used = np.zeros(len(local), dtype=bool)
+    used[faces] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    smoothed = any(each.step_m > _COARSE_M for each in rounded_axes(points))
+    vertices = _averaged(points[kept], edges) if smoothed else points[kept]
+    mesh = TriangleMesh(vertices[used], number[faces])
+    return SeenSurface(mesh, spacing, _roughness(local, faces, edges), smoothed)
+
+
+def _averaged(points: FloatArray, edges: NDArray[np.int32]) -> FloatArray:
+    """(n, 3) the mean of each point and its neighbours, a neighbour along two triangles counted once."""
+    ends = np.unique(np.sort(edges, axis=1), axis=0)
+    ends = np.concatenate([ends, ends[:, ::-1]])
+    count = 1 + np.bincount(ends[:, 0], minlength=len(points))
+    origin = points[0]
+    local = points - origin
+    sums = [column + np.bincount(ends[:, 0], column[ends[:, 1]], minlength=len(points)) for column in local.T]
+    return origin + np.stack(sums, axis=1) / count[:, None]
+
+
+def _one_per_direction(distance: FloatArray, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
+    """Indices of points: of those of one cell (a third of the median angular spacing) the one of median range."""
+    span = float(np.ptp(azimuth) * np.ptp(zenith))
+    cell = max(np.sqrt(span / len(distance)) / 3, np.sqrt(span / (9 * _MOST_POINTS)), 1e-7)
+    code = np.floor((azimuth - azimuth.min()) / cell).astype(np.int64) << 32
+    code += np.floor((zenith - zenith.min()) / cell).astype(np.int64)
+    order = np.lexsort((distance, code))
+    starts = np.flatnonzero(np.diff(code[order], prepend=-1))
+    counts = np.diff(starts, append=len(order))
+    return np.sort(order[starts + (counts - 1) // 2])
+
+
+def _plane(azimuth: FloatArray, zenith: FloatArray) -> FloatArray:
+    """(n, 2) angles as lengths on the sphere; azimuth begins behind its widest gap."""
+    ordered = np.sort(azimuth)
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    begin = ordered[(int(np.argmax(gaps)) + 1) % len(ordered)]
+    level = np.sin(np.clip(np.median(zenith), 0.1, np.pi - 0.1))
+    return np.stack([np.mod(azimuth - begin, 2 * np.pi) * level, zenith], axis=1)
+
+
+def _whole(local: FloatArray, distance: FloatArray, plane: FloatArray, faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(m,) triangles none of whose edges is cut."""
+    whole = np.ones(len(faces), dtype=bool)
+    pairs = [faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]
+    sides = [np.abs(plane[pair[:, 0]] - plane[pair[:, 1]]) for pair in pairs]
+    longest = [_LONGEST * _typical(np.concatenate([side[:, axis] for side in sides])) for axis in (0, 1)]
+    for pair, side in zip(pairs, sides, strict=True):
+        step = np.abs(distance[pair[:, 0]] - distance[pair[:, 1]])
+        length = np.linalg.norm(local[pair[:, 0]] - local[pair[:, 1]], axis=1)
+        small = step <= np.maximum(_STEP_M, _STEP_SHARE * np.minimum(distance[pair[:, 0]], distance[pair[:, 1]]))
+        whole &= small & ((step <= 0.05) | (step <= np.cos(_GRAZING_RAD) * length))
+        whole &= (side[:, 0] <= longest[0]) & (side[:, 1] <= longest[1])
+    return whole
+
+
+def _typical(lengths: FloatArray) -> float:
+    """Median of the lengths that are no rounding."""
+    return float(np.median(lengths[lengths > 0.05 * lengths.mean()]))
+
+
+def _towards(faces: NDArray[np.int32], local: FloatArray) -> NDArray[np.int32]:
+    """The faces, wound counter-clockwise seen from the origin of the local frame."""
+    corners = local[faces]
+    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    away = volume > 0
+    faces = faces.copy()
+    faces[away] = faces[away][:, ::-1]
+    return faces
+
+
+def _roughness(local: FloatArray, faces: NDArray[np.int32], edges: NDArray[np.int32]) -> float:
+    """Robust spread along the rays of a vertex about the mean of its neighbours; noise s and k of them give s sqrt(1 + 1 / k)."""
+    ends = np.concatenate([edges, edges[:, ::-1]])
+    count = np.bincount(ends[:, 0], minlength=len(local))
+    inner = count >= 8  # four neighbours, each edge seen from two triangles
+    if not inner.any():
+        return float("nan")
+    sums = [np.bincount(ends[:, 0], column[ends[:, 1]], minlength=len(local)) for column in local.T]
+    apart = (local - np.stack(sums, axis=1) / np.maximum(count, 1)[:, None])[inner]
+    normal = TriangleMesh(local, faces).vertex_normals()[inner]
+    facing = np.einsum("ni,ni->n", local[inner], normal) / np.linalg.norm(local[inner], axis=1)
+    off = np.einsum("ni,ni->n", apart, normal) / np.minimum(facing, -0.1) / np.sqrt(1 + 2 / count[inner])
+    return float(1.4826 * np.median(np.abs(off - np.median(off))))
