@@ -59,6 +59,14 @@ class MeanDecisions(_Group):
         "Within which of the best others belong to its class: e^-3 bounds by 5 % how often the truth is left out.",
         "GAP.md's 93 to 97 % of classes that hold the truth",
     )
+    class_share: PositiveFloat = _by(
+        0.01,
+        "share",
+        "Of its gain by which a score must be ahead too for the others not to belong to its class: no signature is exact, and "
+        "what it misses grows with the gain (6 degrees off the truth leave so much).",
+        "geometry of small angles",
+        lt=1,
+    )
     free_margin: PositiveFloat = _by(
         5.0, "log-likelihood", "By which a free form must do better than the catalogue's best to be called unknown.", _DEVELOPMENT
     )
@@ -79,6 +87,12 @@ class MeanDecisions(_Group):
         _DEVELOPMENT,
     )
     most_effects: PositiveInt = _by(3, "effects", "Named at the most for the mean.", _JUDGEMENT)
+    undone_size: PositiveFloat = _by(
+        10.0, "typical sizes", "From which on an effect that the registration undoes nearly is not committed to.", _JUDGEMENT
+    )
+    undone_share: PositiveFloat = _by(
+        0.1, "share", "Of an effect that the registration leaves, below which it undoes it nearly.", _JUDGEMENT, lt=1
+    )
     practical_share: PositiveFloat = _by(
         0.02,
         "share",
@@ -140,6 +154,9 @@ class SpreadDecisions(_Group):
         "three development scans the right one was 9 to 15 ahead of its nearest.",
         _DEVELOPMENT,
     )
+    class_share: PositiveFloat = _by(
+        0.01, "share", "Of its gain by which a score must be ahead too: no form of a variance is exact.", _JUDGEMENT, lt=1
+    )
     free_margin: PositiveFloat = _by(
         6.0, "log-likelihood", "By which a free form must do better than the catalogue's best.", _DEVELOPMENT
     )
@@ -166,8 +183,18 @@ class SpreadDecisions(_Group):
         _DEVELOPMENT,
         le=1,
     )
-    one_block: PositiveFloat = _by(
-        0.2, "share", "Of the far residuals that one block of the wall may have: more is a change of the scene.", _JUDGEMENT, le=1
+    most_uneven: PositiveFloat = _by(
+        0.5,
+        "standard deviation over mean",
+        "Of the blocks' shares of far points beyond chance: more is of parts of the wall, not the instrument's own.",
+        _JUDGEMENT,
+    )
+    core_excess: PositiveFloat = _by(
+        0.15,
+        "share of the predicted variance",
+        "By which the middle of the residuals must be wider for an effect on the spread to hold beside far points all over "
+        "the wall.",
+        _JUDGEMENT,
     )
 
 

@@ -64,7 +64,7 @@ def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not
     else:
         extra = rng.standard_normal(len(part))
     value = registered(replace(part, value=part.value + 0.002 * extra))[0]
-    spread, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    spread, _, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
     assert len(spread) == count
 
 

@@ -96,7 +96,7 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
     there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
     part = residuals.part(residuals.smooth)
     value = registered(part)[0]
-    spread, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    spread, _, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     (found,) = told_apart(spread, part, value, there.model)
     assert found.name == kind
@@ -110,7 +110,7 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
     there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
     part = residuals.part(residuals.smooth)
     value = registered(part)[0]
-    spread, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    spread, _, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     described = [replace(each, name="spread by disparity", empirical=True) for each in spread]
     (found,) = told_apart(described, part, value, there.model)

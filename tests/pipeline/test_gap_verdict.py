@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.gap.decisions import Decisions
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verdict import Evidence, lower_noise, too_noisy, verdict_of
 from pipeline.gap.naming.verify import Gap
@@ -27,6 +28,7 @@ GAPS = [
 ]
 P_VALUES = [None, 0.002, 0.01, 0.02, 0.5]
 SPREADS = [1.0, 0.11]
+FAR = [0.0, 0.02]
 ROWS = [
     {"covariate": "range", "statistic": "mean", "p_value": p, "region": {"from": 10.0, "to": 20.0}, "size_m": 0.0021}
     for p in (0.001, 0.3)
@@ -47,6 +49,9 @@ NAMED = [
 ]
 
 
+DECISIONS = Decisions()
+
+
 class _Residuals(list[int]):
     sensor = "tls"
 
@@ -58,6 +63,7 @@ class _Found:
     effects: tuple[Named, ...]
     evidence: Evidence
     changes: tuple[Any, ...] = ()
+    decisions: Decisions = DECISIONS
     residuals: _Residuals = field(default_factory=lambda: _Residuals(range(1000)))
 
     @property
@@ -81,10 +87,10 @@ class _Found:
 
 def _every() -> Iterator[tuple[Any, Evidence, str]]:
     """Each combination, and all that is said of it, but those that cannot be: without an effect the gap stays."""
-    for named, gap, p_value, spread in product(NAMED, GAPS, P_VALUES, SPREADS):
+    for named, gap, p_value, spread, far in product(NAMED, GAPS, P_VALUES, SPREADS, FAR):
         if gap is not None and not named and spread == 1.0 and gap.after != gap.before:
             continue
-        found: Any = _Found(named, Evidence(gap, p_value, spread))
+        found: Any = _Found(named, Evidence(gap, p_value, spread, far))
         for row in ROWS:
             yield found, found.evidence, f"{title(found)}. {paragraph(found, [row])} {summary(found)}"
 
@@ -93,7 +99,7 @@ def test_no_gap_needs_a_gap_at_the_floor_and_a_p_value_that_does_not_reject() ->
     for found, evidence, _ in _every():
         gap, p_value = evidence.gap, evidence.p_value
         near = gap is not None and gap.before - gap.floor <= 2 * ERROR
-        agrees = not found.effects and near and p_value is not None and p_value > 0.01
+        agrees = not found.effects and near and p_value is not None and p_value > 0.01 and not evidence.far
         assert (found.verdict == "no_gap") == agrees
 
 
@@ -118,7 +124,7 @@ def test_a_gap_that_nothing_closes_is_not_reported_as_closed() -> None:
 def test_what_is_rejected_without_a_description_says_where_and_how_much() -> None:
     for found, evidence, said in _every():
         bare = found.verdict == "unknown" and not found.effects
-        only_too_noisy = evidence.spread < 1.0 and not evidence.rejects
+        only_too_noisy = evidence.spread < 1.0 and not evidence.rejects and not evidence.far
         assert ("noise is too large" in said) >= (bare and only_too_noisy)
         assert ("nothing that was tried describes what is missing" in said) == (bare and not only_too_noisy)
         assert ("It shows most in the mean against range, from 10 to 20: 2.1 mm there" in said) == bare

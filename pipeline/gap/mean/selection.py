@@ -85,6 +85,11 @@ class _Set:
         return plain
 
 
+def class_margin(gain: float) -> float:
+    """Within which of a score, of so large a gain, others belong to its class: signatures are exact to a share of the gain."""
+    return max(decided().mean.class_margin, decided().mean.class_share * gain)
+
+
 def _weak(form: Tried | None) -> float:
     """Score of a free form that is too weak to be said, and that a weak effect of the catalogue has to do better than; else 0."""
     return form.score if form is not None and form.score < decided().mean.least_free_score else 0.0
@@ -180,8 +185,11 @@ class Choice:
             assert found is not None
             return found[0].members, found[1]
         alone = empty.free
-        margin = decided().mean.free_margin if len(best.members) < 2 else 0.0
-        if best.members and alone is not None and alone.score > max(best.score, self.search.score(best.members)) + margin:
+        if not best.members or alone is None:
+            return None
+        score = max(best.score, self.search.score(best.members))
+        margin = max(decided().mean.free_margin, decided().mean.practical_share * score) if len(best.members) < 2 else 0.0
+        if alone.score > score + margin:
             return (), alone
         return None
 
@@ -203,7 +211,8 @@ class Choice:
         others = tuple(member for member in among if member is not item)
         beside = [each for each in self.search.tried(others) if not each.empirical and each.name not in {o.name for o in others}]
         mine = next(each for each in beside if each.name == item.name)
-        alike = tuple(each.name for each in beside if each is not mine and each.score > mine.score - decided().mean.class_margin)
+        least = mine.score - class_margin(mine.gain)
+        alike = tuple(each.name for each in beside if each is not mine and each.score > least)
         return Chosen(item.candidate, alike, self.search.p_value(mine.score), mine.gain, mine.score, self.search.tried(others))
 
     def _significant(self, score: float) -> bool:

@@ -110,9 +110,14 @@ def is_possible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     """Whether an entry's values lie within the bounds of its effect and are not far beyond what is typical of it."""
     if not within_bounds(model, entry):
         return False
-    effect = with_effects(model, [entry]).effects[-1]
+    return typical_sizes(entry) <= decided().mean.largest_size
+
+
+def typical_sizes(entry: dict[str, Any]) -> float:
+    """How many times its typical size an effect has; 0 of one that is not in the catalogue."""
+    effect = effect_of(entry["name"])
     sizes = effect.typical_sizes() if effect.catalogue else {}
-    return all(abs(getattr(effect, key)) <= decided().mean.largest_size * abs(typical) for key, typical in sizes.items())
+    return max((abs(entry.get(key, 0.0) / typical) for key, typical in sizes.items()), default=0.0)
 
 
 def from_comb(comb: Comb, part: Residuals) -> Named:
@@ -148,10 +153,10 @@ def from_shape(found: ShapeFound) -> Named:
     return Named(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
-def from_tails(sensor: str, sigma: float, points: int) -> Named:
+def from_tails(sensor: str, sigma: float, gain: float) -> Named:
     """Noise with heavy tails, which the catalogue does not have: its standard deviation as white noise, marked empirical."""
     name, key = (RangeNoise.tag(), "sigma_m") if sensor == "tls" else (ParallaxNoise.tag(), "sigma_px")
-    return Named(f"{sensor}.{name}", "empirical", {"name": name, key: sigma}, {}, (), None, float(points))
+    return Named(f"{sensor}.{name}", "empirical", {"name": name, key: sigma}, {}, (), None, gain)
 
 
 def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:

@@ -12,7 +12,7 @@ from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.entries import Named, from_comb, from_locking, from_mean, from_spread, within_bounds
 from pipeline.gap.naming.families import believes, families_of
-from pipeline.gap.naming.relinearised import Points, beyond, followed_up, noisier, weighed
+from pipeline.gap.naming.relinearised import Points, beyond, followed_up, noisier, undone, weighed
 from pipeline.gap.other.locking import find_locking
 from pipeline.gap.other.quantization import find_comb
 from pipeline.gap.other.spread import SpreadFound, SpreadTried, find_spread, share_of_spread
@@ -88,17 +88,19 @@ def name_effects(
     part = noisier(part, added)
     allowed = (each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out | found_apart)
     families = list(allowed)
-    spread, spread_tried = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
+    spread, spread_tried, words = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
     if wrong := _too_wide(measurement, spread):
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
     points = Points(measurement, part, families, spread, (scale, added), random)
     first = MeanSearch(weighed(part, spread, scale), families, random)
     found = followed_up(points, first)
+    names, cosines, survival = first.design.identifiability()
     wrong = beyond(measurement, found.estimates, found.at)
+    wrong |= undone(found.estimates, found.at, dict(zip(names, survival, strict=True)))
     design = found.search.design
     left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
-        spread, spread_tried = _spread(measurement, found.at, design.cells, left, random, left_out)
+        spread, spread_tried, words = _spread(measurement, found.at, design.cells, left, random, left_out)
     if not spread and isinstance(measurement.model, StereoModel) and (_NODES, False) not in left_out:
         nodes = find_nodes(found.at, left, measurement.model, random)
         spread = [] if nodes is None else [nodes]
@@ -107,9 +109,8 @@ def name_effects(
     moving = [from_mean(each, found.at) for each in found.estimates]
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
-    names, cosines, survival = first.design.identifiability()
     share = 1.0 if spread else share_of_spread(found.at, design.cells, left)
-    notes = (*part.notes, *_words(left_out))
+    notes = (*part.notes, *_words(left_out), *filter(None, [words]))
     p_value = found.search.p_value(found.tried[0].score) if found.tried else None
     alone = first.tried(()) if moving else ()
     p_alone = first.p_value(alone[0].score) if alone else p_value
@@ -128,13 +129,13 @@ def _spread(
     value: FloatArray,
     random: KeyedRandom,
     left_out: frozenset[tuple[str, bool]],
-) -> tuple[list[SpreadFound], list[SpreadTried]]:
-    """Effects on the spread of residuals (n,) without the mean effects found, and what was tried."""
+) -> tuple[list[SpreadFound], list[SpreadTried], str]:
+    """Effects on the spread of residuals (n,) without the mean effects found, what was tried, and words for a spread of none."""
     names = frozenset(name for name, empirical in left_out if not empirical)
-    found, tried = find_spread(part, cells, value, random, names)
+    found, tried, words = find_spread(part, cells, value, random, names)
     model = measurement.model
     apart = told_apart(found, part, value, model) if found and isinstance(model, StereoModel) else found
-    return [each for each in apart if each.effect not in names], tried
+    return [each for each in apart if each.effect not in names], tried, words
 
 
 def _too_wide(measurement: Measurement, spread: list[SpreadFound]) -> frozenset[tuple[str, bool]]:
@@ -145,4 +146,7 @@ def _too_wide(measurement: Measurement, spread: list[SpreadFound]) -> frozenset[
 
 def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
     said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out))
-    return [f"{what} left out: the best value is beyond what a config may hold" for what in said]
+    why = (
+        "the best value is beyond what a config may hold, or many times the usual where the registration undoes nearly all of it"
+    )
+    return [f"{what} left out: {why}" for what in said]

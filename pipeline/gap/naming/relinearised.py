@@ -11,8 +11,8 @@ from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, Grid, harmonics, precision_of
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import Chosen, Tried
-from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, with_effects
+from pipeline.gap.mean.selection import Chosen, Tried, class_margin
+from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, typical_sizes, with_effects
 from pipeline.gap.naming.families import PERIODIC, families_of
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.registration import registered, settled
@@ -140,7 +140,8 @@ def _largest_alone(points: Points, first: MeanSearch) -> _Alone | None:
 def _with_class(converged: list[_Alone]) -> _Alone:
     """The best, with those that would do as well: slopes say so of effects that were not taken exactly only."""
     best, *others = converged
-    near = {each.chosen.candidate.name for each in others if each.score > best.score - decided().mean.class_margin}
+    least = best.score - class_margin(best.chosen.gain)
+    near = {each.chosen.candidate.name for each in others if each.score > least}
     slopes = set(best.chosen.alike) - {each.chosen.candidate.name for each in others}
     return replace(best, chosen=replace(best.chosen, alike=tuple(sorted(near | slopes))))
 
@@ -168,6 +169,14 @@ def beyond(measurement: Measurement, estimates: list[Estimate], part: Residuals)
     """Families whose estimate lies beyond the bounds of the effect."""
     wrong = [each for each in estimates if not is_possible(measurement.model, from_mean(each, part).entry)]
     return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
+
+
+def undone(estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]) -> frozenset[tuple[str, bool]]:
+    """Effects far beyond their typical size of which the registration leaves next to nothing. survival: that share by name."""
+    by = decided().mean
+    doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.undone_share]
+    large = [each for each in doubtful if typical_sizes(from_mean(each, part).entry) > by.undone_size]
+    return frozenset((each.candidate.name, False) for each in large)
 
 
 def noisier(part: Residuals, variance: float) -> Residuals:

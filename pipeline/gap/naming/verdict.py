@@ -32,12 +32,14 @@ class Evidence:
     """The numbers that a verdict rests on.
 
     gap: on held-out points, None where there are too few; p_value: of what remains, None where it was not drawn; spread: share of
-    the predicted standard deviation that the residuals have where that is clearly less, else 1.
+    the predicted standard deviation that the residuals have where that is clearly less, else 1; far: share of points far out all
+    over the wall, 0 where they are as few as noise leaves.
     """
 
     gap: Gap | None
     p_value: float | None
     spread: float = 1.0
+    far: float = 0.0
 
     @property
     def rejects(self) -> bool:
@@ -47,11 +49,12 @@ class Evidence:
     @property
     def agrees(self) -> bool:
         """Whether the model without any effect is not rejected: by the gap on held-out points, and by what remains."""
-        return self.gap is not None and not self.gap.above_floor and self.p_value is not None and not self.rejects
+        measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
+        return measured and not self.rejects and not self.far
 
     def only_too_noisy(self, named: Sequence[Named]) -> bool:
         """Whether the model's noise is too large and nothing else was found to be wrong."""
-        return self.spread < 1.0 and not named and not self.rejects
+        return self.spread < 1.0 and not named and not self.rejects and not self.far
 
 
 def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:

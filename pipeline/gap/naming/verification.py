@@ -81,7 +81,7 @@ class Showing:
             return replace(self, lower={}).show(named)
         learned = self._of(named, self.learned) if shown.is_worse else shown
         while shown.is_worse:
-            doubtful = [item for item in shown.named if item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES]
+            doubtful = [item for item in shown.named if _may_be_harmful(item)]
             fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in doubtful]
             best = min(fewer, key=_score, default=learned)
             if _score(best) >= _score(learned):
@@ -122,6 +122,11 @@ class Showing:
         part = self.residuals.part(places[thinned(len(places))])
         random = self.random.child("verify")
         return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.largest, random)
+
+
+def _may_be_harmful(item: Named) -> bool:
+    """Of what is described, only noise: without a term on the mean nothing would be said to be wrong."""
+    return item.spreads or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)
 
 
 def _score(shown: Shown) -> float:

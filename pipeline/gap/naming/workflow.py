@@ -26,7 +26,7 @@ from pipeline.gap.naming.verify import Gap
 from pipeline.gap.other.footprint import find_footprint
 from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
 from pipeline.gap.other.shapes import ShapeFound
-from pipeline.gap.other.spread import SpreadTried, find_tails
+from pipeline.gap.other.spread import SpreadTried, Tails, find_tails
 from pipeline.gap.other.stereo_shapes import find_shapes
 from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
 from pipeline.gap.residuals.changes import SceneChange, find_changes
@@ -81,7 +81,7 @@ class Diagnosis:
     @property
     def evidence(self) -> Evidence:
         """The numbers that the verdict and its words rest on."""
-        return Evidence(self.gap, self.remaining["p_value"], self.remaining["spread"])
+        return Evidence(self.gap, self.remaining["p_value"], self.remaining["spread"], self.remaining["far"])
 
     @property
     def mended(self) -> bool:
@@ -125,7 +125,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     named = sorted([*named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
     named, wide = only_within_bounds(there.model, named)
     clock.lap("naming")
-    named, dropped = _confirmed(there, state, named, naming.reference_sigma)
+    named, tails, dropped = _confirmed(there, state, named, naming.reference_sigma)
     showing = Showing(
         measurement=there,
         residuals=plain,
@@ -140,7 +140,8 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     )
     shown, harmful = showing.show(named)
     notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *wide, *dropped, *harmful]
-    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share)
+    far = tails.share if tails is not None and tails.even else 0.0
+    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far)
     value = plain.value - plain.pose @ showing.pose
     clock.lap("verification")
     return Diagnosis(
@@ -156,7 +157,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
         gap=shown.gap,
         tried=naming.tried,
         spread_tried=naming.spread_tried,
-        remaining=_remaining(evidence.p_value, notes, naming.share, shown.lower),
+        remaining=_remaining(evidence, notes, shown.lower),
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,
@@ -271,8 +272,10 @@ def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random:
     return min(found, key=lambda each: each.complexity)
 
 
-def _confirmed(there: Measurement, state: _State, named: list[Named], reference_sigma: float) -> tuple[list[Named], list[str]]:
-    """The effects that hold on held-out blocks, with heavy tails and what would split each class; and words for the others."""
+def _confirmed(
+    there: Measurement, state: _State, named: list[Named], reference_sigma: float
+) -> tuple[list[Named], Tails | None, list[str]]:
+    """The effects that hold on held-out blocks, with what would split each class; heavy tails; and words for the others."""
     fit = state.residuals.smooth & ~state.changed
     tested = _thinned(np.flatnonzero(fit & state.held_out))
     rows = np.concatenate([state.chosen, tested])
@@ -285,7 +288,8 @@ def _confirmed(there: Measurement, state: _State, named: list[Named], reference_
     words += [f"{item.name} dropped: so much is left over by the empirical term" for item in left]
     steady = _thinned(np.flatnonzero(fit & ~state.held_out))
     kept = [item for item in scored.named if item not in left]
-    return with_splits(there, _with_tails(*few(there, state.residuals, steady), kept, state.cells.side_m)), words
+    found, tails = _with_tails(*few(there, state.residuals, steady), kept, state.cells.side_m)
+    return with_splits(there, found), tails, words + ([tails.words] if tails else [])
 
 
 def _thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -331,21 +335,34 @@ def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64])
     return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)
 
 
-def _with_tails(measurement: Measurement, residuals: Residuals, named: list[Named], side_m: float) -> list[Named]:
-    """Effects on the spread give way to heavy tails where those are, which no effect of the catalogue makes but two: strips that
-    are filled are also cells that had no match by chance, and drops return early."""
+def _with_tails(
+    measurement: Measurement, residuals: Residuals, named: list[Named], side_m: float
+) -> tuple[list[Named], Tails | None]:
+    """With heavy tails where those are all over the wall, which no effect of the catalogue makes but two: strips that are filled
+    are also cells that had no match by chance, and drops return early. An effect on the spread stays beside them where the
+    middle of the residuals is wider too."""
     if any(item.effect is OcclusionFill or item.entry.get("early_share") for item in named):
-        return named
+        return named, None
+    part, value, scale = _smooth_with(measurement, named)
+    tails = find_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
+    if tails is None or not tails.even:
+        return named, tails
+    steady = [item for item in named if not item.spreads]
+    if len(steady) < len(named):
+        _, _, middle = _smooth_with(measurement, steady)
+        if middle**2 - 1 > decided().spread.core_excess:
+            return named, tails
+    heavy = from_tails(part.sensor, tails.sigma * float(np.median(part.sigma)), tails.gain)
+    return [*steady, *only_within_bounds(measurement.model, [heavy])[0]], tails
+
+
+def _smooth_with(measurement: Measurement, named: list[Named]) -> tuple[Residuals, FloatArray, float]:
+    """Residuals on smooth rock against the model with some effects, registered ones (n,), and how many sigmas they spread."""
     model = with_effects(measurement.model, [item.entry for item in named])
     found = settled(measurement.changed(model=model))[1]
     part = found.part(np.flatnonzero(found.smooth))
     value, _, scale = registered(part)
-    tails = find_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
-    if tails is None:
-        return named
-    kept = [item for item in named if not item.spreads]
-    heavy = only_within_bounds(measurement.model, [from_tails(part.sensor, tails * float(np.median(part.sigma)), len(part))])[0]
-    return [*kept, *heavy] if heavy else named
+    return part, value, scale
 
 
 class _Clock:
@@ -365,9 +382,16 @@ class _Clock:
         return time.perf_counter() - self._start
 
 
-def _remaining(p_value: float | None, notes: list[str], spread: float = 1.0, lower_noise: dict[str, float] | None = None) -> Any:
-    """As gap.json holds it. spread: share of the predicted one that the residuals have where that is clearly less."""
-    return {"p_value": p_value, "note": "; ".join(notes), "spread": spread, "lower_noise": lower_noise or {}}
+def _remaining(evidence: Evidence, notes: list[str], lower_noise: dict[str, float]) -> dict[str, Any]:
+    """As gap.json holds it. spread: share of the predicted one that the residuals have where that is clearly less; far: share of
+    points far out all over the wall."""
+    return {
+        "p_value": evidence.p_value,
+        "note": "; ".join(notes),
+        "spread": evidence.spread,
+        "far": evidence.far,
+        "lower_noise": lower_noise,
+    }
 
 
 def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> Diagnosis:
@@ -376,7 +400,8 @@ def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock)
     empty = np.zeros(len(residuals))
     return Diagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, np.zeros(6), measurement.model,
-        None, (), (), _remaining(None, [note]), {"names": [], "cosines": [], "survival": []}, clock.total, clock.laps, decided(),
+        None, (), (), _remaining(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
+        clock.total, clock.laps, decided(),
     )  # fmt: skip
 
 

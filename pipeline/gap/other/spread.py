@@ -131,14 +131,14 @@ def _candidate(effect: type[Effect], geometry: Any, fixed: dict[str, float]) -> 
 
 def find_spread(
     residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom, left_out: frozenset[str] = frozenset()
-) -> tuple[list[SpreadFound], list[SpreadTried]]:
-    """The effects that the spread asks for, at most two, and all that were tried, best first.
+) -> tuple[list[SpreadFound], list[SpreadTried], str]:
+    """The effects that the spread asks for, at most two, all that were tried, best first, and words for a spread of no effect.
 
     value: (n,) residuals without the mean effects found; left_out: effects that are no candidates.
     """
     candidates = [each for each in spread_candidates(residuals) if each.name not in left_out]
     if not candidates:
-        return [], []
+        return [], [], ""
     weighed = residuals
     for again in (True, False):
         # noisy points move a cell's plane, and with that what its quiet points show, unless they have the weight they deserve
@@ -158,10 +158,11 @@ def find_spread(
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     by = decided().spread
     if best.gain < by.least_gain or p_value > by.significance or excess < by.least_excess:
-        return [], tried
+        return [], tried, ""
     # of disparities `stereo_noise` looks at neighbours, which noise on nodes moves alike too
-    if residuals.sensor == "tls" and _between_neighbours(residuals, value, kept, best.added(forms)) < by.least_between:
-        return [], tried
+    between = _between_neighbours(residuals, value, kept, best.added(forms)) if residuals.sensor == "tls" else 1.0
+    if between < by.least_between:
+        return [], tried, _shared_by_neighbours(excess, between, residuals.sigma)
     pairs = [
         _Joint.fitted(squared, forms, [first, second], candidates)
         for first, second in combinations(range(len(forms)), 2)
@@ -170,18 +171,20 @@ def find_spread(
     pair = max(pairs, key=lambda fit: fit.score, default=best)
     free_name, free_score, free = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()})
     # where one effect leaves something over, a second of the catalogue comes before a form of no effect
-    needed = by.second_gain if free_score > best.score + by.free_margin else by.least_gain
+    ahead = max(by.free_margin, by.class_share * best.gain)
+    needed = by.second_gain if free_score > best.score + ahead else by.least_gain
     agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    empirical = free_score > chosen.score + by.free_margin and _blocks_prefer(squared, chosen.added(forms), free, block)
+    empirical = free_score > chosen.score + ahead and _blocks_prefer(squared, chosen.added(forms), free, block)
     if empirical:
         chosen = best
     tried = sorted([*tried, SpreadTried(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
+    margin = max(by.class_margin, by.class_share * chosen.gain)
     found = []
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
         others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _differ_by(fit, chosen, number)]
-        near = {candidates[n].name for fit in others if fit.score > chosen.score - by.class_margin for n in fit.members}
+        near = {candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
         alike = near - {candidates[each].name for each in chosen.members}
         parameters = candidate.parameters(theta)
         std = candidate.errors(theta, chosen.error[place])
@@ -202,7 +205,17 @@ def find_spread(
                 candidate.variance @ theta,
             )
         )
-    return found, tried
+    return found, tried, ""
+
+
+def _shared_by_neighbours(excess: float, between: float, sigma: FloatArray) -> str:
+    """Words for a spread that neighbours share, which is no noise. excess: added variance over the predicted one."""
+    times, more = float(np.sqrt(1 + excess)), 1e3 * float(np.median(sigma)) * float(np.sqrt(excess))
+    shared = min(max(1 - between, 0.0), 1.0)
+    return (
+        f"the residuals spread {times:.2g} times what the model predicts ({more:.2g} mm more), and neighbours share {shared:.0%} "
+        "of that: an error of the reference, a change of the scene or wrong coordinates, not noise of the sensor"
+    )
 
 
 def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray, added: FloatArray) -> float:
@@ -315,18 +328,51 @@ def _p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np.int
     return float((1 + np.sum(largest >= np.max(scores.sum(axis=1) / size))) / (1 + DRAWS))
 
 
-def find_tails(z: FloatArray, block: NDArray[np.int64]) -> float | None:
-    """Standard deviation, in predicted ones, of noise with heavy tails that normal noise of the predicted spread leaves; or None.
+@dataclass(frozen=True)
+class Tails:
+    """Residuals farther out than normal noise of the predicted spread leaves them.
+
+    share: of all residuals, beyond `beyond` predicted sigmas; sigma: to how many predicted ones they raise the standard
+    deviation; gain: in log-likelihood, of that share being distributed so widely; even: whether they lie all over the wall, as an
+    instrument's own do, and not in parts of it, as at edges, in plants or where something moved.
+    """
+
+    share: float
+    beyond: float
+    sigma: float
+    gain: float
+    even: bool
+
+    @property
+    def words(self) -> str:
+        """As the report notes it."""
+        where = "all over the wall" if self.even else "in parts of the wall, as edges, plants and what moved leave them"
+        return f"{100 * self.share:.2g} % of the points lie beyond {self.beyond:g} predicted sigmas, {where}"
+
+
+def find_tails(z: FloatArray, block: NDArray[np.int64]) -> Tails | None:
+    """What lies farther out than it should, None where that is no more than normal noise and small faults of a reference leave.
 
     z: (n,) residuals over the spread that all effects together predict; of normal ones 6e-5 lie beyond 4.
     """
-    far = np.abs(z) > decided().spread.far
-    if far.mean() < decided().spread.most_far:
+    by = decided().spread
+    far = np.abs(z) > by.far
+    share = float(far.mean())
+    if share < by.most_far:
         return None
-    sums = np.bincount(np.unique(block, return_inverse=True)[1], far)
-    spread_out = float(sums.max()) < decided().spread.one_block * float(sums.sum())
-    excess = float(np.mean(np.minimum(z**2, _CUT**2))) - 1
-    return float(np.sqrt(max(excess, 0.0))) if spread_out else None
+    square = np.minimum(z**2, _CUT**2)
+    wide = max(float(square[far].mean()), 1.0)
+    mixed = np.log(1 - share + share / np.sqrt(wide) * np.exp(0.5 * square * (1 - 1 / wide)))
+    sigma = float(np.sqrt(max(float(square.mean()) - 1, 0.0)))
+    return Tails(share, by.far, sigma, float(mixed.sum()), _unevenness(far, block) < by.most_uneven)
+
+
+def _unevenness(far: BoolArray, block: NDArray[np.int64]) -> float:
+    """How much the share of far points differs between blocks beyond chance: its standard deviation over its mean."""
+    _, number = np.unique(block, return_inverse=True)
+    expected = np.bincount(number) * far.mean()
+    beyond_chance = np.sum((np.bincount(number, far) - expected) ** 2 - expected * (1 - far.mean()))
+    return float(np.sqrt(max(float(beyond_chance), 0.0) / np.sum(expected**2)))
 
 
 def _free_form(squared: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:

@@ -1,0 +1,69 @@
+"""Points far out: how many, where, and what they may and may not say of an instrument."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.gap.naming.relinearised import undone
+from pipeline.gap.other.spread import find_tails
+
+POINTS, BLOCKS = 30_000, 100
+
+
+def _residuals(share: float, uneven: bool, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Normal residuals of which a share is ten times as wide: at random, or in one block of six."""
+    rng = np.random.default_rng(seed)
+    block = rng.integers(0, BLOCKS, POINTS)
+    chance = np.where(block % 6 == 0, 6 * share, 0.0) if uneven else share
+    wide = rng.random(POINTS) < chance
+    return rng.standard_normal(POINTS) * np.where(wide, 10.0, 1.0), block
+
+
+def test_normal_residuals_have_no_tails() -> None:
+    assert find_tails(*_residuals(0.0, False)) is None
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_where_far_points_lie_says_whose_they_are(uneven: bool) -> None:
+    """Of 3 % of width 10 a share of 0.689 lies beyond 4: P(|z| > 0.4)."""
+    found = find_tails(*_residuals(0.03, uneven))
+    assert found is not None
+    assert found.even is not uneven
+    assert found.share == pytest.approx(0.03 * 0.689, rel=0.15)
+    assert ("all over the wall" in found.words) is not uneven
+    assert f"{100 * found.share:.2g} % of the points lie beyond 4 predicted sigmas" in found.words
+
+
+def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None:
+    """Of a mixture over a normal distribution: an oracle by the same densities written out."""
+    z, block = _residuals(0.03, False)
+    found = find_tails(z, block)
+    assert found is not None
+    cut = np.clip(z, -12, 12)
+    far = np.abs(z) > 4
+    wide = np.mean(cut[far] ** 2)
+    share = far.mean()
+
+    def density(value: Any, variance: float) -> Any:
+        return np.exp(-0.5 * value**2 / variance) / np.sqrt(2 * np.pi * variance)
+
+    mixed = (1 - share) * density(cut, 1.0) + share * density(cut, wide)
+    assert found.gain == pytest.approx(np.sum(np.log(mixed / density(cut, 1.0))), rel=1e-6)
+
+
+def _estimate(monkeypatch: pytest.MonkeyPatch, amplitude: float) -> Any:
+    entry = {"name": "horizontal_eccentricity", "amplitude_rad": amplitude, "phase_rad": 0.0}
+    monkeypatch.setattr("pipeline.gap.naming.relinearised.from_mean", lambda *_: SimpleNamespace(entry=entry))
+    return SimpleNamespace(candidate=SimpleNamespace(name="horizontal_eccentricity", empirical=False))
+
+
+@pytest.mark.parametrize(("amplitude", "left", "out"), [(3.8e-3, 0.04, True), (3.8e-3, 0.4, False), (2e-4, 0.04, False)])
+def test_an_effect_that_registration_undoes_is_not_believed_at_38_times_its_size(
+    monkeypatch: pytest.MonkeyPatch, amplitude: float, left: float, out: bool
+) -> None:
+    found = undone([_estimate(monkeypatch, amplitude)], Any, {"horizontal_eccentricity": left})  # type: ignore[arg-type]
+    assert found == (frozenset({("horizontal_eccentricity", False)}) if out else frozenset())
