@@ -44,7 +44,7 @@ class Outcome:
     placed: NDArray[np.float64]
 
 
-def true_outlines(blocks: Blocks, wall: RayCaster, grid: Grid, shift_m: FloatArray) -> IntArray:
+def true_outlines(blocks: Blocks, wall: RayCaster, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
     """(h, w) the block that takes the wall's surface along at each pixel, of the outlines moved by `shift_m` (h, w, 2)."""
     solids = RayCaster(TriangleMesh(blocks.vertices, blocks.faces, face_block=blocks.face_label))
     turned = RayCaster(TriangleMesh(blocks.vertices * [1.0, 1.0, -1.0], blocks.faces[:, ::-1].copy()))
@@ -53,7 +53,7 @@ def true_outlines(blocks: Blocks, wall: RayCaster, grid: Grid, shift_m: FloatArr
     return np.where(inside, solids.labels_down(grid, shift_m), np.int32(WALL))
 
 
-def _height(caster: RayCaster, grid: Grid, shift_m: FloatArray) -> FloatArray:
+def _height(caster: RayCaster, grid: Grid, shift_m: NDArray[np.float32]) -> FloatArray:
     hits, point = caster.look_down(grid, shift_m)
     return np.array(dr.select(hits.valid, point.z, np.nan)).reshape(grid.shape)
 

@@ -200,12 +200,12 @@ class RayCaster:
         met = face >= 0
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
-    def labels_down(self, grid: Grid, shift_m: FloatArray) -> IntArray:
+    def labels_down(self, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
         """(h, w) the label of the face seen along -z from each pixel's centre minus `shift_m` ((h, w, 2) in x and y)."""
         hits, _ = self.look_down(grid, shift_m)
         return np.array(hits.block).reshape(grid.shape)
 
-    def look_down(self, grid: Grid, shift_m: FloatArray | None = None) -> tuple[Hits, mi.Array3f64]:
+    def look_down(self, grid: Grid, shift_m: NDArray[np.float32] | None = None) -> tuple[Hits, mi.Array3f64]:
         """Cast one ray per pixel centre of `grid` along -z from above the mesh, row by row; returns hits and points.
 
         shift_m: (h, w, 2) by which the rays stand aside, towards -x and -y.

@@ -105,7 +105,9 @@ def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
     return np.asarray(spectrum)
 
 
-def true_change(wall: RayCaster, carved: RayCaster, block: IntArray, grid: Grid, shift_m: FloatArray) -> NDArray[np.float32]:
+def true_change(
+    wall: RayCaster, carved: RayCaster, block: IntArray, grid: Grid, shift_m: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """(h, w) what the wall really lost at the pixels with a label, m, 0 elsewhere, NaN where there is no wall.
 
     wall, carved: before and after; shift_m: (h, w, 2) by which the map is displaced, in x and y.

@@ -23,11 +23,11 @@ _OUTLIER = 6.0
 """Samples displaced by more than this many NMAD from the median met another surface than the one they are beside."""
 
 
-def displacement(observations: tuple[Observation, ...], registration: Registration | None, grid: Grid) -> FloatArray:
+def displacement(observations: tuple[Observation, ...], registration: Registration | None, grid: Grid) -> NDArray[np.float32]:
     """(h, w, 2) x and y of the map minus the truth at the pixels of `grid`, m; 0 where the samples do not know it."""
     samples = [_samples(each, registration) for each in observations]
     place, offset = (np.concatenate(parts) for parts in zip(*samples, strict=True))
-    result = np.zeros((*grid.shape, 2))
+    result = np.zeros((*grid.shape, 2), dtype=np.float32)
     if len(place) == 0:
         return result
     area = grid.width * grid.height * grid.gsd**2
@@ -37,11 +37,11 @@ def displacement(observations: tuple[Observation, ...], registration: Registrati
     row = np.clip(grid.rows(place[:, 1]) * grid.gsd / side, 0, rows - 1).astype(np.int64)
     cell = row * columns + column
     count = np.bincount(cell, minlength=rows * columns).reshape(rows, columns)
-    x, y = np.meshgrid(*((np.arange(size) + 0.5) * grid.gsd / side - 0.5 for size in (grid.width, grid.height)))
+    x, y = ((np.arange(size) + 0.5) * grid.gsd / side - 0.5 for size in (grid.width, grid.height))
+    maps = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
     for axis in range(2):
         total = np.bincount(cell, offset[:, axis], rows * columns).reshape(rows, columns)
         mean = _filled(np.asarray(total, dtype=np.float64), count)
-        maps = x.astype(np.float32), y.astype(np.float32)
         result[..., axis] = cv2.remap(mean.astype(np.float32), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return result
 

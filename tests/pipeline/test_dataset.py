@@ -312,7 +312,7 @@ def test_the_thesis_matrix() -> None:
     assert len(sets) == 9
     assert {epoch.sensor for epoch in plan} == {"stereo", "tls"}
     epochs = [epoch for epoch in plan if (epoch.sensor, epoch.noise, epoch.size) == ("stereo", "low", "small")]
-    tiles = {"train": 4 * 4, "val": 3 * 4}  # of 7 x 4.4 on 3500 x 2250 px
+    tiles = {"train": 4 * 3, "val": 3 * 3}  # of 7 x 2.9 on 3500 x 1500 px
     counts = {split: sum(tiles[split] for epoch in epochs if epoch.split == split) for split in tiles}
     assert 1600 <= sum(counts.values()) <= 1800
     assert counts["val"] / sum(counts.values()) == pytest.approx(0.2, abs=0.005)
@@ -333,7 +333,7 @@ def test_noise_is_scaled_and_its_grid_is_not() -> None:
     assert level is not None
     scaled, plain = level.on("bismantova").noise.model_dump(), level.model.noise.model_dump()
     factor = level.scale["bismantova"]  # type: ignore[index]
-    assert scaled["parallax_sigma_px"] == pytest.approx(factor * plain["parallax_sigma_px"])
+    assert scaled["parallax_sigma_px"] == plain["parallax_sigma_px"] < 1  # the orientation alone is scaled
     assert scaled["orientation"]["cx_px"]["sigma"] == pytest.approx(factor * plain["orientation"]["cx_px"]["sigma"])
     assert scaled["regularization_step_px"] == plain["regularization_step_px"]
     epoch = next(each for each in planned_epochs(config) if (each.noise, each.wall) == ("5cm", "bismantova"))
