@@ -6,6 +6,7 @@ Hypothesis draws the damage, the same at each run (derandomised); docs/robustnes
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -38,10 +39,12 @@ from scene.mesh import TriangleMesh
 from sensors.camera import Camera, CameraPair
 
 CONFIGS = Path(__file__).parent / "configs_of_versions" / "0.1"
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "25"))
+"""Of each kind of file and damage; benchmarks/fuzz.py tries 500."""
 QUICK = settings(
     derandomize=True,
     database=None,
-    max_examples=40,
+    max_examples=EXAMPLES,
     phases=[Phase.generate],
     deadline=timedelta(seconds=60),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],

@@ -1,6 +1,6 @@
 """Bad inputs, each to its command: how many are answered well.
 
-    python benchmarks/bad_inputs/run.py [--only WORD ...] [--jobs 2] [--table docs/robustness.md]
+    python benchmarks/bad_inputs/run.py [--listed] [--only WORD ...] [--jobs 2] [--table docs/robustness.md]
 
 Each runs as a process of its own, some seconds long, on copies of small good inputs that are made first. Prints those that are
 answered badly (see case.py for what that is), and counts by command; exit status 1 where
@@ -29,6 +29,13 @@ BEGIN, END = "<!-- bad inputs: begin -->", "<!-- bad inputs: end -->"
 
 def all_cases() -> list[Case]:
     return [*gap_cases.cases(), *coco_cases.cases(), *dataset_cases.cases(), *site_cases.cases()]
+
+
+def listed_cases() -> list[Case]:
+    """Those of listed.txt; KeyError for a name that no case has."""
+    known = {case.name: case for case in all_cases()}
+    lines = (Path(__file__).parent / "listed.txt").read_text(encoding="utf-8").splitlines()
+    return [known[name] for name in lines if not name.startswith("#")]
 
 
 def run(
@@ -75,13 +82,15 @@ def table(outcomes: Sequence[Outcome]) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description="bad inputs, each to its command")
     parser.add_argument("--only", nargs="+", default=[], help="cases whose names hold one of these words")
+    parser.add_argument("--listed", action="store_true", help="those of listed.txt alone, which were answered badly once")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--materials", type=Path, help="keep the good inputs here, or take those that are here")
     parser.add_argument("--table", type=Path, help="a page with the two marks between which the table goes")
     parser.add_argument("--show", action="store_true", help="print the good answers too")
     parser.add_argument("--here", action="store_true", help="in this process: faster, and memory is not looked at")
     arguments = parser.parse_args()
-    cases = [case for case in all_cases() if not arguments.only or any(word in case.name for word in arguments.only)]
+    chosen = listed_cases() if arguments.listed else all_cases()
+    cases = [case for case in chosen if not arguments.only or any(word in case.name for word in arguments.only)]
     outcomes = run(cases, arguments.jobs, arguments.materials, here=arguments.here, show=arguments.show)
     print(table(outcomes))
     if arguments.table:

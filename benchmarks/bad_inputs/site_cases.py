@@ -203,7 +203,7 @@ _CALIBRATE: dict[str, Change] = {
 }  # fmt: skip
 _MAP = "run/difference_001.tif"
 _CALIBRATION: dict[str, tuple[str, ...]] = {
-    "same map twice": (_MAP, _MAP),
+    "same map twice": (_MAP, _MAP, "--sensor", "tls", "--config", SITE),
     "one map": (_MAP,),
     "no such map": ("none.tif",),
     "a picture": ("run/reference.png",),

@@ -35,10 +35,11 @@ from pipeline.cli import (
 )
 from pipeline.cli import simulate as simulate_command
 from pipeline.cli.answer import Answer, as_json
+from pipeline.cli.interrupt import INTERRUPTED, second_interrupt_ends
 from pipeline.cli.parser import Parser
 from scene.errors import InputError, OutsideError, nearest, one_line
 
-DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_INPUT = 0, 1, 2
 _BAD_PLACES = {
     errno.ENOSPC: "make room, or choose another folder with --out",
     errno.EDQUOT: "make room, or choose another folder with --out",
@@ -140,7 +141,8 @@ def _carry_out(prog: str, command: Command, words: list[str]) -> int:
         parser = command_parser(prog, command)
         arguments = parser.parse(words)
         as_document = getattr(arguments, "json", False)
-        with redirect_stdout(sys.stderr) if as_document else nullcontext():
+        ended = second_interrupt_ends(lambda: arguments.kept or "nothing is kept")
+        with redirect_stdout(sys.stderr) if as_document else nullcontext(), ended:
             answer = command.run(arguments)
             text = as_json(answer.document()) if as_document else answer.text
         print(text)

@@ -20,6 +20,7 @@ from pipeline.dataset.records import SHARDS, Record, read_dataset_file, read_sha
 from pipeline.dataset.statistics import SetStatistics
 from pipeline.formats.atomic import write_text, writing
 from pipeline.formats.checksum import sha256
+from scene.errors import InputError
 
 ANNOTATIONS = "annotations.json"
 
@@ -71,6 +72,15 @@ def shards(folder: Path, dataset: Record) -> Iterator[Record]:
         record = read_shard(folder, name)
         if record is not None:
             yield record
+
+
+def whole_shards(folder: Path, dataset: Record) -> Iterator[Record]:
+    """All epochs' records; raises InputError where one is missing or damaged."""
+    for name in _shard_names(dataset):
+        record = read_shard(folder, name)
+        if record is None:
+            raise InputError("is missing or damaged", where=str(folder / SHARDS / name), remedy="verify its set")
+        yield record
 
 
 def assembled_damages(folder: Path) -> list[Damage]:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import shutil
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pipeline.dataset.assemble import assemble, shards
+from pipeline.dataset.assemble import assemble, whole_shards
 from pipeline.dataset.folder import tile_files
 from pipeline.dataset.records import SHARDS, Record, read_dataset_file, shard_name, write_dataset_file, write_shard
 from pipeline.dataset.run import DatasetSummary
+from pipeline.formats.atomic import note, noting, remove_written
 from pipeline.formats.checksum import sha256
 from pipeline.formats.inside import inside
 from pipeline.formats.lock import is_free, locked
@@ -36,9 +38,9 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
                 raise InputError("holds epochs that an earlier one holds too", where=str(folder), remedy="give each set once")
             epochs[source] = sorted({*epochs[source], *indices})
             sources[source] = {**dataset["sources"][source], "prefix": f"{source}_"}
-    with locked(_new(out)):
+    with locked(_new(out)), _all_or_nothing(out):
         for folder, dataset in sets:
-            for record in shards(folder, dataset):
+            for record in whole_shards(folder, dataset):
                 _copy(folder, out, record, dataset["sources"][record["source"]]["prefix"], f"{record['source']}_")
         name = "-".join(dict.fromkeys(dataset["name"] for _, dataset in sets))
         return _finish(out, name, sources, dict(epochs))
@@ -54,16 +56,32 @@ def split_dataset(folder: Path, out: Path, keys: Sequence[str]) -> list[DatasetS
             raise InputError(f"unknown key '{key}'", where="--by", allowed=", ".join(KEYS), remedy=nearest(key, KEYS))
     dataset = _finished(folder)
     found: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
-    for record in shards(folder, dataset):
+    for record in whole_shards(folder, dataset):
         name = "_".join(record["epoch"][key] for key in keys)
         found[name][record["source"]].append(record["epoch"]["index"])
-    return [_part(folder, out / name, f"{dataset['name']}_{name}", dataset, epochs) for name, epochs in found.items()]
+    with _all_or_nothing(out):
+        return [_part(folder, out / name, f"{dataset['name']}_{name}", dataset, epochs) for name, epochs in found.items()]
+
+
+@contextmanager
+def _all_or_nothing(out: Path) -> Iterator[None]:
+    """Remove what the block wrote into `out` where it ends with wrong input."""
+    missing = [each for each in (out, *out.parents) if not each.exists()]
+    with noting() as written:
+        try:
+            yield
+        except InputError:
+            remove_written(out, written)
+            for each in missing:
+                with suppress(OSError):  # holds what others put there
+                    each.rmdir()
+            raise
 
 
 def _part(folder: Path, out: Path, name: str, dataset: Record, epochs: dict[str, list[int]]) -> DatasetSummary:
     sources = {source: dataset["sources"][source] for source in epochs}
     with locked(_new(out)):
-        for record in shards(folder, {"epochs": epochs}):
+        for record in whole_shards(folder, {"epochs": epochs}):
             prefix = sources[record["source"]]["prefix"]
             _copy(folder, out, record, prefix, prefix)
         return _finish(out, name, sources, {source: list(indices) for source, indices in epochs.items()})
@@ -96,6 +114,7 @@ def _copy(folder: Path, out: Path, record: Record, before: str, after: str) -> N
     for name, (new, digest) in zip(old, tile_files(record), strict=True):
         source, target = inside(folder, name, folder / SHARDS / shard), inside(out, new, folder / SHARDS / shard)
         target.parent.mkdir(parents=True, exist_ok=True)
+        note(target)
         if not source.is_file() or sha256(shutil.copyfile(source, target)) != digest:
             raise InputError("is missing or damaged", where=str(source), remedy="verify its set")
     write_shard(out, shard, record)

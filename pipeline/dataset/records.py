@@ -19,7 +19,7 @@ from scene.regular_file import read_json, read_text
 SCHEMA = 1
 SHARDS = "shards"
 Record = dict[str, Any]
-_REMEDY = "put it back from a copy, or make the set again in another folder"
+_REMEDY = "put it back from a copy, or make the set again in another folder; tiles and annotations.json stay usable"
 _Fingerprint = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")]
 _Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 

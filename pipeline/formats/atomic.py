@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from datetime import datetime
 from pathlib import Path
@@ -77,6 +77,17 @@ def note(path: Path) -> None:
     found = _noted.get()
     if found is not None:
         found.append(path)
+
+
+def remove_written(out: Path, written: list[Path]) -> None:
+    """Remove files (of a `noting`), and the folders in `out` that hold nothing else; what others put beside them stays."""
+    for path in written:
+        with suppress(OSError):  # is gone: it was renamed with its folder
+            path.unlink()
+    folders = {folder for path in written for folder in path.parents if out in folder.parents}
+    for folder in sorted(folders, reverse=True):  # the inner ones first
+        with suppress(OSError):  # is gone, or holds another's file
+            folder.rmdir()
 
 
 def give_name(temporary: Path, path: Path) -> None:

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.change.annotate import merge
 from pipeline.config.simulation import CamerasFile, SensorName, SimulationConfig
-from pipeline.formats.atomic import noting, write_json
+from pipeline.formats.atomic import noting, remove_written, write_json
 from pipeline.formats.checksum import sha256
 from pipeline.formats.crs import wkt_of
 from pipeline.formats.lock import is_free, locked
@@ -195,13 +194,7 @@ def _leave_nothing_half_written(run: _Run, resumed: bool, written: list[Path]) -
     _remove_unfinished(run.out)
     if resumed or run.has(1):
         return
-    for path in written:
-        with suppress(OSError):  # is gone: it was renamed with its folder
-            path.unlink()
-    folders = {folder for path in written for folder in path.parents if run.out in folder.parents}
-    for folder in sorted(folders, reverse=True):  # the inner ones first
-        with suppress(OSError):  # is gone, or holds another's file
-            folder.rmdir()
+    remove_written(run.out, written)
 
 
 def _finish(run: _Run, site: Site, *, complete: bool) -> RunSummary:

@@ -254,3 +254,14 @@ def test_what_others_put_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_too_many_workers_are_refused_by_verify_too(copy: Path) -> None:
     with pytest.raises(InputError, match="--workers"):
         verify_dataset(copy, Workers(100_000))
+
+
+@pytest.mark.parametrize("spoil", ["tile", "shard"])
+def test_a_set_that_is_not_whole_is_neither_merged_nor_split(spoil: str, copy: Path, tmp_path: Path) -> None:
+    """The last epoch: what was copied before it is taken back."""
+    tile = max((copy / "test").glob("*.tif"))
+    path = tile if spoil == "tile" else max((copy / "shards").glob("*.json"))
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(InputError, match="is missing or damaged; verify its set"):
+        split_dataset(copy, tmp_path / "parts", ["sensor"])
+    assert not (tmp_path / "parts").exists()

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,28 @@ def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
     with locked(tmp_path / "run"):
         pass
     assert list((tmp_path / "run").iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_goes_on_to_the_same_bytes(finished: Path, tmp_path: Path) -> None:
+    """kill -9 of the command itself in the middle of the reference epoch, then of its successor among the maps."""
+    out, coarse = tmp_path / "run", tmp_path / "coarse.yaml"
+    coarse.write_text(json.dumps(config(**COARSE).model_dump(mode="json")))
+    program = "from pipeline.cli.main import simulate; raise SystemExit(simulate())"
+    words = ["--sensor", "tls", "--config", str(coarse), "--out", str(out), "--quiet"]
+    for moment in (".epoch_000/points.laz", "difference_001.tif"):
+        process = subprocess.Popen(
+            [sys.executable, "-c", program, *words, *(["--resume"] if (out / "run.json").exists() else [])],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        while not (out / moment).exists():
+            assert process.poll() is None
+            time.sleep(0.001)
+        process.kill()
+        process.wait()
+    simulate(config(**COARSE), "tls", out, resume=True)
+    assert digests(out) == digests(finished)
+    assert not list(out.rglob(".*"))
 
 
 def cut(path: Path) -> None:

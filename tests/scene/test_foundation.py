@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 from scene.raycast import RayCaster, heights
+from scene.regular_file import check_file
 
 SIGNIFICANCE = 1e-5
 """False-failure rate of each statistical test here; seeds are fixed."""
@@ -271,6 +273,58 @@ def test_a_config_file_that_cannot_be_read_is_an_input_error(tmp_path: Path) -> 
     (tmp_path / "tag.yaml").write_text("a: !!python/object/apply:os.system ['true']")
     with pytest.raises(InputError, match="not valid YAML"):
         load_yaml(tmp_path / "tag.yaml")
+
+
+MERGE_BOMB = "m0: &m0 {k: 1}\n" + "".join(
+    f"m{level}: &m{level} {{<<: [{', '.join([f'*m{level - 1}'] * 9)}]}}\n" for level in range(1, 11)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (MERGE_BOMB, "10,000 keys"),
+        ("seed: " + "1" * 5000, "a number of 5,000 digits"),
+        ("# a\n" * 1_100_000, "has 4 MB; allowed: up to 4 MB"),
+    ],
+    ids=["merge_keys", "digits", "large"],
+)  # fmt: skip
+def test_yaml_that_takes_without_end_is_refused(text: str, problem: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(InputError, match=problem) as caught:
+        load_yaml(tmp_path / "a.yaml")
+    assert len(str(caught.value)) < 1000
+
+
+def test_json_is_read_as_a_config(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"seed": 1, "wall": {"width_m": 1e1}}')
+    assert load_yaml(tmp_path / "a.json") == {"seed": 1, "wall": {"width_m": 10.0}}
+
+
+@pytest.mark.parametrize(
+    ("make", "problem"),
+    [
+        (os.mkfifo, "is a pipe, a device or a socket"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a pipe, a device or a socket"),
+        (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
+        (lambda path: path.mkdir(), "Is a directory"),
+        (lambda path: None, "No such file or directory"),
+    ],
+)
+def test_what_is_no_file_is_not_opened(make: Any, problem: str, tmp_path: Path) -> None:
+    make(tmp_path / "a")
+    with pytest.raises(InputError, match=problem):
+        check_file(tmp_path / "a")
+    for name in ("a" * 5000, "a\0b"):
+        with pytest.raises(InputError, match="cannot be read"):
+            check_file(tmp_path / name)
+
+
+def test_a_message_is_one_plain_line_of_bounded_length() -> None:
+    text = str(InputError("is \x1b[31mred\n\x07", where="a" * 10_000, allowed="b", remedy="c"))
+    assert text.endswith("is \ufffd[31mred \ufffd; allowed: b; c")
+    assert len(text) < 700
+    assert text.isprintable()
 
 
 def test_a_wrong_variant_is_an_input_error() -> None:
