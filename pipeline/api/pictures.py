@@ -62,7 +62,7 @@ def html_table(title: str, rows: Mapping[str, Any], picture: Picture | None = No
     lines = "".join(
         f"<tr><th style='text-align:left'>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows.items()
     )
-    shown = "" if picture is None else f"<img src='{picture_source(picture.small())}' alt='{_text(title)}'>"
+    shown = "" if picture is None else f'<img src="{picture_source(picture.small())}" alt="{_text(title)}">'
     return f"<div><strong>{_text(title)}</strong><table>{lines}</table>{shown}</div>"
 
 

@@ -61,7 +61,7 @@ def true_minus(value: float, digits: int) -> str:
 
 
 def picture_source(png: bytes) -> str:
-    """A picture as the source of an <img>, inside the page."""
+    """A PNG as the `src` of a picture that stands inside the page."""
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import rasterio
 import rioxarray
+import trimesh
 import xarray
 
 from pipeline import Mesh, Points, Run, SimulationConfig, configure, detect, open_run, plan, simulate
@@ -119,6 +120,20 @@ def test_everything_with_a_picture_shows_it(run: Run, tmp_path: Path) -> None:
     assert len(repr(pictures[0])) < 60
     with pytest.raises(InputError, match="allowed: difference"):
         run.plot("diference")
+
+
+def test_a_surface_goes_to_slides_with_its_differences_as_colours(run: Run, tmp_path: Path) -> None:
+    scene = trimesh.load(run[1].save_gltf(tmp_path / "wall.glb"))
+    (mesh,) = scene.geometry.values()
+    surface = run[1].surface
+    assert np.allclose(mesh.vertices, surface.vertices, atol=1e-4)
+    red, green, blue, _ = np.asarray(mesh.visual.vertex_colors, dtype=int).T
+    x, y = (xarray.DataArray(surface.vertices[:, axis]) for axis in (0, 1))
+    fallen = run[1].difference.interp(x=x, y=y, method="nearest")
+    assert np.all((red > green + 80)[fallen.values > 0.1])
+    assert np.median(np.abs(red - blue)[np.abs(fallen.values) < 0.002]) < 60
+    with pytest.raises(InputError, match=r"allowed: \.glb"):
+        run[1].save_gltf(tmp_path / "wall.obj")
 
 
 def test_an_opened_run_is_the_same(run: Run, tmp_path: Path) -> None:
