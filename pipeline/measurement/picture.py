@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from pipeline.report.figures import FAMILY, SEQUENTIAL, dress, png_bytes
@@ -21,20 +22,22 @@ def picture(points: FloatArray, mesh: TriangleMesh, position: FloatArray, rotati
     here = position - origin
     above.scatter(*known[:, :2].T, s=0.5, color="#b5b5b5", linewidths=0, label="reference")
     above.scatter(*few[:, :2].T, s=0.5, color=FAMILY[0], linewidths=0, label="scan")
-    above.plot(here[0], here[1], marker="*", markersize=13, color=FAMILY[1], linestyle="none", label="scanner")
+    above.plot(here[0], here[1], marker="*", markersize=13, color=FAMILY[1], linestyle="none", label="sensor")
     _fan(above, few, here)
     above.set_aspect("equal", adjustable="datalim")
     shift = "" if not origin.any() else f" less {origin[0]:,.0f}", f" less {origin[1]:,.0f}" if origin.any() else ""
     dress(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
     above.set_title("from above")
-    above.legend(markerscale=1, loc="best", fontsize=8)
+    for handle in above.legend(loc="best", fontsize=8).legend_handles:
+        if isinstance(handle, PathCollection):
+            handle.set_sizes([16])  # the dots themselves are too small to tell their colours
     distance, azimuth, zenith = polar(np.einsum("ij,ni->nj", rotation, few - here))
     middle = float(np.angle(np.mean(np.exp(1j * azimuth))))
     azimuth = middle + np.angle(np.exp(1j * (azimuth - middle)))
     dots = seen.scatter(np.degrees(azimuth), np.degrees(zenith), c=distance, s=0.8, cmap=SEQUENTIAL, linewidths=0)
     seen.invert_yaxis()
     dress(seen, "azimuth, degrees", "zenith angle, degrees")
-    seen.set_title("as the scanner sees it")
+    seen.set_title("as the sensor sees it")
     figure.colorbar(dots, ax=seen, label="range, m")
     figure.suptitle(title)
     return png_bytes(figure)
