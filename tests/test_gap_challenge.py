@@ -224,7 +224,7 @@ def test_right_answers_score_well() -> None:
     found = figures_of(pair("one", "a", "a", ("c",)), pair("none"), pair("change"), pair("off", "off_a", verdict="unknown"))
     assert found["right class"]["value"] == 1.0
     assert found["wrong names among committed answers"]["value"] == 0.0
-    assert found["false alarms on no-effect cases"]["reached"]
+    assert found["false alarms on no-effect cases"]["reached"] == "undecided"  # one quiet case shows no 1 %
     assert found["off-catalogue effects answered unknown"]["value"] == 1.0
     assert found["90 % intervals that contain the true parameter"]["value"] == 1.0
     assert found["gap closed by the best wrong effect outside the class (median)"]["value"] == 0.03
@@ -241,6 +241,15 @@ def test_the_control_is_shown_beside_what_the_angle_lets_a_wrong_effect_close() 
     alone = "the same, where that angle leaves it 5 %"
     assert found[alone]["value"] is None
     assert figures_of(near, far)[alone]["value"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("alarms", "cases", "reached"), [(0, 64, "undecided"), (0, 400, "yes"), (20, 64, "no"), (1, 64, "undecided")]
+)
+def test_what_an_interval_does_not_settle_is_undecided(alarms: int, cases: int, reached: str) -> None:
+    """0 of 64 is 0 to 5.7 % (Wilson), 0 of 400 to 0.95 %."""
+    found = figures_of(*([pair("none", said="a")] * alarms + [pair("none")] * (cases - alarms)))
+    assert found["false alarms on no-effect cases"]["reached"] == reached
 
 
 def test_wrong_answers_score_badly() -> None:

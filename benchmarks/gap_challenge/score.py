@@ -25,6 +25,7 @@ def score(pairs: list[tuple[Json, Json]]) -> Json:
     rows = [_row(truth, answer) for truth, answer in pairs]
     return {
         "figures": _figures(rows),
+        "by_sensor": {sensor: _figures([row for row in rows if row["sensor"] == sensor]) for sensor in ("tls", "stereo")},
         "confusion": _confusion(rows),
         "by_effect": _by_effect(rows),
         "detection": {sensor: _curve([row for row in rows if row["sensor"] == sensor]) for sensor in ("tls", "stereo")},
@@ -225,24 +226,28 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
 
 def _share(what: str, of: list[Any], hit: Any, goal: str, limits: tuple[float, float] | None) -> Json:
-    """A row of the table. Above a band with two ends a share still counts as reached where its interval meets the band."""
+    """A row of the table; what its 95 % interval does not settle is undecided."""
     count, successes = len(of), sum(bool(hit(item)) for item in of)
     value = successes / count if count else None
     low, high = wilson(successes, count)
     return {
         "what": what, "goal": goal, "value": value, "successes": successes, "count": count, "interval": [low, high],
-        "reached": None if value is None or limits is None else _within(value, low, limits),
+        "reached": None if value is None or limits is None else _settled(low, high, successes, limits),
     }  # fmt: skip
 
 
-def _within(value: float, lower_end: float, limits: tuple[float, float]) -> bool:
-    above = value > limits[1] and not (limits[0] > 0 and lower_end <= limits[1])
-    return value >= limits[0] and not above
+def _settled(low: float, high: float, successes: int, limits: tuple[float, float]) -> str:
+    """Whether all of an interval lies within the limits, none of it, or neither; of limits that are one number, by the count."""
+    if limits == (0.0, 0.0):
+        return "no" if successes else "yes"
+    if limits[0] <= low and high <= limits[1]:
+        return "yes"
+    return "no" if high < limits[0] or low > limits[1] else "undecided"
 
 
 def _number(what: str, values: list[float], statistic: Any, goal: str, limits: tuple[float, float] | None) -> Json:
     value = float(statistic(values)) if values else None
-    reached = None if value is None or limits is None else bool(limits[0] <= value <= limits[1])
+    reached = None if value is None or limits is None else ("yes" if limits[0] <= value <= limits[1] else "no")
     return {"what": what, "goal": goal, "value": value, "count": len(values), "reached": reached, "percent": "size" not in what}
 
 

@@ -24,6 +24,9 @@ quarter of the cases each; in one of eight laser cases an effect that the model 
 sin(angle), from 2 to 120, even in its logarithm, where no more than three times the catalogue's largest typical size gives it."""
 
 
+_UNDECIDED = "undecided: the 95 % interval holds values that reach the goal and values that do not."
+
+
 def markdown(found: Json) -> str:
     """docs/gap_challenge.md, from results.json."""
     parts = [
@@ -33,7 +36,8 @@ def markdown(found: Json) -> str:
         "noise and the reference's correlated error; x sin(angle): what is left of it when the nearest "
         "effect of another class is fitted too (signatures with sin < 0.1 make one class).",
         _ALWAYS,
-        _figures(found["figures"]),
+        _figures(found["figures"], found["by_sensor"]),
+        _UNDECIDED,
         _command(found["settings"]),
         f"A case took {found['seconds'].get('median', 0):.0f} s (median), {found['seconds'].get('longest', 0):.0f} s at most.",
         "## Beside two baselines\n\nBoth take residuals for independent and give one name: the effect with the largest |z| above "
@@ -57,7 +61,7 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _figures(figures: list[Json]) -> str:
+def _figures(figures: list[Json], by_sensor: dict[str, list[Json]]) -> str:
     def value(row: Json) -> str:
         if row["value"] is None:
             return "no cases"
@@ -66,10 +70,15 @@ def _figures(figures: list[Json]) -> str:
             return f"{100 * row['value']:.1f} % ({row['successes']} of {row['count']}; 95 %: {100 * low:.0f}-{100 * high:.0f})"
         return f"{100 * row['value']:.1f} % (of {row['count']})" if row["percent"] else f"{row['value']:g} (of {row['count']})"
 
-    reached = {True: "yes", False: "**no**", None: ""}
-    return _table(
-        ("what", "to reach", "found", "reached"), ((r["what"], r["goal"], value(r), reached[r["reached"]]) for r in figures)
-    )
+    reached = {"yes": "yes", "no": "**no**", "undecided": "undecided", None: ""}
+
+    def cell(row: Json) -> str:
+        said = reached[row["reached"]]
+        return f"{value(row)}, {said}" if said else value(row)
+
+    head = ("what", "to reach", "both sensors", "laser", "stereo")
+    columns = zip(figures, by_sensor["tls"], by_sensor["stereo"], strict=True)
+    return _table(head, ((each[0]["what"], each[0]["goal"], *map(cell, each)) for each in columns))
 
 
 def _baselines(found: Json) -> str:
