@@ -31,7 +31,6 @@ from sensors.model import StereoModel, TlsModel
 
 FILE = "measurement.yaml"
 MOST_EPOCHS = 1000
-Sweep = tuple[float, float, float]
 _FEW_DIGITS, _ROUNDING = 0.005, 1e-9
 """How far a rotation matrix may be from orthonormal for want of digits, and how far it is left as it stands."""
 
