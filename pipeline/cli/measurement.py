@@ -11,10 +11,12 @@ from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least, one_of
 
 if TYPE_CHECKING:
-    from pipeline.measurement.build import Request, Understood
+    from pipeline.measurement.build import Request
+    from pipeline.measurement.folder import Understood
 
 SUMMARY = "build the folder that gap takes out of raw scans and a reference; say what was understood"
 EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner riegl_vz400i --out my_measurement
+  scarpsim measurement cloud.laz --cameras cameras.xml --reference scan.laz --out my_measurement
   scarpsim measurement scan.laz --reference half --scanner leica_p50 --position 12.1,40.3,2.5 --out my_measurement"""
 
 
@@ -30,7 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """What a raw scan needs beside itself; `gap` takes the same."""
     parser.add_argument(
-        "--reference", metavar="FILE|half", help="the surface as known: a mesh, a cloud, another epoch; half: of the scan itself"
+        "--reference",
+        metavar="FILE|half",
+        help="the surface as known: a mesh, a cloud, another epoch, a DEM; half: of the scan itself",
     )
     parser.add_argument("--scanner", metavar="PRESET", help="what is believed about the scanner, such as riegl_vz400i, or a file")
     parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
@@ -46,6 +50,10 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
     )
+    parser.add_argument(
+        "--cameras", type=Path, metavar="FILE", help="the points are from photographs: cameras.yaml, Metashape XML, COLMAP folder"
+    )
+    parser.add_argument("--pair", type=pair, metavar="LEFT,RIGHT", help="which two cameras of a project")
     parser.add_argument("--scan", type=at_least(1), metavar="N", help="take one scan of a file that holds several")
 
 
@@ -56,9 +64,10 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Understood:
     """Build the folder that the arguments ask for."""
-    from pipeline.measurement.build import build
+    from pipeline.measurement.build import build, build_stereo
 
-    return build(_request(arguments, scans), out)
+    request = _request(arguments, scans)
+    return build_stereo(request, arguments.cameras, arguments.pair, out) if arguments.cameras else build(request, out)
 
 
 def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
@@ -84,6 +93,14 @@ def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
 def words(text: str) -> list[str]:
     """An argument's type: words between commas."""
     return [word.strip().lower() for word in text.split(",")]
+
+
+def pair(text: str) -> tuple[str, str]:
+    """An argument's type: two labels."""
+    labels = [label.strip() for label in text.split(",")]
+    if len(labels) != 2 or not all(labels):
+        raise argparse.ArgumentTypeError(f"got '{text}'; allowed: two cameras' labels with a comma between")
+    return labels[0], labels[1]
 
 
 def numbers(count: int) -> Callable[[str], Any]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Discriminator, Field, Tag, field_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from pipeline.change.areas import Area, in_areas
 from pipeline.formats.camera_files import read_oriented, stereo_pair
@@ -31,6 +31,8 @@ from sensors.model import StereoModel, TlsModel
 
 FILE = "measurement.yaml"
 MOST_EPOCHS = 1000
+_FEW_DIGITS, _ROUNDING = 0.005, 1e-9
+"""How far a rotation matrix may be from orthonormal for want of digits, and how far it is left as it stands."""
 
 
 class ScannerPose(Config):
@@ -42,20 +44,45 @@ class ScannerPose(Config):
     @field_validator("rotation")
     @classmethod
     def _orthonormal(cls, rotation: Matrix3) -> Matrix3:
-        return check_rotation(rotation)
+        """A rotation of few digits becomes the nearest one (`_mended` says so); one that is none is refused."""
+        rows = np.array(rotation)
+        if np.linalg.det(rows) <= 0 or np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS:
+            return check_rotation(rotation)
+        left, _, right = np.linalg.svd(rows)
+        first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in left @ right)
+        nearest: Matrix3 = (first, second, third)
+        return rotation if np.abs(rows - left @ right).max() < _ROUNDING else nearest
 
 
 class ScanPattern(Config):
     """The nominal directions of a scan: start, stop and step of each angle."""
 
-    azimuth_rad: Sweep = Field(description="start, stop, step [rad]")
-    zenith_rad: Sweep = Field(description="start, stop, step [rad]")
+    azimuth_rad: Sweep = Field(description="start, stop, step [rad]; or azimuth_deg")
+    zenith_rad: Sweep = Field(description="start, stop, step [rad]; or zenith_deg")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_degrees(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        found = dict(values)
+        for name in ("azimuth", "zenith"):
+            sweep = found.get(f"{name}_deg")
+            if isinstance(sweep, list | tuple) and all(isinstance(each, int | float) for each in sweep):
+                if f"{name}_rad" in found:
+                    raise ValueError(f"'{name}_deg' stands beside '{name}_rad'; give one of them")
+                found[f"{name}_rad"] = [math.radians(each) for each in found.pop(f"{name}_deg")]
+        return found
 
     @field_validator("azimuth_rad", "zenith_rad")
     @classmethod
     def _forward(cls, sweep: Sweep) -> Sweep:
+        """A sweep of a scanner that turns the other way (step below 0) is the same directions from its other end."""
+        start, stop, step = sweep
+        if step < 0 and stop < start:
+            sweep = start + step * math.floor((stop - start) / step + 1e-6), start, -step
         if not (sweep[2] > 0 and sweep[1] > sweep[0]):
-            raise ValueError("needs start < stop and a step above 0")
+            raise ValueError("needs start < stop and a step above 0, or start > stop and a step below 0")
         if max(map(abs, sweep)) > 2 * math.pi:
             raise ValueError(
                 f"is beyond a full turn; angles are in radians: {sweep[1]:g} degrees are {math.radians(sweep[1]):.4g}"
@@ -205,13 +232,23 @@ def read_measurement(folder: Path) -> Measurement:
     path = folder / FILE if folder.is_dir() else folder
     if not path.is_file():
         raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
-    config, base = parse(MeasurementConfig, load_yaml(path), str(path)), path.parent
+    values = load_yaml(path)
+    config, base = parse(MeasurementConfig, values, str(path)), path.parent
     model = read_model(base / config.model)
     _check_sensor(config, model, str(path))
     cameras = _cameras(config, base, str(path))
     mesh, notes = read_reference(base / config.reference)
     points = {str(base / name): read_points(base / name) for name in _files(config)}
+    notes = (*notes, *_mended(config, values))
     return assembled(config, Material(mesh, points, model, cameras, notes), str(base / config.reference), str(path))
+
+
+def _mended(config: MeasurementConfig, values: Any) -> tuple[str, ...]:
+    """A word where the scanner's rotation is not the one that the file's `values` state."""
+    if config.scanner is None:
+        return ()
+    off = float(np.abs(np.array(config.scanner.rotation) - np.array(values["scanner"]["rotation"], dtype=float)).max())
+    return (f"the scanner's rotation has few digits and was made orthonormal, by up to {off:.1g}",) if off > 0 else ()
 
 
 def assembled(config: MeasurementConfig, material: Material, reference: str, where: str) -> Measurement:

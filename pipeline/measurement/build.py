@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.presets import read_preset
-from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
-from pipeline.formats.laz import EXACT_INTENSITY, write_laz
-from pipeline.formats.measurement import FILE, Measurement, read_measurement, read_model
-from pipeline.formats.measurement_checks import check_near
-from pipeline.formats.ply import write_ply
-from pipeline.measurement.picture import picture
+from pipeline.formats.measurement import read_model
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.measurement.folder import Content, Understood, write
+from pipeline.measurement.photogrammetry import looking, read_pair, seen_by
 from pipeline.measurement.reference import HALF, Reference, from_file, half_of
 from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.station import Station, find_station
@@ -23,10 +21,8 @@ from pipeline.measurement.units import check_extent, check_same_unit
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.rounding import rounded_axes
-from scene.yaml_text import yaml_line
-from sensors.model import TlsModel
+from sensors.model import StereoModel, TlsModel
 
-UNDERSTOOD = "understood.json"
 _ONE_PLACE_M = 0.05
 """Stations that stand nearer to each other than this are one, set up again."""
 
@@ -48,24 +44,6 @@ class Request:
     number: int | None = None
 
 
-@dataclass(frozen=True)
-class Understood:
-    """How files were understood: lines of words by what they are about, and the command that comes next."""
-
-    folder: Path
-    about: dict[str, tuple[str, ...]]
-    next_command: str
-
-    def summary(self) -> str:
-        """The words for people, a line each."""
-        lines = [f"{name}: {line}" for name, words in self.about.items() for line in words]
-        return "\n".join([*lines, f"next: {self.next_command}"])
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"schema": 1, "folder": str(self.folder), **{name: list(words) for name, words in self.about.items()},
-                "next": self.next_command}  # fmt: skip
-
-
 def build(request: Request, out: Path) -> Understood:
     """Write the folder `out`: measurement.yaml, model.yaml, the points, the reference, what was understood in words and picture.
 
@@ -75,7 +53,7 @@ def build(request: Request, out: Path) -> Understood:
     scans = _scans(request)
     stations = _stations(scans, request)
     station = stations[0]
-    reference = half_of(scans[0], station) if request.reference == HALF else _given(request, scans[0], station)
+    reference = half_of(scans[0], station) if request.reference == HALF else _given(request, scans[0], *_eye(station))
     if reference.rows is not None:
         scans = [scans[0].part(reference.rows), *scans[1:]]
         stations = [_part(stations[0], reference.rows), *stations[1:]]
@@ -88,12 +66,58 @@ def build(request: Request, out: Path) -> Understood:
         "cannot show": reference.limits,
         "model": (*model_words, *noise_words),
     }
-    found = Understood(out, about, f"scarpsim gap {out} --out {out}_gap")
-    pattern = None if request.reference == HALF or echo_words else station.pattern
-    with filling(out) as folder:
-        _write(folder, scans, stations, reference, model, found, pattern)
-        _tried(folder, out)
+    keys: dict[str, Any] = {"scanner": {"position_m": station.position.tolist(), "rotation": station.rotation.tolist()}}
+    if station.pattern is not None and request.reference != HALF and not echo_words:
+        keys["pattern"] = station.pattern
+    clouds = [_for_file(scan, each) for scan, each in zip(scans, stations, strict=True)]
+    content = Content("tls", clouds, reference.mesh, model, _eye(station), ", ".join(scan.name for scan in scans), keys=keys)
+    found = Understood(out, about)
+    write(out, content, found)
     return found
+
+
+def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None, out: Path) -> Understood:
+    """The same of clouds from photographs, with the pair's calibration; labels: which two cameras of a project.
+
+    Raises InputError as `build` does, and for a cloud that the pair does not see.
+    """
+    if request.reference == HALF:
+        raise InputError("is for scans: neighbours in a matched cloud share their errors", where="--reference half",
+                         remedy="name a mesh, a cloud or a DEM")  # fmt: skip
+    pair = read_pair(cameras, labels)
+    model = StereoModel() if request.model is None else read_model(request.model)
+    if not isinstance(model, StereoModel):
+        raise InputError("is the model of a laser scanner", where=str(request.model), allowed="sensor: stereo")
+    scans = _scans(request)
+    eye = pair.left.position, looking(pair.left)
+    words = seen_by(pair, scans[0].cloud.points, scans[0].name)
+    reference = _given(request, scans[0], *eye)
+    kept = ("pixel_x", "pixel_y")
+    clouds = [
+        replace(scan.cloud, extra={name: scan.cloud.extra[name] for name in kept if name in scan.cloud.extra}) for scan in scans
+    ]
+    of_model = (
+        f"as in {request.model}" if request.model else "the default of a stereo pair: 0.3 px white, 0.1 px smooth over 32 px"
+    )
+    about = {
+        "points": tuple(f"{scan.name}: {len(scan.cloud.points):,} points{_said(scan)}" for scan in scans),
+        "cameras": words,
+        "reference": reference.words,
+        "cannot show": reference.limits,
+        "model": (of_model,),
+    }
+    found = Understood(out, about)
+    write(out, Content("stereo", clouds, reference.mesh, model, eye, scans[0].name, cameras=pair), found)
+    return found
+
+
+def _eye(station: Station) -> tuple[FloatArray, FloatArray]:
+    return station.position, station.rotation
+
+
+def _for_file(scan: RawScan, station: Station) -> PointCloud:
+    """The cloud with its scan lines, without what only reading needed."""
+    return replace(scan.cloud, extra={} if station.line is None else {"line": station.line})
 
 
 def _scans(request: Request) -> list[RawScan]:
@@ -124,9 +148,9 @@ def _stations(scans: list[RawScan], request: Request) -> list[Station]:
     return stations
 
 
-def _given(request: Request, scan: RawScan, station: Station) -> Reference:
-    path = Path(request.reference)
-    reference = from_file(path, request.reference_unit, station)
+def _given(request: Request, scan: RawScan, position: FloatArray, rotation: FloatArray) -> Reference:
+    """The reference out of its file, as seen from a place (3,) m with a rotation (3, 3) to the points' frame."""
+    reference = from_file(Path(request.reference), request.reference_unit, position, rotation)
     check_same_unit(scan.cloud.points, reference.mesh.vertices, scan.name, request.unit, request.reference_unit)
     return reference
 
@@ -195,52 +219,3 @@ def _part(station: Station, rows: Any) -> Station:
 
 def _said(scan: RawScan) -> str:
     return "" if not scan.words else "; " + "; ".join(scan.words)
-
-
-def _write(
-    folder: Path,
-    scans: list[RawScan],
-    stations: list[Station],
-    reference: Reference,
-    model: TlsModel,
-    found: Understood,
-    pattern: dict[str, list[float]] | None,
-) -> None:
-    station, names = stations[0], [f"scan_{number}.laz" for number in range(len(scans))]
-    for name, scan, each in zip(names, scans, stations, strict=True):
-        extra: dict[str, Any] = {} if each.line is None else {"line": each.line}
-        if scan.cloud.intensity is not None:
-            extra[EXACT_INTENSITY] = np.asarray(scan.cloud.intensity, dtype=np.float32)
-        write_laz(folder / name, scan.cloud.points, gps_time=scan.cloud.gps_time, extra=extra)
-    write_ply(folder / "reference.ply", reference.mesh)
-    values: dict[str, Any] = {
-        "sensor": "tls",
-        "reference": "reference.ply",
-        "points": names[0] if len(names) == 1 else names,
-        "frame": "world",
-        "scanner": {"position_m": station.position.tolist(), "rotation": station.rotation.tolist()},
-    }
-    if pattern is not None:
-        values["pattern"] = pattern
-    values |= {"model": "model.yaml", "notes": [f"the reference: {words}" for words in reference.limits]}
-    write_text(folder / FILE, "".join(f"{key}: {yaml_line(value)}\n" for key, value in values.items()))
-    head = "".join(f"# {line}\n" for line in found.about["model"])
-    body = model.model_dump(mode="json")
-    write_text(folder / "model.yaml", head + "".join(f"{key}: {yaml_line(value)}\n" for key, value in body.items()))
-    write_text(folder / "understood.txt", found.summary() + "\n")
-    write_json(folder / UNDERSTOOD, found.to_dict())
-    title = ", ".join(dict.fromkeys(scan.name for scan in scans))
-    seen = np.concatenate([scan.cloud.points for scan in scans])
-    write_bytes(folder / "understood.png", picture(seen, reference.mesh, station.position, station.rotation, title))
-
-
-def _tried(folder: Path, out: Path) -> Measurement:
-    """The measurement as `gap` will read it. Raises InputError, with the folder's later name, where points and reference do not
-    meet."""
-    try:
-        found = read_measurement(folder)
-        check_near(found.fit)
-    except InputError as error:
-        where = error.where.replace(str(folder), str(out))
-        raise InputError(error.what, where=where, allowed=error.allowed, remedy=error.remedy) from None
-    return found

@@ -21,7 +21,7 @@ def picture(points: FloatArray, mesh: TriangleMesh, position: FloatArray, rotati
     here = position - origin
     above.scatter(*known[:, :2].T, s=0.5, color="#b5b5b5", linewidths=0, label="reference")
     above.scatter(*few[:, :2].T, s=0.5, color=FAMILY[0], linewidths=0, label="scan")
-    above.plot(here[0], here[1], marker="*", markersize=13, color=FAMILY[1], linestyle="none", label="scanner")
+    above.plot(here[0], here[1], marker="*", markersize=13, color=FAMILY[1], linestyle="none", label="sensor")
     _fan(above, few, here)
     above.set_aspect("equal", adjustable="datalim")
     shift = "" if not origin.any() else f" less {origin[0]:,.0f}", f" less {origin[1]:,.0f}" if origin.any() else ""
@@ -34,7 +34,7 @@ def picture(points: FloatArray, mesh: TriangleMesh, position: FloatArray, rotati
     dots = seen.scatter(np.degrees(azimuth), np.degrees(zenith), c=distance, s=0.8, cmap=SEQUENTIAL, linewidths=0)
     seen.invert_yaxis()
     dress(seen, "azimuth, degrees", "zenith angle, degrees")
-    seen.set_title("as the scanner sees it")
+    seen.set_title("as the sensor sees it")
     figure.colorbar(dots, ax=seen, label="range, m")
     figure.suptitle(title)
     return png_bytes(figure)

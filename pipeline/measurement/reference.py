@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.points import SUFFIXES
 from pipeline.formats.scan_geometry import ScanGeometry
-from pipeline.measurement.scans import RawScan, read_scans
+from pipeline.measurement.scans import METRES, RawScan, read_scans
 from pipeline.measurement.station import Station
 from pipeline.measurement.triangulation import BETWEEN, SeenSurface, triangulated
 from scene.errors import InputError
 from scene.imported import read_mesh
-from scene.mesh import TriangleMesh
+from scene.mesh import FloatArray, TriangleMesh
 from scene.ply import read_elements
 
 HALF = "half"
+_DEMS = (".tif", ".tiff")
 _MUCH_FINER = 0.6
 """Pulses that lie so much closer along a line than lines do are halved instead of the lines."""
 
@@ -46,10 +48,12 @@ def is_cloud(path: Path) -> bool:
     return faces is None or not faces or not len(next(iter(faces.values())))
 
 
-def from_file(path: Path, unit: str, station: Station) -> Reference:
-    """A reference out of a file. Raises InputError where it cannot be used."""
+def from_file(path: Path, unit: str, position: FloatArray, rotation: FloatArray) -> Reference:
+    """A reference out of a file, seen from `position` (3,) m with `rotation` (3, 3); InputError where it cannot be used."""
     if not path.is_file():
-        raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, or the word {HALF}")
+        raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, a DEM, or the word {HALF}")
+    if path.suffix.lower() in _DEMS:
+        return _from_dem(path, METRES[unit])
     if not is_cloud(path):
         mesh, notes = read_mesh(path, unit)
         words = (f"mesh {path.name}: {len(mesh.faces):,} triangles, taken as exact", *notes)
@@ -57,13 +61,37 @@ def from_file(path: Path, unit: str, station: Station) -> Reference:
         return Reference(mesh, 0.0, words, (limit,))
     scans = read_scans(path, unit)
     points = np.concatenate([scan.cloud.points for scan in scans])
-    surface = triangulated(points, station.position, station.rotation, str(path))
+    surface = triangulated(points, position, rotation, str(path))
     said = f"cloud {path.name}: {len(points):,} points, meshed as seen from the scanner, {len(surface.mesh.faces):,} triangles"
     limits = (
         "the reference is a measurement itself: errors that both share (same scanner, same place) cannot be seen, and rock that "
         "moved between the two is told from errors only where it has edges",
     )
     return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits)
+
+
+def _from_dem(path: Path, metres: float) -> Reference:
+    """A raster of heights as a surface: a vertex at the centre of each pixel, two triangles between four that have data."""
+    heights, grid = read_geotiff(path)
+    known = np.isfinite(heights)
+    if not known.any() or min(heights.shape) < 2:
+        raise InputError("holds no heights", where=str(path), remedy="export the elevation model again")
+    x, y = np.meshgrid(
+        grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd, grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
+    )
+    number = (np.cumsum(known) - 1).reshape(known.shape)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
+    if not whole.any():
+        raise InputError("has no four neighbouring pixels with heights", where=str(path), remedy="export a whole elevation model")
+    faces = np.concatenate([np.stack(each, axis=-1)[whole] for each in ((a, c, d), (a, d, b))]).astype(np.int32)
+    vertices = np.stack([x[known], y[known], heights[known].astype(np.float64)], axis=1) * metres
+    words = f"elevation model {path.name}: {int(known.sum()):,} heights every {grid.gsd * metres:.3g} m, taken as exact"
+    limit = (
+        "an elevation model has one height at each place: overhangs are missing, and steep faces are chords between pixels, "
+        "whose error looks like one of the sensor"
+    )
+    return Reference(TriangleMesh(vertices, faces), 0.0, (words,), (limit,))
 
 
 def half_of(scan: RawScan, station: Station) -> Reference:

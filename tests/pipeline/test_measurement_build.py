@@ -17,18 +17,25 @@ import yaml
 from gap_cases import write_scan
 
 from pipeline.cli.main import main
+from pipeline.formats.cameras import write_cameras_yaml
+from pipeline.formats.colmap import write_colmap
 from pipeline.formats.e57 import E57Scan, write_e57
+from pipeline.formats.geotiff import write_geotiff
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import read_measurement
+from pipeline.formats.metashape import write_metashape
 from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.ptx import read_ptx
+from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.measurement.build import Request, build
 from pipeline.measurement.origin import from_order
 from pipeline.measurement.scans import orthonormal, read_scans
 from pipeline.measurement.triangulation import triangulated
 from scene.errors import InputError
+from scene.grid import Grid
+from sensors.camera import Camera, CameraPair
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 FOREST = SHARED / "tls_forest_vz400i" / "TLS_scan.npz"
@@ -224,6 +231,132 @@ def test_a_rotation_of_few_digits_is_made_orthonormal() -> None:
     for wrong in (np.diag([1.0, 1.0, -1.0]), 2 * np.eye(3), np.full((3, 3), np.nan)):
         with pytest.raises(InputError, match="no rotation matrix"):
             orthonormal(wrong, "a")
+
+
+def rewritten(case: Case, folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A copy of the measurement of gap_cases with other keys."""
+    values = yaml.safe_load((case[0] / "measurement.yaml").read_text())
+    values |= {key: str(case[0] / values[key]) for key in ("reference", "points", "model")}
+    change(values)
+    (folder / "measurement.yaml").write_text(yaml.safe_dump(values))
+    return folder
+
+
+def test_a_pattern_may_be_in_degrees_and_run_the_other_way(case: Case, tmp_path: Path) -> None:
+    stated = read_measurement(case[0]).pattern
+    assert stated is not None
+
+    def change(values: dict[str, Any]) -> None:
+        start, stop, step = np.degrees(values["pattern"].pop("azimuth_rad")).tolist()
+        last = start + step * float(np.floor((stop - start) / step))
+        low, high, zenith_step = values["pattern"]["zenith_rad"]
+        values["pattern"] = {"azimuth_deg": [last, start - 1e-9, -step], "zenith_rad": [high, low - 1e-9, -zenith_step]}
+
+    found = read_measurement(rewritten(case, tmp_path, change)).pattern
+    assert found is not None
+    np.testing.assert_allclose(found.azimuth_rad[::2], stated.azimuth_rad[::2], atol=1e-8)
+    np.testing.assert_allclose(found.zenith_rad[::2], stated.zenith_rad[::2], atol=1e-8)
+
+
+def test_degrees_stand_beside_no_radians(case: Case, tmp_path: Path) -> None:
+    folder = rewritten(case, tmp_path, lambda values: values["pattern"].update(zenith_deg=[40, 90, 0.7]))
+    with pytest.raises(InputError, match="'zenith_deg' stands beside 'zenith_rad'"):
+        read_measurement(folder)
+
+
+def test_a_pose_of_few_digits_is_taken_with_a_word(case: Case, tmp_path: Path) -> None:
+    def change(values: dict[str, Any]) -> None:
+        values["scanner"]["rotation"] = np.round(values["scanner"]["rotation"], 4).tolist()
+
+    found = read_measurement(rewritten(case, tmp_path, change))
+    assert any("few digits" in note for note in found.notes)
+    assert found.station is not None
+    np.testing.assert_allclose(found.station[1] @ found.station[1].T, np.eye(3), atol=1e-12)
+    assert not any("few digits" in note for note in read_measurement(case[0]).notes)
+
+
+def nadir_pair() -> CameraPair:
+    """Two cameras 40 m above the ground, 6 m apart, looking down."""
+    lens = {
+        "width": 1200,
+        "height": 900,
+        "f_px": 1500.0,
+        **dict.fromkeys(("cx_px", "cy_px", "b1", "b2", "k2", "k3", "k4", "p1", "p2"), 0.0),
+    }
+    down = np.diag([1.0, -1.0, -1.0])
+    return CameraPair(*(Camera(**lens, k1=-0.05, position=UTM + np.array([x, 0.0, 40.0]), rotation=down) for x in (0.0, 6.0)))
+
+
+def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 0.05 * x + 0.8 * np.sin(x / 3) * np.cos(y / 4)
+
+
+def write_dem(path: Path) -> None:
+    """Heights every 0.25 m, a corner without data."""
+    grid = Grid(float(UTM[0]) - 20, float(UTM[1]) + 20, 0.25, 180, 160)
+    x, y = np.meshgrid(-20 + 0.25 * (np.arange(180) + 0.5), 20 - 0.25 * (np.arange(160) + 0.5))
+    heights = UTM[2] + ground(x, y)
+    heights[:20, :20] = np.nan
+    write_geotiff(path, heights, grid)
+
+
+@pytest.mark.parametrize("kind", ["cameras.yaml", "cameras.xml", "model"])
+def test_a_cloud_from_photographs_with_a_dem(kind: str, tmp_path: Path) -> None:
+    """Cameras in the three forms that people have them; every point lies on the surface to the chord of a pixel, s^2 / 8 c."""
+    cameras = nadir_pair()
+    by_label = {"left.jpg": cameras.left, "right.jpg": cameras.right}
+    if kind == "cameras.yaml":
+        write_cameras_yaml(tmp_path / kind, cameras)
+    elif kind == "cameras.xml":
+        write_metashape(tmp_path / kind, by_label)
+    else:
+        write_colmap(tmp_path / kind, by_label)
+    x, y = np.random.default_rng(1).uniform([-8, -8], [12, 8], size=(4000, 2)).T
+    np.savetxt(tmp_path / "cloud.xyz", np.stack([x, y, ground(x, y)], axis=1) + UTM, fmt="%.4f")
+    write_dem(tmp_path / "dem.tif")
+    words = [
+        "measurement",
+        str(tmp_path / "cloud.xyz"),
+        "--cameras",
+        str(tmp_path / kind),
+        "--reference",
+        str(tmp_path / "dem.tif"),
+    ]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    measurement = read_measurement(tmp_path / "out")
+    assert measurement.cameras is not None
+    np.testing.assert_allclose(measurement.cameras.right.position, cameras.right.position, atol=1e-6)
+    assert measurement.fit.near == 1.0
+    assert abs(measurement.fit.off_m) < 0.003
+    residuals = stereo_residuals(measurement)
+    depth, base = 40.0, 6.0
+    assert np.median(np.abs(residuals.value)) < 1500 * base / depth**2 * 0.003
+    assert any("one height at each place" in note for note in measurement.notes)
+
+
+PHOTOGRAPHS: dict[str, tuple[list[str], str]] = {
+    "half": (["--reference", "half"], "neighbours in a matched cloud share their errors"),
+    "behind": (["--reference", "dem.tif"], "lie behind a camera"),
+    "elsewhere": (["--reference", "dem.tif"], "both cameras see"),
+    "no cameras": (["--reference", "dem.tif", "--cameras", "no.xml"], "there is no such file"),
+    "one label": (["--reference", "dem.tif", "--pair", "a"], "two cameras' labels"),
+}
+
+
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_bad_photographs_are_answered_by_one_line(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_cameras_yaml(tmp_path / "cameras.yaml", nadir_pair())
+    write_dem(tmp_path / "dem.tif")
+    x, y = np.random.default_rng(1).uniform([-8, -8], [12, 8], size=(400, 2)).T
+    points = (
+        np.stack([x, y, ground(x, y)], axis=1) + UTM + {"behind": [0, 0, 90.0], "elsewhere": [300.0, 0, 0]}.get(name, [0, 0, 0])
+    )
+    np.savetxt(tmp_path / "cloud.xyz", points, fmt="%.4f")
+    words, problem = PHOTOGRAPHS[name]
+    assert problem in said(["measurement", "cloud.xyz", "--cameras", "cameras.yaml", *words, "--out", "out"], capfd)
 
 
 def said(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:

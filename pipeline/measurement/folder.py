@@ -1,0 +1,110 @@
+"""The files of a measurement's folder, written together and read back as `gap` will read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
+from pipeline.formats.cameras import write_cameras_yaml
+from pipeline.formats.laz import EXACT_INTENSITY, write_laz
+from pipeline.formats.measurement import FILE, read_measurement
+from pipeline.formats.measurement_checks import check_near
+from pipeline.formats.ply import write_ply
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.measurement.picture import picture
+from scene.errors import InputError
+from scene.mesh import FloatArray, TriangleMesh
+from scene.yaml_text import yaml_line
+from sensors.camera import CameraPair
+from sensors.model import StereoModel, TlsModel
+
+UNDERSTOOD = "understood.json"
+
+
+@dataclass(frozen=True)
+class Understood:
+    """How files were understood: lines of words by what they are about, and the command that comes next."""
+
+    folder: Path
+    about: dict[str, tuple[str, ...]]
+
+    @property
+    def next_command(self) -> str:
+        return f"scarpsim gap {self.folder} --out {self.folder}_gap"
+
+    def summary(self) -> str:
+        """The words for people, a line each."""
+        lines = [f"{name}: {line}" for name, words in self.about.items() for line in words]
+        return "\n".join([*lines, f"next: {self.next_command}"])
+
+    def to_dict(self) -> dict[str, Any]:
+        words = {name: list(lines) for name, lines in self.about.items()}
+        return {"schema": 1, "folder": str(self.folder), **words, "next": self.next_command}
+
+
+@dataclass(frozen=True)
+class Content:
+    """What goes into a folder. clouds: an epoch each, world frame, m; keys: of measurement.yaml beside files and notes; eye:
+    position (3,) and rotation (3, 3) to the world of what looks at the wall."""
+
+    sensor: str
+    clouds: Sequence[PointCloud]
+    reference: TriangleMesh
+    model: TlsModel | StereoModel
+    eye: tuple[FloatArray, FloatArray]
+    title: str
+    cameras: CameraPair | None = None
+    keys: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write(out: Path, content: Content, found: Understood) -> None:
+    """Fill `out` and try what is in it; it stays away where points and reference do not meet (InputError)."""
+    with filling(out) as folder:
+        names = [f"scan_{number}.laz" for number in range(len(content.clouds))]
+        for name, cloud in zip(names, content.clouds, strict=True):
+            _write_points(folder / name, cloud)
+        write_ply(folder / "reference.ply", content.reference)
+        values: dict[str, Any] = {
+            "sensor": content.sensor,
+            "reference": "reference.ply",
+            "points": names[0] if len(names) == 1 else names,
+            "frame": "world",
+            **content.keys,
+        }
+        if content.cameras is not None:
+            write_cameras_yaml(folder / "cameras.yaml", content.cameras)
+            values["cameras"] = "cameras.yaml"
+        limits = [f"the reference: {words}" for words in found.about.get("cannot show", ())]
+        _write_yaml(folder / FILE, values | {"model": "model.yaml", "notes": limits})
+        _write_yaml(folder / "model.yaml", content.model.model_dump(mode="json"), found.about["model"])
+        write_text(folder / "understood.txt", found.summary() + "\n")
+        write_json(folder / UNDERSTOOD, found.to_dict())
+        seen = np.concatenate([cloud.points for cloud in content.clouds])
+        write_bytes(folder / "understood.png", picture(seen, content.reference, *content.eye, content.title))
+        _try(folder, out)
+
+
+def _write_points(path: Path, cloud: PointCloud) -> None:
+    extra = dict(cloud.extra)
+    if cloud.intensity is not None:
+        extra[EXACT_INTENSITY] = np.asarray(cloud.intensity, dtype=np.float32)
+    write_laz(path, cloud.points, gps_time=cloud.gps_time, extra=extra)
+
+
+def _write_yaml(path: Path, values: Mapping[str, Any], comments: Sequence[str] = ()) -> None:
+    lines = [*(f"# {line}" for line in comments), *(f"{key}: {yaml_line(value)}" for key, value in values.items())]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _try(folder: Path, out: Path) -> None:
+    """Raise InputError, with the folder's later name, where `gap` could not use the folder."""
+    try:
+        check_near(read_measurement(folder).fit)
+    except InputError as error:
+        where = error.where.replace(str(folder), str(out))
+        raise InputError(error.what, where=where, allowed=error.allowed, remedy=error.remedy) from None

@@ -1,0 +1,72 @@
+"""A cloud from photographs whose cameras are known: pixels and disparities follow by projection, so only the pair is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.formats.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras import read_cameras_yaml
+from scene.errors import InputError
+from scene.mesh import FloatArray
+from sensors.camera import Camera, CameraPair
+
+_FEWEST_SEEN = 0.05
+
+
+def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
+    """The pair out of cameras.yaml, a Metashape XML or a COLMAP text model, world frame; labels: which two of a project.
+
+    Raises InputError where the file does not tell a pair.
+    """
+    if not path.exists():
+        raise InputError("there is no such file", where=str(path), allowed="cameras.yaml, a Metashape XML, a COLMAP folder")
+    found = read_oriented(path)
+    if found is None:
+        return read_cameras_yaml(path)
+    if labels is None and len(found.cameras) != 2:
+        raise InputError(
+            f"holds {len(found.cameras)} aligned cameras, a pair is two", where=str(path),
+            allowed=", ".join(sorted(found.cameras)[:20]), remedy="name them: --pair LEFT,RIGHT",
+        )  # fmt: skip
+    left, right = labels or (None, None)
+    return stereo_pair(found, left, right, str(path))
+
+
+def looking(camera: Camera) -> FloatArray:
+    """(3, 3) a frame at the camera to the world: x forward, y left, z up in the picture, for angles about its middle."""
+    right, down, forward = camera.rotation.T
+    return np.stack([forward, -right, -down], axis=1)
+
+
+def seen_by(pair: CameraPair, points: FloatArray, where: str) -> tuple[str, ...]:
+    """Words on how much of a cloud (n, 3), m, the pair sees. Raises InputError where that is next to nothing."""
+    both = np.ones(len(points), dtype=bool)
+    front = np.ones(len(points), dtype=bool)
+    for camera in (pair.left, pair.right):
+        x, y, z = np.einsum("ji,nj->in", camera.rotation, points - camera.position)
+        ahead = z > 0
+        depth = np.where(ahead, z, 1.0)
+        u, v = camera.pixel(x / depth, y / depth)
+        front &= ahead
+        both &= ahead & (u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)
+    if front.mean() < _FEWEST_SEEN:
+        raise InputError(
+            f"{100 * (1 - front.mean()):.3g} % of the points lie behind a camera", where=where,
+            remedy="check the coordinate system, and that rotations map camera (x right, y down, z forward) to world",
+        )  # fmt: skip
+    if both.mean() < _FEWEST_SEEN:
+        raise InputError(
+            f"both cameras see {100 * both.mean():.2g} % of the points", where=where,
+            allowed=f"{100 * _FEWEST_SEEN:g} % and more", remedy="check that cameras and points are of one project",
+        )  # fmt: skip
+    left, right = pair.left, pair.right
+    middle = float(np.median((points - left.position) @ left.rotation[:, 2]))
+    base = float(np.linalg.norm(right.position - left.position))
+    tenth = 1e3 * middle**2 / (left.f_px * base) * 0.1
+    return (
+        f"cameras {left.width} x {left.height} px, f {left.f_px:.1f} px, base {base:.4g} m, depth {middle:.4g} m (median)",
+        f"0.1 px of disparity are {tenth:.3g} mm of depth",
+        f"both see {100 * both.mean():.3g} % of the points; pixels and disparities are found by projection",
+    )
