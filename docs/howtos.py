@@ -30,6 +30,7 @@ PICTURES = {
     "compare_sensors": "comparison/detection.png",
     "calibrate": "calibration/windows.png",
     "missing_effect": "diagnosis/profiles.png",
+    "raw_scan": "from_raw/understood.png",
 }
 """The pages, and the picture among their results that each shows."""
 _BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -82,7 +83,7 @@ def _renew(page: str) -> None:
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         if page == "own_site":
             example_data.site(Path())
-        if page == "missing_effect":
+        if page in ("missing_effect", "raw_scan"):
             example_data.measurement(Path("my_measurement"))
         sys.stderr.write(f"== {page}\n{carry_out(page)}\n")
         with Image.open(PICTURES[page]) as picture:

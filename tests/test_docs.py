@@ -16,6 +16,7 @@ import howtos
 import nbformat
 import numpy as np
 import pytest
+import yaml
 from nbclient import NotebookClient
 
 from pipeline.formats.laz import read_laz
@@ -60,6 +61,7 @@ FURTHER = {
         ],
     },
     "missing_effect": {"simulate": [*SMALL_WALL, *FEW_POINTS, *FEW_BLOCKS]},
+    "raw_scan": {},
 }
 """What is added to the pages' commands, so that they are done in seconds."""
 
@@ -92,7 +94,7 @@ def test_a_how_to_works_as_it_is_written(page: str, tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     if page == "own_site":
         example_data.site(Path(), resolution_m=0.2)
-    if page == "missing_effect":
+    if page in ("missing_effect", "raw_scan"):
         example_data.measurement(Path("my_measurement"), step_rad=0.012)
     howtos.carry_out(page, FURTHER[page])
     assert Path(howtos.PICTURES[page]).is_file()
@@ -138,12 +140,23 @@ def what_the_gap_names_is_simulated() -> None:
     ]
 
 
+def the_scanner_is_found() -> None:
+    """To a millimetre of the place that the example's own measurement states."""
+    places = [
+        yaml.safe_load(Path(folder, "measurement.yaml").read_text())["scanner"]["position_m"]
+        for folder in ("my_measurement", "from_raw")
+    ]
+    assert np.abs(np.subtract(*places)).max() < 1e-3
+    assert "found from the scan lines" in Path("from_raw/understood.txt").read_text()
+
+
 CLAIMS = {
     "own_site": a_site_is_simulated,
     "training_set": a_set_is_made,
     "compare_sensors": sensors_are_compared,
     "calibrate": the_calibrated_model_is_simulated,
     "missing_effect": what_the_gap_names_is_simulated,
+    "raw_scan": the_scanner_is_found,
 }
 """What the pages say that their commands do."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from pipeline.report.figures import FAMILY, SEQUENTIAL, dress, png_bytes
@@ -27,7 +28,9 @@ def picture(points: FloatArray, mesh: TriangleMesh, position: FloatArray, rotati
     shift = "" if not origin.any() else f" less {origin[0]:,.0f}", f" less {origin[1]:,.0f}" if origin.any() else ""
     dress(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
     above.set_title("from above")
-    above.legend(markerscale=1, loc="best", fontsize=8)
+    for handle in above.legend(loc="best", fontsize=8).legend_handles:
+        if isinstance(handle, PathCollection):
+            handle.set_sizes([16])  # the dots themselves are too small to tell their colours
     distance, azimuth, zenith = polar(np.einsum("ij,ni->nj", rotation, few - here))
     middle = float(np.angle(np.mean(np.exp(1j * azimuth))))
     azimuth = middle + np.angle(np.exp(1j * (azimuth - middle)))
