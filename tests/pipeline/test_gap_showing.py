@@ -53,14 +53,15 @@ def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> N
     ("name", "key", "value", "kind", "kept"),
     [
         ("range_noise", "sigma_m", 0.0015, "physical", 0),
-        ("range_noise", "sigma_m", 0.0015, "empirical", 1),
+        ("range_noise", "sigma_m", 0.0015, "empirical", 0),
+        ("range_incidence_bias", "coefficient_m", -0.02, "empirical", 0),
         ("range_incidence_bias", "coefficient_m", 0.003, "physical", 1),
     ],
 )
 def test_an_effect_that_does_little_harm_is_taken_out_too(
     tmp_path: Path, name: str, key: str, value: float, kind: str, kept: int
 ) -> None:
-    """Half as much noise again, no more than chance would make of it, goes unless it stands for what has no name; what is there,
-    and as small, stays."""
+    """Half as much noise again, no more than chance would make of it, goes, named or not, and so does a description that clearly
+    does harm; what is there, and as small, stays."""
     shown, _ = _showing(tmp_path, 0.003).show([replace(_named(name, key, value), kind=kind)])
     assert len(shown.named) == kept

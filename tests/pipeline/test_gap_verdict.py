@@ -141,7 +141,7 @@ def test_what_an_effect_leaves_over_is_said() -> None:
 
 def test_too_much_noise_is_said_with_less_that_would_do() -> None:
     for found, evidence, said in _every():
-        assert ("the residuals spread 11% of what the model predicts" in said) == (evidence.spread < 1.0)
+        assert ("the residuals spread 11 % of what the model predicts" in said) == (evidence.spread < 1.0)
         if evidence.spread < 1.0:
             assert "range_sigma_m 0.00033" in said
             assert "too noisy" in said or found.verdict != "no_gap"

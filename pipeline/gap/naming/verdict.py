@@ -108,6 +108,8 @@ def too_noisy(spread: float, lower: dict[str, float]) -> list[str]:
     """Words for a model that predicts more spread than there is."""
     if spread >= 1.0:
         return []
-    said = f"the residuals spread {spread:.0%} of what the model predicts: its noise is too large, which no effect can mend"
+    said = (
+        f"the residuals spread {100 * spread:.0f} % of what the model predicts: its noise is too large, which no effect can mend"
+    )
     proposed = ", ".join(f"{key} {value:g}" for key, value in lower.items())
     return [f"{said}; a noise that fits: {proposed}"] if proposed else [said]

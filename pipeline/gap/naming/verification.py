@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurement import Measurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.naming.entries import Named, with_effects
 from pipeline.gap.naming.verify import LOSS_MEASURE, Gap, Version, measure_gap, measure_losses, thinned
 from pipeline.gap.other.missing import MissingFound
@@ -42,6 +43,15 @@ class Shown:
         gap = self.gap
         return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
 
+    @property
+    def is_clearly_worse(self) -> bool:
+        """Whether that is by more than its uncertainty."""
+        return (
+            self.is_worse
+            and self.gap is not None
+            and self.gap.after - self.gap.before > decided().verdict.gap_sigmas * self.gap.error
+        )
+
 
 @dataclass(frozen=True)
 class Showing:
@@ -73,15 +83,15 @@ class Showing:
         """The gap on points that no step has used, and words for effects that are taken out.
 
         As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
-        one goes without which those are predicted best. What is described, not named, stays: without it nothing would be said
-        to be wrong. A lower noise is proposed only if it predicts better.
+        one goes without which those are predicted best. What is described, not named, goes only where it clearly does harm. A
+        lower noise is proposed only if it predicts better.
         """
         shown, words = self._of(named, self.tested), []
         if self.lower and shown.is_worse:
             return replace(self, lower={}).show(named)
         learned = self._of(named, self.learned) if shown.is_worse else shown
         while shown.is_worse:
-            doubtful = [item for item in shown.named if _may_be_harmful(item)]
+            doubtful = [item for item in shown.named if shown.is_clearly_worse or _may_be_harmful(item)]
             fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in doubtful]
             best = min(fewer, key=_score, default=learned)
             if _score(best) >= _score(learned):
@@ -125,7 +135,7 @@ class Showing:
 
 
 def _may_be_harmful(item: Named) -> bool:
-    """Of what is described, only noise: without a term on the mean nothing would be said to be wrong."""
+    """Of what is described, only noise: a term on the mean is not exact, and without it nothing would be said of it."""
     return item.spreads or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)
 
 

@@ -345,7 +345,7 @@ def _with_tails(
         return named, None
     part, value, scale = _smooth_with(measurement, named)
     tails = find_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
-    if tails is None or not tails.even:
+    if tails is None or not tails.even or not tails.sigma:
         return named, tails
     steady = [item for item in named if not item.spreads]
     if len(steady) < len(named):

@@ -211,10 +211,10 @@ def find_spread(
 def _shared_by_neighbours(excess: float, between: float, sigma: FloatArray) -> str:
     """Words for a spread that neighbours share, which is no noise. excess: added variance over the predicted one."""
     times, more = float(np.sqrt(1 + excess)), 1e3 * float(np.median(sigma)) * float(np.sqrt(excess))
-    shared = min(max(1 - between, 0.0), 1.0)
+    shared = 100 * min(max(1 - between, 0.0), 1.0)
     return (
-        f"the residuals spread {times:.2g} times what the model predicts ({more:.2g} mm more), and neighbours share {shared:.0%} "
-        "of that: an error of the reference, a change of the scene or wrong coordinates, not noise of the sensor"
+        f"the residuals spread {times:.2g} times what the model predicts ({more:.2g} mm more), and neighbours share {shared:.0f} "
+        "% of that: an error of the reference, a change of the scene or wrong coordinates, not noise of the sensor"
     )
 
 

@@ -99,7 +99,7 @@ def _row(found: Identifiability, row: int) -> _Row:
     return _Row(
         name=found.names[row] + (f" ({found.shown[row]})" if found.shown[row] else ""),
         parameter=found.parameters[row],
-        survival=f"{found.survival[row]:.1%}",
+        survival=f"{100 * found.survival[row]:.1f} %",
         seen_from=_value("", found.seen_from[row]),
         named_from=_value("", named),
         alike=", ".join(f"{found.names[other].partition('.')[2]} {found.cosines[row, other]:.2f}" for other in found.alike(row)),

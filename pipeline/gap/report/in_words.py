@@ -71,7 +71,7 @@ def _shown_most(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
         what = first["covariate"].replace("_", " ")
         region = " to ".join(number(first["region"][key]) for key in ("from", "to"))
         size = f"{number(1e3 * abs(first['size_m']), 2)} mm"
-        size = f"{first['share_lost']:.0%} lost" if first["statistic"] == "missing" else size
+        size = f"{100 * first['share_lost']:.0f} % lost" if first["statistic"] == "missing" else size
         return f"It shows most in the {statistic} against {what}, from {region}: {size} there."
     if not clear:
         return ""

@@ -73,7 +73,7 @@ def _spread(view: View) -> list[OtherEffect]:
         information = 0.5 * float(np.sum(form**2)) * view.whole / len(residuals)
         theta = SIGNAL_TO_NOISE / np.sqrt(max(information, 1e-300))
         least = excess / max(float(np.mean(form)), 1e-300)
-        note = "" if theta > least else f"below that it adds less than {excess:.0%} to the variance, which is not named"
+        note = "" if theta > least else f"below that it adds less than {100 * excess:.0f} % to the variance, which is not named"
         value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
         name = f"{residuals.sensor}.{candidate.name}"
         if name not in found or value < found[name].seen_from:
@@ -105,4 +105,6 @@ def _rain(view: View) -> OtherEffect:
     weight = view.whole / len(distance) / (_LOSSES * (1 - _LOSSES))
     information = weight * slopes.T @ slopes
     rate = SIGNAL_TO_NOISE * float(np.sqrt(np.linalg.inv(information)[0, 0]))
-    return OtherEffect(f"tls.{Precipitation.tag()}", "rate_per_m", rate, f"beside a loss of {_LOSSES:.0%} that is there anyway")
+    return OtherEffect(
+        f"tls.{Precipitation.tag()}", "rate_per_m", rate, f"beside a loss of {100 * _LOSSES:.0f} % that is there anyway"
+    )
