@@ -231,7 +231,7 @@ def test_weights_of_another_network_are_refused(tmp_path):
     with pytest.raises(InputError, match="does not fit"):
         weights.load(tmp_path)
     (tmp_path / weights.WEIGHTS).write_bytes(b"no weights")
-    with pytest.raises(InputError, match="does not fit"):
+    with pytest.raises(InputError, match="is no HDF5 file"):
         weights.load(tmp_path)
     with pytest.raises(InputError, match="holds no detector"):
         weights.load(tmp_path / "nowhere")

@@ -96,7 +96,7 @@ MISTAKES = [
     (["simulat"], "did you mean 'simulate'?"),
     (
         ["frobnicate"],
-        "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, gap, train, detect, evaluate, "
+        "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, measurement, gap, train, detect, evaluate, "
         "view, surface, init, schema, completion, doctor",
     ),
     (["--versio"], "did you mean '--version'?"),
