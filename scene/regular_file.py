@@ -22,7 +22,7 @@ def check_file(
     try:
         state = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a null character
-        problem = getattr(error, "strerror", None) or str(error)
+        problem = getattr(error, "strerror", None) or "a null character in its name"
         raise InputError(f"cannot be read ({problem})", where=where, remedy=remedy) from None
     if stat.S_ISDIR(state.st_mode):
         raise InputError("cannot be read (Is a directory)", where=where, allowed="a file", remedy=remedy)
