@@ -67,8 +67,8 @@ def resolved(command: str) -> Iterator[dict[str, Any]]:
     if name == "simulate":
         path = config_path("sites", given.config) if given.config else bundled_config("", "demo")
         yield load_config(path, overrides, given.sensor, given.seed).model_dump(mode="json")
-    elif name == "inspect" or (name == "gap" and given.identifiability and not given.measurement.is_dir()):
-        path = config_path("sites", given.config if name == "inspect" else given.measurement)
+    elif name == "inspect" or (name == "gap" and given.identifiability and not given.measurement[0].is_dir()):
+        path = config_path("sites", given.config if name == "inspect" else given.measurement[0])
         yield load_config(path, overrides, given.sensor, None).model_dump(mode="json")
     elif name == "calibrate" and given.config:
         yield load_config(config_path("sites", given.config), overrides, given.sensor, None).model_dump(mode="json")

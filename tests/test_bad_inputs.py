@@ -15,7 +15,14 @@ from benchmarks.bad_inputs.materials import make_materials
 from benchmarks.bad_inputs.run import all_cases, listed_cases, said
 
 AT_THE_DOOR = ("ev: ", "det: tiff", "det: coco", "icp: run.json", "view: ", "cal: run.json", "ds: verify ", "ds: config")
-LONG = ("cal: run.json rotation", "cal: run.json epoch", "cal: run.json sigma", "cal: run.json block", "cal: run.json wall")
+LONG = (
+    "cal: run.json products",
+    "cal: run.json rotation",
+    "cal: run.json epoch",
+    "cal: run.json sigma",
+    "cal: run.json block",
+    "cal: run.json wall",
+)
 """With these a calibration runs, as it does not look at what is wrong."""
 
 

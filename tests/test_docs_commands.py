@@ -91,6 +91,7 @@ PARSED = (
     "scarpsim evaluate sets/small/test found/detections.json --by noise --confidence 0.5 --confidence 0.95",
     "scarpsim view runs/my_run --detections found",
     "scarpsim gap scan.e57 --reference wall.ply --scanner leica_p50",
+    "scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis",
     "scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis",
     "scarpsim view diagnosis",
     "scarpsim view sets/small/test",

@@ -16,10 +16,10 @@ import yaml
 from gap_cases import write_scan
 from hypothesis import given
 from hypothesis import strategies as st
-from pipeline.detect.weights import CONFIG, load_config
 from test_fuzz import ODD, QUICK, answered, places
 
 from pipeline.dataset.records import _digest, _text, read_dataset_file
+from pipeline.detection.weights import CONFIG, load_config
 from pipeline.formats.measurement import read_measurement
 from pipeline.formats.result_records import read_gap, read_run
 

@@ -19,6 +19,7 @@ from scene.regular_file import read_json, read_text
 SCHEMA = 1
 SHARDS = "shards"
 Record = dict[str, Any]
+_MOST_EPOCHS = 100_000
 _REMEDY = "put it back from a copy, or make the set again in another folder; tiles and annotations.json stay usable"
 _Fingerprint = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")]
 _Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
@@ -43,7 +44,7 @@ class _DatasetFile(BaseModel):
     fingerprint: str
     complete: bool
     sources: dict[_Fingerprint, _Source] = Field(min_length=1)
-    epochs: dict[_Fingerprint, list[NonNegativeInt]]
+    epochs: dict[_Fingerprint, Annotated[list[NonNegativeInt], Field(max_length=_MOST_EPOCHS)]]
     sha256: str = ""
 
     @model_validator(mode="after")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pycocotools import mask
+from scipy.ndimage import binary_erosion
 
 from pipeline.change.difference import SurfaceRaster
 from pipeline.change.m3c2 import M3c2Config, core_grid, m3c2
@@ -121,7 +122,8 @@ def test_a_run_with_m3c2(tmp_path: Path) -> None:
     inside = np.any(masks, axis=0)
     both = ~np.isnan(core) & ~np.isnan(distance)
     assert np.median((core - distance)[both & ~inside]) == pytest.approx(0, abs=3e-4)
-    assert np.median((distance / core)[both & inside & (core > 0.1)]) == pytest.approx(1, abs=0.1)
+    deep = binary_erosion(inside) & (core > 0.1)  # a cylinder at a rim reaches over it
+    assert np.median((distance / core)[both & deep]) == pytest.approx(1, abs=0.1)
     assert np.mean(distance[both & inside] > level[both & inside]) > 0.8
     points = read_laz(out / "m3c2_001.laz")
     assert {"distance_m", "lod_m", "significant", "block"} <= set(points.extra)
