@@ -177,7 +177,8 @@ def _score(group: str, confidence: float, threshold: float, images: Iterable[_Pa
         matched = matches(pairs.overlap, threshold)
         chosen = np.flatnonzero(matched >= 0)
         hits, predicted, true = hits + len(chosen), predicted + pairs.overlap.shape[0], true + pairs.overlap.shape[1]
-        ratios.append(pairs.predicted_area[chosen] / pairs.true_area[matched[chosen]])
+        true_area = pairs.true_area[matched[chosen]]
+        ratios.append((pairs.predicted_area[chosen] / np.maximum(true_area, 1.0))[true_area > 0])  # a box may hold no mask
     every = np.concatenate(ratios) if ratios else np.zeros(0)
     ratio = float(every.mean()) if every.size else float("nan")
     return Score(group, confidence, threshold, hits, predicted - hits, true - hits, ratio)

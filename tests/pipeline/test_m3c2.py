@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pycocotools import mask
-from scipy.ndimage import binary_erosion
 
 from pipeline.change.difference import SurfaceRaster
 from pipeline.change.m3c2 import M3c2Config, core_grid, m3c2
@@ -99,7 +98,8 @@ def test_a_run_with_m3c2(tmp_path: Path) -> None:
     """The same labels at the same places as the difference map, and distances along the wall's normal that agree with it.
 
     The raster has single pixels, M3C2 means over a cylinder: on stable ground the difference of both has about the raster's noise
-    (NMAD 4 mm), so that the medians agree to 0.3 mm; in the niches they differ by the rims that cylinders reach over.
+    (NMAD 4 mm), so that the medians agree to 0.3 mm; in the niches they differ by the rims that cylinders of 16 cm reach over (by 12 % from
+    10 cm of depth on, by 5 % from 15 cm).
     """
     values = {
         "seed": 3,
@@ -122,8 +122,7 @@ def test_a_run_with_m3c2(tmp_path: Path) -> None:
     inside = np.any(masks, axis=0)
     both = ~np.isnan(core) & ~np.isnan(distance)
     assert np.median((core - distance)[both & ~inside]) == pytest.approx(0, abs=3e-4)
-    deep = binary_erosion(inside) & (core > 0.1)  # a cylinder at a rim reaches over it
-    assert np.median((distance / core)[both & deep]) == pytest.approx(1, abs=0.1)
+    assert np.median((distance / core)[both & inside & (core > 0.15)]) == pytest.approx(1, abs=0.1)
     assert np.mean(distance[both & inside] > level[both & inside]) > 0.8
     points = read_laz(out / "m3c2_001.laz")
     assert {"distance_m", "lod_m", "significant", "block"} <= set(points.extra)
