@@ -98,8 +98,8 @@ def test_a_run_with_m3c2(tmp_path: Path) -> None:
     """The same labels at the same places as the difference map, and distances along the wall's normal that agree with it.
 
     The raster has single pixels, M3C2 means over a cylinder: on stable ground the difference of both has about the raster's noise
-    (NMAD 4 mm), so that the medians agree to 0.3 mm; in the niches they differ by the rims that cylinders of 16 cm reach over (by 12 % from
-    10 cm of depth on, by 5 % from 15 cm).
+    (NMAD 4 mm), so that the medians agree to 0.3 mm; in the niches they differ by the rims that cylinders of 16 cm reach over (by
+    12 % from 10 cm of depth on, by 5 % from 15 cm).
     """
     values = {
         "seed": 3,
