@@ -88,7 +88,8 @@ def _summary(found: Diagnosis) -> str:
         alike = f"; cannot be told from {', '.join(effect.alike)}" if effect.alike else ""
         lines.append(f"  {effect.name} ({values(effect)}){alike}")
     if found.changes:
-        lines.append(f"  {len(found.changes)} regions where the scene itself moved were set aside")
+        regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
+        lines.append(f"  set aside: {regions} where the scene itself moved")
     if found.gap is not None:
         factor, unit = found.gap.shown
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
