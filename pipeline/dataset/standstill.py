@@ -36,23 +36,16 @@ def ended_if_stuck(seconds: float = STUCK_S) -> Iterator[None]:
     """End this process where what is in the block, with the threads that it starts, takes no processor time for so long."""
     own = threading.get_native_id()
     others = {thread.native_id for thread in threading.enumerate()} - {own}
-    over = threading.Event()
+    pulse = _Pulse()
 
-    def watch() -> None:
+    def look() -> None:
         others.add(threading.get_native_id())
-        pulse = _Pulse()
-        while not over.wait(seconds / _LOOKS):
-            if pulse.stands(_thread_seconds(others), seconds):
-                _tell(seconds)
-                os._exit(1)
+        if pulse.stands(_thread_seconds(others), seconds):
+            _tell(seconds)
+            os._exit(1)
 
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
+    with _looked_at(look, seconds):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 @contextmanager
@@ -62,18 +55,29 @@ def workers_watched(seconds: float = STUCK_S) -> Iterator[None]:
 
     before = {child.pid for child in psutil.Process().children()}
     known: dict[int, _Pulse] = {}
+
+    def look() -> None:
+        for child in psutil.Process().children():
+            with suppress(psutil.Error):  # is gone
+                used = sum(child.cpu_times()[:2])
+                is_worker = child.pid not in before and "spawn_main" in " ".join(child.cmdline())
+                if is_worker and known.setdefault(child.pid, _Pulse()).stands(used, seconds):
+                    _tell(seconds)
+                    del known[child.pid]
+                    child.kill()
+
+    with _looked_at(look, seconds):
+        yield
+
+
+@contextmanager
+def _looked_at(look: Callable[[], None], seconds: float) -> Iterator[None]:
+    """Call look() from a thread of its own during the block, _LOOKS times within so many seconds."""
     over = threading.Event()
 
     def watch() -> None:
         while not over.wait(seconds / _LOOKS):
-            for child in psutil.Process().children():
-                with suppress(psutil.Error):  # is gone
-                    used = sum(child.cpu_times()[:2])
-                    is_worker = child.pid not in before and "spawn_main" in " ".join(child.cmdline())
-                    if is_worker and known.setdefault(child.pid, _Pulse()).stands(used, seconds):
-                        _tell(seconds)
-                        del known[child.pid]
-                        child.kill()
+            look()
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

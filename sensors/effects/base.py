@@ -91,6 +91,12 @@ class Effect(Config, ABC):
     held_out_gain: ClassVar[float] = 0.0
 
     @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Raises TypeError where a class declares a searched sine and not what that runs along."""
+        if cls.searched is not None and cls.argument is Effect.argument:
+            raise TypeError(f"{cls.__name__} declares `searched`; it needs `argument` too, what the sine runs along")
+
+    @classmethod
     def tag(cls) -> str:
         """The name that configs hold."""
         return cast(str, cls.model_fields["name"].default)
@@ -116,8 +122,8 @@ class Effect(Config, ABC):
         }
 
     def argument(self, at: Any) -> FloatArray:
-        """(n,) what a searched sine runs along, in the unit of its period."""
-        raise NotImplementedError(f"{self.name} is no searched sine")
+        """(n,) what a searched sine runs along, in the unit of its period. Raises TypeError where the effect is none."""
+        raise TypeError(f"{self.name} is no searched sine")
 
     def mean(self, at: Any) -> FloatArray:
         """(n,) by how much the effect changes a recorded range (m) or disparity (px) on average.

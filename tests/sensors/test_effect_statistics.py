@@ -17,7 +17,7 @@ from pipeline.gap.residuals.residuals import SharedNoise
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from sensors.effects import EFFECTS
-from sensors.effects.base import Effect, ShowsIn, Stage
+from sensors.effects.base import Effect, Search, ShowsIn, Stage
 from sensors.effects.heavy_tailed_noise import HeavyTailedNoise
 from sensors.effects.matching_noise import MatchingNoise
 from sensors.effects.range_incidence_bias import RangeIncidenceBias
@@ -207,3 +207,9 @@ def test_locking_moves_disparities_as_the_effect_states() -> None:
     moved = np.array(effect.apply(matches(found), KeyedRandom(1)).disparity) - found
     at = type("Pixels", (), {"found": found, "__len__": lambda self: len(found)})()
     np.testing.assert_allclose(effect.mean(at), moved, atol=1e-9)
+
+
+def test_a_searched_sine_without_what_it_runs_along_is_no_class() -> None:
+    """Else the diagnosis would end in the middle, with an effect of another package."""
+    with pytest.raises(TypeError, match="needs `argument` too"):
+        type("Half", (Effect,), {"searched": Search("period_m", "range", shortest=0.1), "__annotations__": {}})
