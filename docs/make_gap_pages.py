@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.measurement import Measurement, read_measurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.workflow import Diagnosis, diagnose
@@ -93,14 +93,16 @@ class View:
             position, rotation = StationConfig().place(target)
             cloud = PointCloud(points, seen.intensity.ravel()[valid], valid.astype(np.float64))
             station = stage.frame.to_wall(position), stage.frame.rotation @ rotation
-            measurement = Measurement("tls", cloud, model=TlsModel(noise=TLS_QUIET.model_copy(update={"range_sigma_m": 0.003})),
-                                      station=station, reference=reference, frame=frame)  # fmt: skip
+            model = TlsModel(noise=TLS_QUIET.model_copy(update={"range_sigma_m": 0.003}))
+            measurement: Measurement = TlsMeasurement(cloud=cloud, model=model, station=station, reference=reference, frame=frame)
         else:
             step, columns = REDUCTION["medium"], seen.depth.shape[1]
             pixels = {"pixel_x": (valid % columns + 0.5) * step, "pixel_y": (valid // columns + 0.5) * step}
-            model = StereoModel(noise={**STEREO_QUIET, "parallax_sigma_px": 0.3})
-            measurement = Measurement("stereo", PointCloud(points, extra=pixels), model=model,
-                                      cameras=RigConfig().place(target), reference=reference, frame=frame)  # fmt: skip
+            noise, cameras = {**STEREO_QUIET, "parallax_sigma_px": 0.3}, RigConfig().place(target)
+            measurement = StereoMeasurement(
+                cloud=PointCloud(points, extra=pixels), model=StereoModel(noise=noise), cameras=cameras, reference=reference,
+                frame=frame,
+            )  # fmt: skip
         measurement.__dict__["scene"] = stage.caster
         found = residuals_of(measurement)
         return cls(found, valid[found.index])

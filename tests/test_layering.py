@@ -87,6 +87,13 @@ def test_mitsuba_comes_through_the_backend_only(folder: str) -> None:
     assert set(direct) <= allowed
 
 
+@pytest.mark.parametrize("folder", ["scene", "sensors", "pipeline"])
+def test_what_cannot_be_is_said_by_types_and_not_by_asserts(folder: str) -> None:
+    """An assert is left out by `python -O`; a type that cannot hold the case needs none."""
+    trees = {str(file.relative_to(ROOT)): ast.walk(ast.parse(file.read_text())) for file in sources(folder)}
+    assert [name for name, nodes in trees.items() if any(isinstance(node, ast.Assert) for node in nodes)] == []
+
+
 def test_files_stay_short() -> None:
     lengths = {
         str(file.relative_to(ROOT)): len(file.read_text().splitlines())

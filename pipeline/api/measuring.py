@@ -41,8 +41,6 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 from sensors.camera import CameraPair
 from sensors.exchanged import pair_of
-from sensors.stereo import StereoPair
-from sensors.stereo_matched import MatchedStereoPair
 from sensors.tls import LaserScanner
 
 if TYPE_CHECKING:
@@ -251,10 +249,9 @@ def _of_run(run: Run, model: Any) -> Measurement:
     world = site.mesh.with_vertices(site.frame.to_world(site.mesh.vertices))
     cloud = run[0].points.cloud()
     points = replace(cloud, points=site.frame.to_world(cloud.points), extra={})
-    if isinstance(site.sensor, StereoPair | MatchedStereoPair):
+    if not isinstance(site.sensor, LaserScanner):
         believed, cameras = model or run.config.stereo_model(), pair_of(site.sensor).cameras
         return measure(sensor="stereo", reference=world, points=points, model=believed, cameras=cameras)
-    assert isinstance(site.sensor, LaserScanner)  # there is no other sensor of a run
     position, rotation = site.frame.to_world(site.sensor.position), site.frame.rotation.T @ site.sensor.rotation
     scanner, believed = {"position_m": position, "rotation": rotation}, model or run.config.tls_model()
     return measure(sensor="tls", reference=world, points=points, model=believed, scanner=scanner)

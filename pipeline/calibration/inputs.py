@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 from pipeline.calibration.windows import Windows, choose_windows, unchanged
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.measurement import FILE, Measurement, read_measurement
+from pipeline.formats.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
 from pipeline.run.site import Site, prepare_site
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.model import StereoModel
 from sensors.stereo import StereoPair
 from sensors.tls import LaserScanner, Pattern
 
@@ -130,21 +128,21 @@ def _covered(maps: NDArray[np.floating], of_points: bool) -> BoolArray:
 
 def _measured_site(measurement: Measurement, config: SimulationConfig) -> Site:
     """The instrument of a measurement in front of its reference surface."""
-    frame, mesh = measurement.frame, measurement.reference
-    model = measurement.model
-    if isinstance(model, StereoModel):
-        assert measurement.cameras is not None
-        pair = StereoPair(measurement.cameras, frame, model, config.depth_map)
-        eyes: dict[str, FloatArray] = {"cameras": frame.to_wall(measurement.cameras.left.position)}
-        return Site("measured", measurement.notes, mesh, frame, pair, eyes)
-    assert measurement.station is not None
-    position, rotation = measurement.station
+    sensor: StereoPair | LaserScanner
+    if isinstance(measurement, StereoMeasurement):
+        name, sensor = "cameras", StereoPair(measurement.cameras, measurement.frame, measurement.model, config.depth_map)
+    else:
+        name, sensor = "scanner", _scanner(measurement, config)
+    eyes = {name: measurement.viewpoint}
+    return Site("measured", measurement.notes, measurement.reference, measurement.frame, sensor, eyes)
+
+
+def _scanner(measurement: TlsMeasurement, config: SimulationConfig) -> LaserScanner:
+    """With the measurement's pattern; where that is not known, over all of the reference as the config says."""
+    (position, rotation), model, frame = measurement.station, measurement.model, measurement.frame
     if measurement.pattern is None:
         world = frame.to_world(position), frame.rotation.T @ rotation
-        scanner = LaserScanner.aimed(world, frame, mesh.vertices, config.scanner, model)
-    else:
-        azimuth, zenith = measurement.pattern.azimuth_rad, measurement.pattern.zenith_rad
-        steps = config.scanner.model_copy(update={"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})  # of any size
-        pattern = Pattern.over(azimuth[:2], zenith[:2], steps)
-        scanner = LaserScanner(position, rotation, pattern, steps, model)
-    return Site("measured", measurement.notes, mesh, frame, scanner, {"scanner": position})
+        return LaserScanner.aimed(world, frame, measurement.reference.vertices, config.scanner, model)
+    azimuth, zenith = measurement.pattern.azimuth_rad, measurement.pattern.zenith_rad
+    steps = config.scanner.model_copy(update={"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})  # of any size
+    return LaserScanner(position, rotation, Pattern.over(azimuth[:2], zenith[:2], steps), steps, model)

@@ -94,15 +94,16 @@ def _moves(base: StereoModel) -> bool:
 
 
 def _bounds(base: Model, name: str) -> tuple[float, float]:
+    if not isinstance(base, StereoModel):
+        return _BOUNDS[name]
     if name in _BOUNDS:
-        if name == ORIENTATION and isinstance(base, StereoModel) and not _moves(base):
+        if name == ORIENTATION and not _moves(base):
             raise InputError(
                 "the model has no noise of the orientation that a factor could change",
                 where="calibration.fit",
                 remedy="give its sigmas, such as --set sensor=glendale_high",
             )
         return _BOUNDS[name]
-    assert isinstance(base, StereoModel)
     sigma = getattr(base.noise.orientation, name.removeprefix(f"{ORIENTATION}.")).sigma
     if not sigma > 0:
         raise InputError("its sigma in the model is 0, so there is no scale to seek it at", where=f"calibration.fit: {name}")

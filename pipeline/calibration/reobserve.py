@@ -24,7 +24,7 @@ from pipeline.calibration.windows import Windows
 from pipeline.config.simulation import SimulationConfig
 from pipeline.noise.measured import point_differences
 from pipeline.registration.closest_points import ReferenceSurface
-from pipeline.registration.register import register_to
+from pipeline.registration.register import IcpConfig, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.run.site import Site
 from pipeline.surface.mesh import mesh_observation
@@ -136,7 +136,7 @@ class Reobserver:
         points = self._observe(model, random)
         if self.config.icp is None:
             return points
-        return self._registration(points, random.child("register")).apply(points)
+        return self._registration(points, self.config.icp, random.child("register")).apply(points)
 
     @cached_property
     def silent_heights(self) -> FloatArray:
@@ -147,13 +147,12 @@ class Reobserver:
         """(cells, 3) points, m."""
         return _asked(self.sensor, model, self.cells).observe(self.caster, random).points.reshape(-1, 3)
 
-    def _registration(self, points: FloatArray, random: KeyedRandom) -> RigidTransform:
+    def _registration(self, points: FloatArray, icp: IcpConfig, random: KeyedRandom) -> RigidTransform:
         """ICP to the wall as it is, from where the lattice's own points, which are known without noise, bring it."""
         lattice = points[self._lattice_start :]
         known = ~np.isnan(lattice[:, 0])
         first = _best_rigid(lattice[known], self._lattice_points[known])
-        assert self.config.icp is not None
-        config = self.config.icp.model_copy(update={"subsample_points": False, "outlier_threshold_decay_iteration": 1})
+        config = icp.model_copy(update={"subsample_points": False, "outlier_threshold_decay_iteration": 1})
         then = register_to(self.target, first.apply(lattice[known]), config, random, threads=1).transform
         return RigidTransform(then.rotation @ first.rotation, then.rotation @ first.translation + then.translation)
 

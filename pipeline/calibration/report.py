@@ -12,7 +12,7 @@ import yaml
 from matplotlib.figure import Figure
 from scipy import stats
 
-from pipeline.calibration.calibrate import Calibration
+from pipeline.calibration.calibrate import Baseline, Calibration
 from pipeline.change.difference import statistics
 from pipeline.formats.atomic import write_text
 from pipeline.report.figures import DIFFERENCE_LABEL, DPI, FAMILY, difference_figure, dress, plain_numbers, png_bytes
@@ -164,13 +164,11 @@ def _tables(result: Calibration) -> list[_Table]:
         sized = [[row[0], f"{1e3 * size:.2f}", *row[1:]] for row, size in zip(rows, result.patterns.size_m, strict=True)]
         tables.append(_Table(caption, ["", "mm", *result.patterns.names], sized))
     if result.baseline is not None:
-        tables.append(_greedy(result))
+        tables.append(_greedy(result, result.baseline))
     return tables
 
 
-def _greedy(result: Calibration) -> _Table:
-    baseline = result.baseline
-    assert baseline is not None
+def _greedy(result: Calibration, baseline: Baseline) -> _Table:
     rows = [["one parameter at a time, by StD", str(baseline.result.tests), f"{baseline.cost:.0f}"]]
     rows += [
         [f"this search, after round {number}", str(maps), f"{cost:.0f}"] for number, (maps, cost) in enumerate(baseline.costs, 1)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibration.calibrate import Calibration
+from pipeline.calibration.calibrate import Baseline, Calibration
 from pipeline.calibration.maps import noise_map
 from pipeline.calibration.report import pictures, write_calibration_report
 from pipeline.config.simulation import SimulationConfig
@@ -118,13 +118,11 @@ def to_dict(result: Calibration) -> dict[str, Any]:
             "cells_per_observation": result.cells,
             "seconds": result.seconds,
         },
-        "greedy": None if result.baseline is None else _baseline(result),
+        "greedy": None if result.baseline is None else _baseline(result, result.baseline),
     }
 
 
-def _baseline(result: Calibration) -> dict[str, Any]:
-    baseline = result.baseline
-    assert baseline is not None
+def _baseline(result: Calibration, baseline: Baseline) -> dict[str, Any]:
     return {
         "parameters": dict(zip(result.parameters.names, np.exp(baseline.result.x), strict=True)),
         "simulated_maps": baseline.result.tests,

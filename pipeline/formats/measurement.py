@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from pipeline.formats.measurement_checks import Fit, Sweep, check_frame, check_i
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
+from pipeline.registration.rigid import rotation_matrix
 from scene.config import Config, load_yaml, parse
 from scene.errors import InputError
 from scene.frame import WallFrame
@@ -26,11 +28,13 @@ from scene.imported import read_reference
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import RayCaster
 from scene.winding import check_near, facing
-from sensors.camera import CameraPair, Matrix3, Vector3, check_rotation
+from sensors.camera import Camera, CameraPair, Matrix3, Vector3, check_rotation
+from sensors.effects.base import Sensor
 from sensors.model import StereoModel, TlsModel
 
 FILE = "measurement.yaml"
 MOST_EPOCHS = 1000
+_NAME_CAMERAS = "name cameras.yaml or a Metashape XML"
 _FEW_DIGITS, _ROUNDING = 0.005, 1e-9
 """How far a rotation matrix may be from orthonormal for want of digits, and how far it is left as it stands."""
 
@@ -133,25 +137,23 @@ class _ModelFile(Config):
     sensor: Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_kind)]
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """What was measured, with everything that predicts it.
+Pose = tuple[FloatArray, FloatArray]
+"""Position (3,) m and rotation (3, 3) of a sensor."""
 
-    cloud: points in the wall frame; reference: wall frame; station: position (3,) and rotation (3, 3) scanner to wall frame, TLS
-    only; cameras: world frame, stereo only; frame: the wall frame; order: each point's scan line and share of the scan's duration
-    (n,), None where not known, once they were counted (see `with_order`); stable_areas: outside of which the scene may have
-    changed, everywhere where there are none; notes: what should be said of the files.
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementBase(ABC):
+    """What was measured, with everything that predicts it; what a laser scan and a stereo pair have in common.
+
+    cloud: points in the wall frame; reference: wall frame; frame: the wall frame; stable_areas: outside of which the scene may
+    have changed, everywhere where there are none; notes: what should be said of the files.
     """
 
-    sensor: Literal["tls", "stereo"]
+    sensor: ClassVar[Sensor]
     cloud: PointCloud
     reference: TriangleMesh
     frame: WallFrame
     model: TlsModel | StereoModel
-    pattern: ScanPattern | None = None
-    station: tuple[FloatArray, FloatArray] | None = None
-    cameras: CameraPair | None = None
-    order: tuple[FloatArray | None, FloatArray | None] | None = None
     stable_areas: tuple[Area, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -171,36 +173,90 @@ class Measurement:
         return RayCaster(self.reference)
 
     @property
+    @abstractmethod
     def viewpoint(self) -> FloatArray:
         """(3,) where the rays begin, wall frame, m: the scanner's centre, the left camera's."""
-        if self.cameras is not None:
-            return self.frame.to_wall(self.cameras.left.position)
-        if self.station is None:
-            raise InputError("a TLS measurement needs `scanner`", where=FILE)
-        return self.station[0]
 
     @property
     def fit(self) -> Fit:
         """How the points lie against the reference."""
         return Fit.of(self.cloud.points, self.viewpoint, self.scene)
 
-    def changed(self, **values: Any) -> Measurement:
+    def changed(self, **values: Any) -> Self:
         """The same with other points, cameras or pose, in front of the same ray caster."""
         other = replace(self, **values)
         other.__dict__["scene"] = self.scene  # where cached_property keeps it
         return other
 
-    def part(self, rows: NDArray[np.int64]) -> Measurement:
+    def part(self, rows: NDArray[np.int64]) -> Self:
         """Some of the points."""
-        cloud = self.cloud
-        few = PointCloud(
-            points=cloud.points[rows],
-            intensity=None if cloud.intensity is None else cloud.intensity[rows],
-            gps_time=None if cloud.gps_time is None else cloud.gps_time[rows],
-            extra={name: values[rows] for name, values in cloud.extra.items()},
-        )
+        return self.changed(cloud=self.cloud.part(rows))
+
+    def moved(self, pose: FloatArray) -> Self:
+        """The measurement with its sensor shifted (m) and turned (rad) by a pose (6,) in the wall frame, and its points with it.
+
+        What the sensor recorded stays as it is. A pair of cameras turns about the left one.
+        """
+        turn, centre = rotation_matrix(pose[3:]), self.viewpoint
+        points = (self.cloud.points - centre) @ turn.T + centre + pose[:3]
+        return self.changed(cloud=replace(self.cloud, points=points), **self._moved_sensor(turn, pose[:3]))
+
+    @abstractmethod
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        """The field that says where the sensor stands, with another value. turn: (3, 3), shift: (3,), wall frame, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TlsMeasurement(MeasurementBase):
+    """A laser scan, or epochs of it.
+
+    station: scanner to wall frame; pattern: the nominal directions, None where not known; order: each point's scan line and share
+    of the scan's duration (n,), None where not known, once they were counted (see `with_order`).
+    """
+
+    sensor = "tls"
+    model: TlsModel
+    station: Pose
+    pattern: ScanPattern | None = None
+    order: tuple[FloatArray | None, FloatArray | None] | None = None
+
+    @property
+    def viewpoint(self) -> FloatArray:
+        return self.station[0]
+
+    def part(self, rows: NDArray[np.int64]) -> Self:
         line, share = (None if values is None else values[rows] for values in self.order or (None, None))
-        return self.changed(cloud=few, order=self.order and (line, share))
+        return super().part(rows).changed(order=self.order and (line, share))
+
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        position, rotation = self.station
+        return {"station": (position + shift, turn @ rotation)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoMeasurement(MeasurementBase):
+    """A surface that a stereo pair gave. cameras: the nominal calibration, world frame."""
+
+    sensor = "stereo"
+    model: StereoModel
+    cameras: CameraPair
+
+    @property
+    def viewpoint(self) -> FloatArray:
+        return self.frame.to_wall(self.cameras.left.position)
+
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        axes = self.frame.rotation
+        world, along = axes.T @ turn @ axes, axes.T @ shift
+        left = self.cameras.left.position
+
+        def each(camera: Camera) -> Camera:
+            return replace(camera, rotation=world @ camera.rotation, position=left + world @ (camera.position - left) + along)
+
+        return {"cameras": CameraPair(each(self.cameras.left), each(self.cameras.right))}
+
+
+Measurement = TlsMeasurement | StereoMeasurement
 
 
 def read_model(path: Path) -> TlsModel | StereoModel:
@@ -268,20 +324,35 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     for name, each in zip(material.points, clouds, strict=True):
         said.append((name, _rounding(each.points, config, model, cameras, name)))
     cloud = _joined(clouds)
-    found = Measurement(
-        sensor=config.sensor,
+    found = _of_sensor(
+        config,
+        material,
+        where,
         cloud=_in_wall_frame(cloud, config.frame, config.scanner, frame),
         reference=local,
         frame=frame,
-        model=model,
-        pattern=config.pattern,
-        station=_station(config, frame),
-        cameras=cameras,
         stable_areas=config.stable_areas,
         notes=(*config.notes, *(f"{Path(name).name}: {note}" for name, texts in said for note in texts if note)),
     )
     _check(found, cloud, config, where)
     return found
+
+
+def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shared: Any) -> Measurement:
+    """A laser scan or a pair's surface. shared: the fields that both have."""
+    if isinstance(material.model, StereoModel):
+        if material.cameras is None:
+            raise InputError("a stereo measurement needs `cameras`", where=where, remedy=_NAME_CAMERAS)
+        return StereoMeasurement(model=material.model, cameras=material.cameras, **shared)
+    pose, frame = _scanner_pose(config, where), shared["frame"]
+    station = frame.to_wall(np.array(pose.position_m)), frame.rotation @ np.array(pose.rotation)
+    return TlsMeasurement(model=material.model, station=station, pattern=config.pattern, **shared)
+
+
+def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
+    if config.scanner is None:
+        raise InputError("a TLS measurement needs `scanner`", where=where, remedy="give scanner: position_m and rotation")
+    return config.scanner
 
 
 def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, where: str) -> None:
@@ -298,7 +369,7 @@ def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, whe
         unsaid: Literal["scanner", "world"] = "world" if config.frame == "scanner" else "scanner"
         other = found.changed(cloud=_in_wall_frame(cloud, unsaid, config.scanner, found.frame)).fit
     check_frame(here, other, config.frame, where)
-    if config.pattern is not None and found.station is not None:
+    if config.pattern is not None and isinstance(found, TlsMeasurement):
         position, rotation = found.station
         local = np.einsum("ji,nj->ni", rotation, found.cloud.points - position)
         check_inside(local, config.pattern.azimuth_rad, config.pattern.zenith_rad, where)
@@ -312,7 +383,7 @@ def _cameras(config: MeasurementConfig, base: Path, where: str) -> CameraPair | 
     if config.sensor == "tls":
         return None
     if config.cameras is None:
-        raise InputError("a stereo measurement needs `cameras`", where=where, remedy="name cameras.yaml or a Metashape XML")
+        raise InputError("a stereo measurement needs `cameras`", where=where, remedy=_NAME_CAMERAS)
     return nominal_pair(base / config.cameras)
 
 
@@ -326,9 +397,7 @@ def _viewpoints(config: MeasurementConfig, cameras: CameraPair | None, where: st
     """Where the sensors stand, by name, world frame."""
     if cameras is not None:
         return {"left camera": cameras.left.position, "right camera": cameras.right.position}
-    if config.scanner is None:
-        raise InputError("a TLS measurement needs `scanner`", where=where, remedy="give scanner: position_m and rotation")
-    return {"scanner": np.array(config.scanner.position_m)}
+    return {"scanner": np.array(_scanner_pose(config, where).position_m)}
 
 
 def _rounding(
@@ -348,12 +417,6 @@ def _rounding(
     base = float(np.linalg.norm(right.position - left.position))
     noise = depth**2 / (left.f_px * base) * disparity  # of Z = f B / d
     return check_rounded_points(points, left.position, float(noise), where)
-
-
-def _station(config: MeasurementConfig, frame: WallFrame) -> tuple[FloatArray, FloatArray] | None:
-    if config.scanner is None:
-        return None
-    return frame.to_wall(np.array(config.scanner.position_m)), frame.rotation @ np.array(config.scanner.rotation)
 
 
 def _joined(clouds: list[PointCloud]) -> PointCloud:

@@ -73,16 +73,7 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
         raise InputError(problem, where=where, remedy="export the points again")
     if keep.sum() > 1 and np.ptp(cloud.points[keep], axis=0).max() < _ONE_PLACE_M:
         raise InputError(f"all {keep.sum():,} points are the same one", where=where, remedy="export the points again")
-    return cloud if keep.all() else _rows(cloud, keep)
-
-
-def _rows(cloud: PointCloud, keep: NDArray[np.bool_]) -> PointCloud:
-    return PointCloud(
-        cloud.points[keep],
-        None if cloud.intensity is None else cloud.intensity[keep],
-        None if cloud.gps_time is None else cloud.gps_time[keep],
-        {name: channel[keep] for name, channel in cloud.extra.items()},
-    )
+    return cloud if keep.all() else cloud.part(keep)
 
 
 def check_frame(here: Fit, other: Fit | None, frame: str, where: str) -> None:

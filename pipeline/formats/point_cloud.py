@@ -22,3 +22,12 @@ class PointCloud:
     intensity: NDArray[Any] | None = None
     gps_time: FloatArray | None = None
     extra: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def part(self, rows: NDArray[Any]) -> PointCloud:
+        """Some of the points, by a mask or indices."""
+        return PointCloud(
+            points=self.points[rows],
+            intensity=None if self.intensity is None else self.intensity[rows],
+            gps_time=None if self.gps_time is None else self.gps_time[rows],
+            extra={name: values[rows] for name, values in self.extra.items()},
+        )

@@ -10,9 +10,9 @@ from pipeline.report.page import true_minus
 from pipeline.run.site import Site
 from scene.mesh import FloatArray
 from sensors.effects.base import Effect
+from sensors.exchanged import StereoSensor, pair_of
 from sensors.model import OrientationNoise, Spread
-from sensors.observation import Sensor
-from sensors.stereo import REDUCTION, StereoPair
+from sensors.stereo import REDUCTION
 from sensors.stereo_matched import MatchedStereoPair
 from sensors.tls import LaserScanner
 
@@ -44,10 +44,8 @@ def _scanner_figures(scanner: LaserScanner, site: Site) -> dict[str, str]:
     }
 
 
-def _pair_figures(sensor: Sensor, site: Site) -> dict[str, str]:
-    pair = sensor.pair if isinstance(sensor, MatchedStereoPair) else sensor
-    if not isinstance(pair, StereoPair):
-        raise TypeError(f"neither a scanner nor a pair: {type(sensor).__name__}")
+def _pair_figures(sensor: StereoSensor, site: Site) -> dict[str, str]:
+    pair = pair_of(sensor)
     left, right, noise = pair.cameras.left, pair.cameras.right, pair.model.noise
     base = float(np.linalg.norm(right.position - left.position))
     pixel_mm = _ranges(site.mesh.vertices, site.frame.to_wall(left.position))[1] / left.f_px * 1e3

@@ -10,7 +10,7 @@ from pipeline.registration.register import register_to
 from pipeline.run.site import Site
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
-from sensors.observation import Sensor
+from sensors.exchanged import StereoSensor
 from sensors.stereo import StereoPair
 from sensors.stereo_matched import MatchedStereoPair
 from sensors.tls import LaserScanner
@@ -22,13 +22,11 @@ def reference_sensor(config: SimulationConfig, site: Site) -> Site:
         return site
     sensor = site.sensor
     if isinstance(sensor, MatchedStereoPair):
-        quiet: Sensor = replace(sensor, pair=_quiet(sensor.pair))
+        quiet: LaserScanner | StereoSensor = replace(sensor, pair=_quiet(sensor.pair))
     elif isinstance(sensor, StereoPair):
         quiet = _quiet(sensor)
-    elif isinstance(sensor, LaserScanner):
-        quiet = replace(sensor, model=sensor.model.without_noise())
     else:
-        raise TypeError(f"neither a scanner nor a pair: {type(sensor).__name__}")
+        quiet = replace(sensor, model=sensor.model.without_noise())
     further = tuple(replace(each, model=each.model.without_noise()) for each in site.further_stations)
     return replace(site, sensor=quiet, further_stations=further)
 

@@ -13,7 +13,7 @@ from scene.mesh import FloatArray, TriangleMesh
 from scene.wall import Wall, build_wall
 from scene.winding import check_near, facing
 from sensors.camera import CameraPair
-from sensors.observation import Sensor
+from sensors.exchanged import StereoSensor
 from sensors.placement import Target
 from sensors.stereo import StereoPair
 from sensors.stereo_matched import MatchedStereoPair
@@ -32,7 +32,7 @@ class Site:
     repairs: tuple[str, ...]
     mesh: TriangleMesh
     frame: WallFrame
-    sensor: Sensor
+    sensor: LaserScanner | StereoSensor
     viewpoints: dict[str, FloatArray]
     further_stations: tuple[LaserScanner, ...] = ()
 
@@ -84,7 +84,7 @@ def _faced(
     return mesh, (*wall.repairs, *([words] if words else []))
 
 
-def _stereo(config: SimulationConfig, cameras: CameraPair, frame: WallFrame, random: KeyedRandom) -> Sensor:
+def _stereo(config: SimulationConfig, cameras: CameraPair, frame: WallFrame, random: KeyedRandom) -> StereoSensor:
     """The pair with the config's matcher; the rock's texture stays the same from epoch to epoch."""
     pair = StereoPair(cameras, frame, config.stereo_model(), config.depth_map, config.products.truth_channels)
     if config.matcher == "simulated":

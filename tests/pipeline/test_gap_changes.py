@@ -17,8 +17,8 @@ from pipeline.formats.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
 from pipeline.gap.residuals.changes import SceneChange, find_changes
-from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
 
 STEPS = [4e-3, 2e-3, 1e-3]
 """20,000, 80,000 and 325,000 points."""
@@ -29,7 +29,8 @@ def found_in(seen: Scan, value: Array, epoch: Any = None) -> list[SceneChange]:
     at = (seen.plane[:, None] * seen.ray)[:, [0, 2]]
     covariates = {"azimuth": seen.azimuth, "zenith": seen.zenith, "range": seen.plane}
     true = np.ones(n, dtype=bool)
-    residuals = Residuals("tls", value, SIGMA * one, one, true, true, np.zeros((n, 6)), at, covariates, np.arange(n))
+    geometry = RayGeometry(seen.azimuth, seen.zenith)
+    residuals = TlsResiduals(value, SIGMA * one, one, true, true, np.zeros((n, 6)), at, covariates, np.arange(n), geometry)
     plane = np.stack([seen.azimuth, seen.zenith], axis=1)
     sight = Sight(plane, np.zeros(n, dtype=int) if epoch is None else epoch, np.zeros(3), seen.ray, seen.plane)
     return find_changes(residuals, sight, true)[0]

@@ -11,7 +11,7 @@ from gap_cases import write_scan
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.naming.verify import measure_losses
 from pipeline.gap.other.missing import MissingFound, find_missing, isolated
 from pipeline.gap.residuals.residuals import Missing
@@ -110,7 +110,7 @@ def test_a_wall_on_both_sides_of_the_azimuth_pi_is_one_wall(tmp_path: Path) -> N
     """The scanner's frame turned, so that half of the same points have azimuths below pi and half above minus pi."""
     write_scan(tmp_path, 1)
     plain = read_measurement(tmp_path)
-    assert plain.station is not None
+    assert isinstance(plain, TlsMeasurement)
     assert plain.pattern is not None
     position, rotation = plain.station
     before = tls_residuals(plain)

@@ -22,7 +22,7 @@ from pipeline.formats.colmap import write_colmap
 from pipeline.formats.e57 import E57Scan, write_e57
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.formats.laz import write_laz
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurement import StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.metashape import write_metashape
 from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
@@ -270,7 +270,7 @@ def test_a_pose_of_few_digits_is_taken_with_a_word(case: Case, tmp_path: Path) -
 
     found = read_measurement(rewritten(case, tmp_path, change))
     assert any("few digits" in note for note in found.notes)
-    assert found.station is not None
+    assert isinstance(found, TlsMeasurement)
     np.testing.assert_allclose(found.station[1] @ found.station[1].T, np.eye(3), atol=1e-12)
     assert not any("few digits" in note for note in read_measurement(case[0]).notes)
 
@@ -324,7 +324,7 @@ def test_a_cloud_from_photographs_with_a_dem(kind: str, tmp_path: Path) -> None:
     ]
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
     measurement = read_measurement(tmp_path / "out")
-    assert measurement.cameras is not None
+    assert isinstance(measurement, StereoMeasurement)
     np.testing.assert_allclose(measurement.cameras.right.position, cameras.right.position, atol=1e-6)
     assert measurement.fit.near == 1.0
     assert abs(measurement.fit.off_m) < 0.003

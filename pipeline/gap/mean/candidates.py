@@ -76,8 +76,14 @@ class Candidate:
         """(n, k) the design."""
         if self.matrix is not None:
             return self.matrix
-        assert self.wave is not None
-        return self.wave.columns(self.period)
+        return self.sine.columns(self.period)
+
+    @property
+    def sine(self) -> Wave:
+        """The wave of a sine. Raises TypeError where the candidate is none."""
+        if self.wave is None:
+            raise TypeError(f"{self.name} is no sine")
+        return self.wave
 
     def part(self, rows: Rows) -> Candidate:
         """The candidate on some of the points."""
@@ -188,9 +194,7 @@ def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> l
 
 def moved_to(candidate: Candidate, period: float) -> Candidate:
     """The same sine with another period."""
-    wave = candidate.wave
-    assert wave is not None
-    return Grid(candidate.name, candidate.names[0], wave, np.empty(0), candidate.fixed, candidate.empirical).at(period)
+    return Grid(candidate.name, candidate.names[0], candidate.sine, np.empty(0), candidate.fixed, candidate.empirical).at(period)
 
 
 def precision_of(candidate: Candidate, width: int) -> FloatArray:
@@ -200,9 +204,7 @@ def precision_of(candidate: Candidate, width: int) -> FloatArray:
 
 def harmonics(covariate: str, sine: Candidate) -> Candidate:
     """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the fifth."""
-    wave = sine.wave
-    assert wave is not None
-    columns = np.concatenate([wave.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
+    columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
     return replace(_free(covariate, HARMONICS, columns), period=sine.period)
 
 

@@ -182,8 +182,8 @@ class Choice:
                     continue
                 if found is None or self._adds(state, state.score + form.score - found[0].score - found[1].score, found[1]):
                     found = state, form
-            assert found is not None
-            return found[0].members, found[1]
+            if found is not None:
+                return found[0].members, found[1]
         alone = empty.free
         if not best.members or alone is None:
             return None

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import Candidate, Grid, Wave, amplitude_and_phase, frequencies, variants
-from pipeline.gap.residuals.nominal_pair import NominalPair, StereoGeometry, real_pair, seen_disparities
-from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
+from pipeline.gap.residuals.residuals import Geometry, Residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.mesh import FloatArray
 from sensors.effects import catalogue
 from sensors.effects.base import Effect, Search, ShowsIn
@@ -39,15 +40,17 @@ def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candid
     geometry = residuals.geometry
     shown = [effect for effect in catalogue(residuals.sensor) if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
     cameras: list[type[CameraEffect]] = [effect for effect in shown if issubclass(effect, CameraEffect)]
-    found = _of_cameras(cameras, geometry, measurement) if cameras else []
+    found: list[Candidate | Grid] = []
+    if isinstance(residuals, StereoResiduals) and isinstance(measurement, StereoMeasurement) and cameras:
+        found += _of_cameras(cameras, residuals.geometry, measurement)
     for effect in shown:
         if effect not in cameras:
             sides: list[dict[str, str]] = [{"camera": side} for side in _SIDES[:2]] if "camera" in effect.model_fields else [{}]
             found += [form for fixed in sides for form in _families(effect, geometry, fixed)]
-    return [*found, *_locking(geometry)] if residuals.sensor == "stereo" else found
+    return [*found, *_locking(residuals.geometry)] if isinstance(residuals, StereoResiduals) else found
 
 
-def _families(effect: type[Effect], geometry: Any, fixed: dict[str, Any]) -> Iterator[Candidate | Grid]:
+def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> Iterator[Candidate | Grid]:
     """What one effect allows, by its own equation at typical sizes."""
     if effect.searched is not None:
         yield from _searched(effect, effect.searched, geometry, fixed)
@@ -67,14 +70,14 @@ def _families(effect: type[Effect], geometry: Any, fixed: dict[str, Any]) -> Ite
             yield Candidate(effect.tag(), np.stack(columns, axis=1), partial(_by_name, keys), keys, fixed)
 
 
-def _sine_and_cosine(effect: type[Effect], geometry: Any, fixed: dict[str, Any]) -> FloatArray:
+def _sine_and_cosine(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> FloatArray:
     """(n, 2) a sin(x + phase) = (a cos phase) sin x + (a sin phase) cos x, of amplitude 1."""
     ((amplitude, size),) = effect.typical_sizes().items()
     values = (effect(**fixed, **{amplitude: size, _PHASE: phase}).mean(geometry) / size for phase in (0.0, np.pi / 2))
     return np.stack([*values], axis=1)
 
 
-def _searched(effect: type[Effect], search: Search, geometry: Any, fixed: dict[str, Any]) -> Iterator[Grid]:
+def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: dict[str, Any]) -> Iterator[Grid]:
     """A grid of periods as fine as the reach of what the sine runs along can tell apart."""
     (amplitude,) = effect.typical_sizes()
     x = np.asarray(effect(**fixed).argument(geometry), dtype=np.float64)
@@ -88,7 +91,9 @@ def _searched(effect: type[Effect], search: Search, geometry: Any, fixed: dict[s
     yield Grid(effect.tag(), amplitude, Wave(search.period, factor, x), frequencies(low, 1 / search.shortest, 0.3 / reach), fixed)
 
 
-def _of_cameras(effects: list[type[CameraEffect]], geometry: StereoGeometry, measurement: Measurement) -> list[Candidate | Grid]:
+def _of_cameras(
+    effects: list[type[CameraEffect]], geometry: PixelGeometry, measurement: StereoMeasurement
+) -> list[Candidate | Grid]:
     """By finite differences: the changed pair sees other disparities."""
     nominal = NominalPair.of(measurement)
     sets = {effect: effect.sets or (tuple(effect.nulls()),) for effect in effects}
@@ -119,7 +124,7 @@ def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
     return dict(zip(names, map(float, values), strict=True))
 
 
-def _locking(geometry: StereoGeometry) -> list[Grid]:
+def _locking(geometry: PixelGeometry) -> list[Grid]:
     """A sine of the disparity with the pixels of the matched image, full or reduced, at any phase.
 
     The rectification in which the disparities were found is not part of a measurement: its principal distance (the period) is

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import HARMONICS, SURFACE, Candidate
 from pipeline.gap.mean.selection import Chosen
@@ -15,7 +18,9 @@ from pipeline.gap.other.missing import MissingFound
 from pipeline.gap.other.quantization import Comb
 from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.residuals.registration import Settled, settled
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.config import parse
 from scene.errors import InputError
 from scene.mesh import FloatArray
@@ -89,6 +94,20 @@ def with_effects(
     values = model.model_dump(mode="json")
     changed = {"effects": [*values["effects"], *entries], "noise": {**values["noise"], **(noise or {})}}
     return parse(type(model), {**values, **changed}, "model_after.yaml")
+
+
+def settled_with(
+    measurement: Measurement,
+    effects: Iterable[Named],
+    trusted: NDArray[np.int64] | None = None,
+    noise: dict[str, float] | None = None,
+) -> Settled:
+    """The measurement with further effects in its model, settled: its residuals are taken again and registered.
+
+    trusted: rows of the measurement's points by which to register, all where None; noise: other values of the model's noise.
+    """
+    model = with_effects(measurement.model, [item.entry for item in effects], noise)
+    return settled(measurement.changed(model=model), trusted)
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
@@ -255,7 +274,7 @@ def _surface(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[s
 
 def _shift(covariate: str, part: Residuals) -> float:
     """What an effect's covariate is more than that of the residuals, which is relative for the power."""
-    if covariate != "intensity":
+    if covariate != "intensity" or not isinstance(part, TlsResiduals):
         return 0.0
     return float(np.median(np.log(np.maximum(part.geometry.power, 1e-12)) - part.covariates[covariate]))
 

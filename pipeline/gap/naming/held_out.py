@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.naming.entries import Named, with_effects
+from pipeline.gap.naming.entries import Named, settled_with
 from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.registration import pose_of, settled
+from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.mesh import FloatArray
 
@@ -96,8 +96,7 @@ def _value(
     measurement: Measurement, named: list[Named], residuals: Residuals, trained: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """(n,) residuals, registered by the points `trained`, and predicted sigma against the model with some effects."""
-    model = with_effects(measurement.model, [item.entry for item in named])
-    found = settled(measurement.changed(model=model), residuals.index[trained])[1]
+    found = settled_with(measurement, named, residuals.index[trained]).residuals
     count = len(measurement.cloud.points)
     place = np.full(count, -1)
     place[found.index[found.smooth]] = np.flatnonzero(found.smooth)  # an edge where the beam goes by this model says nothing

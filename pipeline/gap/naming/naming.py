@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import PLACE
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Tried
@@ -20,12 +20,13 @@ from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.regularization_noise import RegularizationNoise
-from sensors.model import StereoModel
 
 _NODES = RegularizationNoise.tag()
 
@@ -72,14 +73,14 @@ def name_effects(
     """
     named: list[Named] = []
     whole, whole_scale, added = part, scale, 0.0
-    tls = part.sensor == "tls"
-    comb = find_comb(part.geometry.measured_m) if tls and not believes(measurement, RangeQuantization.tag()) else None
+    comb = locking = None
+    if isinstance(part, TlsResiduals) and not believes(measurement, RangeQuantization.tag()):
+        comb = find_comb(part.geometry.measured_m)
+    if isinstance(part, StereoResiduals) and not believes(measurement, PixelLocking.tag()):
+        locking = find_locking(part.geometry.found, part.geometry.disparity)
     if comb is not None:
         named.append(from_comb(comb, part))
         added, scale = comb.step_m**2 / 12, 1.0
-    locking = (
-        None if tls or believes(measurement, PixelLocking.tag()) else find_locking(part.geometry.found, part.geometry.disparity)
-    )
     found_apart = set()
     if locking is not None:
         named.append(from_locking(locking))
@@ -101,9 +102,11 @@ def name_effects(
     left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
         spread, spread_tried, words = _spread(measurement, found.at, design.cells, left, random, left_out)
-    if not spread and isinstance(measurement.model, StereoModel) and (_NODES, False) not in left_out:
-        nodes = find_nodes(found.at, left, measurement.model, random)
-        spread = [] if nodes is None else [nodes]
+    if not spread and (_NODES, False) not in left_out:
+        match measurement, found.at:
+            case StereoMeasurement(), StereoResiduals():
+                nodes = find_nodes(found.at, left, measurement.model, random)
+                spread = [] if nodes is None else [nodes]
     if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
     moving = [from_mean(each, found.at) for each in found.estimates]
@@ -133,9 +136,10 @@ def _spread(
     """Effects on the spread of residuals (n,) without the mean effects found, what was tried, and words for a spread of none."""
     names = frozenset(name for name, empirical in left_out if not empirical)
     found, tried, words = find_spread(part, cells, value, random, names)
-    model = measurement.model
-    apart = told_apart(found, part, value, model) if found and isinstance(model, StereoModel) else found
-    return [each for each in apart if each.effect not in names], tried, words
+    match measurement, part:
+        case StereoMeasurement(), StereoResiduals():
+            found = told_apart(found, part, value, measurement.model)
+    return [each for each in found if each.effect not in names], tried, words
 
 
 def _too_wide(measurement: Measurement, spread: list[SpreadFound]) -> frozenset[tuple[str, bool]]:

@@ -12,10 +12,10 @@ from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, Grid, harmonics, precision_of
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Chosen, Tried, class_margin
-from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, typical_sizes, with_effects
+from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, settled_with, typical_sizes
 from pipeline.gap.naming.families import PERIODIC, families_of
 from pipeline.gap.other.spread import SpreadFound
-from pipeline.gap.residuals.registration import registered, settled
+from pipeline.gap.residuals.registration import Settled, registered
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -79,7 +79,7 @@ class _Alone:
         """None where it is beyond what can be, or where the rays of many points would miss the reference with it."""
         if beyond(points.measurement, [estimate], points.part):
             return None
-        there, found = _with(points, [estimate])
+        there, found, _ = _with(points, [estimate])
         rough, _, scale = registered(found)
         largest = decided().points.outlier * scale * found.sigma
         value, kept = np.zeros(len(points.part)), _kept(found, points.part)
@@ -211,7 +211,7 @@ def _again(
     that only, and what was tried last.
     """
     part, noise = points.part, points.noise
-    there, found = _with(points, had)
+    there, found, _ = _with(points, had)
     at = noisier(_at_points(found, part), noise[1])
     renewed = families_of(there, at)
     allowed = {(family.name, family.empirical) for family in points.families}
@@ -238,10 +238,9 @@ def _again(
     return search, at, _without_sines([*kept, *_estimates(search, chosen)]), chosen, tried
 
 
-def _with(points: Points, effects: list[Estimate]) -> tuple[Measurement, Residuals]:
-    """The measurement with some effects in its model, settled, and its residuals."""
-    model = with_effects(points.measurement.model, [from_mean(each, points.part).entry for each in effects])
-    return settled(points.measurement.changed(model=model), points.part.index)[:2]
+def _with(points: Points, effects: list[Estimate]) -> Settled:
+    """The measurement with some effects in its model, settled."""
+    return settled_with(points.measurement, [from_mean(each, points.part) for each in effects], points.part.index)
 
 
 def _without_sines(estimates: list[Estimate]) -> list[Estimate]:

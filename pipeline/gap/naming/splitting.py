@@ -20,7 +20,7 @@ def with_splits(measurement: Measurement, named: list[Named]) -> list[Named]:
     """Effects that are alike to others with what would split them, by their signatures in the survey and one measurement more."""
     if not any(item.alike for item in named):
         return named
-    found = identifiability(measured_survey(measurement.changed(order=None), _POINTS))
+    found = identifiability(measured_survey(measurement, _POINTS))
     return [replace(item, split_by=_split(found, item)) if item.alike else item for item in named]
 
 

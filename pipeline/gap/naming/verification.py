@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.naming.entries import Named, with_effects
+from pipeline.gap.naming.entries import Named, settled_with, with_effects
 from pipeline.gap.naming.verify import LOSS_MEASURE, Gap, Version, measure_gap, measure_losses, thinned
 from pipeline.gap.other.missing import MissingFound
-from pipeline.gap.residuals.registration import pose_of, settled
+from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -105,20 +105,18 @@ class Showing:
         model = with_effects(self.measurement.model, [item.entry for item in named], self.lower)
         before = self.pose
         if named or self.lower:
-            value, pose = self._registered(model)
+            value, pose = self._registered(named)
         else:
             value, pose = self.residuals.value - self.residuals.pose @ before, before
         versions = Version(self.measurement.model, before), Version(model, pose)
         return Shown(named, self.lower, model, value, pose, self._gap(named, versions, rows))
 
-    def _registered(self, model: TlsModel | StereoModel) -> tuple[FloatArray, FloatArray]:
-        """(n,) residuals of the same points against another model, NaN where that misses the reference; the pose (6,)."""
+    def _registered(self, named: list[Named]) -> tuple[FloatArray, FloatArray]:
+        """(n,) residuals of the same points with some effects, NaN where their rays miss the reference; the pose (6,)."""
         trusted = self.residuals.index[self.chosen]
-        _, found, there = settled(self.measurement.changed(model=model), trusted)
+        _, found, there = settled_with(self.measurement, named, trusted, self.lower)
         rest = pose_of(found, found.smooth & np.isin(found.index, trusted))
-        value = np.full(len(self.measurement.cloud.points), np.nan)
-        value[found.index] = found.value - found.pose @ rest
-        return np.asarray(value[self.residuals.index]), there + rest
+        return found.of_points(found.value - found.pose @ rest, self.residuals.index), there + rest
 
     def _gap(self, named: list[Named], versions: tuple[Version, Version], rows: BoolArray) -> Gap | None:
         missing = self.residuals.missing

@@ -8,20 +8,20 @@ Floor: the same score of draws of the model itself; no higher than the score aft
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
-from pipeline.gap.residuals.registration import moved
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals
 from pipeline.gap.residuals.scan_simulation import simulate_ranges
-from pipeline.registration.rigid import rotation_matrix
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
@@ -100,23 +100,22 @@ class Version:
 
 def simulated(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
     """(n,) simulated minus geometric observable of the residuals' points, registered, NaN without a return."""
-    if isinstance(version.model, TlsModel):
-        assert measurement.station is not None
-        position, rotation = measurement.station
-        stood = position + version.pose[:3], rotation_matrix(version.pose[3:]) @ rotation
-        there = replace(measurement, station=stood)
-        ranges = simulate_ranges(there, version.model, residuals.geometry, random, measurement.scene)
-        return ranges - np.asarray(residuals.geometry.range_m)
-    return _simulated_disparities(moved(measurement, version.pose), version.model, residuals, random)
+    match measurement.moved(version.pose), version.model, residuals:
+        case TlsMeasurement() as scan, TlsModel() as model, TlsResiduals(geometry=rays):
+            return simulate_ranges(scan, model, rays, random) - np.asarray(rays.range_m)
+        case StereoMeasurement() as pair, StereoModel() as model, StereoResiduals():
+            return _simulated_disparities(pair, model, residuals, random)
+    raise TypeError("measurement, model and residuals are of different sensors")
 
 
-def _simulated_disparities(measurement: Measurement, model: StereoModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+def _simulated_disparities(
+    measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, random: KeyedRandom
+) -> FloatArray:
     """Of the depth map's cell that holds each pixel; the finest depth map of whose grid the pixels are.
 
     measurement: with its cameras where they stood, against which `residuals` may be those of another place.
     """
     nominal, g = NominalPair.of(measurement), residuals.geometry
-    assert measurement.cameras is not None
     quality = min(REDUCTION, key=lambda name: float(np.mean(np.abs(np.mod(g.u, REDUCTION[name]) - REDUCTION[name] / 2))))
     step = REDUCTION[quality]
     pair = StereoPair(measurement.cameras, measurement.frame, model, quality)
@@ -126,13 +125,6 @@ def _simulated_disparities(measurement: Measurement, model: StereoModel, residua
     seen = points[rows, columns]
     found = nominal.disparity(project(nominal.pair.left, seen), project(nominal.pair.right, seen))
     return np.asarray(found - g.disparity)
-
-
-def observed(residuals: Residuals) -> FloatArray:
-    """(n,) measured minus geometric observable, without any effect of the model, as if all epochs were taken from one place."""
-    g = residuals.geometry
-    difference = np.asarray(g.measured_m - g.range_m if residuals.sensor == "tls" else g.found - g.disparity)
-    return difference if residuals.away is None else difference - residuals.away
 
 
 def measure_gap(
@@ -151,7 +143,7 @@ def measure_gap(
     """
     patch = patches(residuals.at, _POINTS_PER_PATCH)
     versions = [_draws(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
-    truth, measured = _draws(measurement, after, residuals, random.child("floor")), observed(residuals)
+    truth, measured = _draws(measurement, after, residuals, random.child("floor")), residuals.observed
     usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
     reach = largest * residuals.sigma
     off = np.min([np.abs(measured - np.median(draws, axis=0)) for draws in versions], axis=0)

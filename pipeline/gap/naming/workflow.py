@@ -11,11 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.formats.measurement_checks import check_near, check_noise
 from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import Tried
-from pipeline.gap.naming.entries import Named, from_missing, from_shape, from_tails, only_within_bounds, with_effects
+from pipeline.gap.naming.entries import (
+    Named,
+    from_missing,
+    from_shape,
+    from_tails,
+    only_within_bounds,
+    settled_with,
+    with_effects,
+)
 from pipeline.gap.naming.families import believes
 from pipeline.gap.naming.held_out import score_effects
 from pipeline.gap.naming.naming import Naming, name_effects
@@ -33,7 +41,8 @@ from pipeline.gap.residuals.changes import SceneChange, find_changes
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
-from pipeline.gap.residuals.tls_residuals import missing_returns, with_order
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.beam_divergence import BeamDivergence
@@ -105,7 +114,7 @@ def diagnose(
 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> Diagnosis:
-    measurement = with_order(measurement) if measurement.sensor == "tls" else measurement
+    measurement = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
     check_near(measurement.fit)
     first = residuals_of(measurement)
     check_noise(first.sensor, first.sigma)
@@ -113,7 +122,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
     held_points |= _held_epoch(measurement.epochs)
     there, plain, surveyed = settled(measurement, first.index[~held_points[first.index]], first)
-    if measurement.sensor == "tls":
+    if isinstance(there, TlsMeasurement) and isinstance(plain, TlsResiduals):
         plain = replace(plain, missing=missing_returns(there, plain))
     clock.lap("residuals")
     if plain.smooth.sum() < decided().points.fewest:
@@ -254,9 +263,8 @@ def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random:
     def beside(found: _Attempt) -> _Attempt:
         if not found.named:
             return found
-        model = with_effects(there.model, [item.entry for item in found.named])
-        seen = settled(there.changed(model=model), plain.index[~held_points[plain.index]])[:2]
-        again = _State.of(there, plain, held_points, *_shapes(*seen, held_points))
+        seen = settled_with(there, found.named, plain.index[~held_points[plain.index]])
+        again = _State.of(there, plain, held_points, *_shapes(seen.measurement, seen.residuals, held_points))
         names = {each.name for each in again.shapes}
         # rays that are not quite where they are thought to be look like a low-pass
         feigned = Smoothing.tag() in names - found.shapes
@@ -303,10 +311,12 @@ def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArr
     """
     rough, _, scale = registered(residuals)
     found: list[ShapeFound] = []
-    if measurement.sensor == "stereo":
-        found = find_shapes(measurement, residuals, rough, held_points[residuals.index])
-    elif not believes(measurement, BeamDivergence.tag()):
-        found = find_footprint(measurement, residuals, rough, scale, held_points[residuals.index])
+    held_out = held_points[residuals.index]
+    match measurement, residuals:
+        case StereoMeasurement(), StereoResiduals():
+            found = find_shapes(measurement, residuals, rough, held_out)
+        case TlsMeasurement(), TlsResiduals() if not believes(measurement, BeamDivergence.tag()):
+            found = find_footprint(measurement, residuals, rough, scale, held_out)
     touched = np.zeros(len(measurement.cloud.points), dtype=bool)
     for each in found:
         touched[residuals.index] |= each.touched
@@ -322,9 +332,7 @@ def _shaped(
     entries = [from_shape(shape).entry for shape in shapes]
     shaped = measurement.changed(model=with_effects(measurement.model, entries))
     found = residuals_of(shaped)
-    value = np.full(len(measurement.cloud.points), np.nan)
-    value[found.index] = found.value
-    there = value[residuals.index]
+    there = found.of_points(found.value, residuals.index)
     smooth = residuals.smooth & ~touched & np.isfinite(there)
     return shaped, replace(residuals, value=np.where(np.isfinite(there), there, residuals.value), smooth=smooth)
 
@@ -358,8 +366,7 @@ def _with_tails(
 
 def _smooth_with(measurement: Measurement, named: list[Named]) -> tuple[Residuals, FloatArray, float]:
     """Residuals on smooth rock against the model with some effects, registered ones (n,), and how many sigmas they spread."""
-    model = with_effects(measurement.model, [item.entry for item in named])
-    found = settled(measurement.changed(model=model))[1]
+    found = settled_with(measurement, named).residuals
     part = found.part(np.flatnonzero(found.smooth))
     value, _, scale = registered(part)
     return part, value, scale

@@ -6,16 +6,16 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
-from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.scan_simulation import mean_model, simulate_ranges
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.footprint import Mode
-from sensors.model import TlsModel
 
 _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
@@ -26,7 +26,7 @@ _PROFILE = 0.12
 
 
 def find_footprint(
-    measurement: Measurement, residuals: Residuals, rough: FloatArray, scale: float, held_out: BoolArray
+    measurement: TlsMeasurement, residuals: TlsResiduals, rough: FloatArray, scale: float, held_out: BoolArray
 ) -> list[ShapeFound]:
     """The divergence that points at edges ask for, if any. rough: (n,) registered residuals, m; scale: sigmas they spread;
     held_out: (n,) points that have no say."""
@@ -57,12 +57,14 @@ def find_footprint(
 
 
 def _moved(
-    measurement: Measurement, residuals: Residuals, rows: np.ndarray[tuple[int], np.dtype[np.int64]], mode: Mode, angle: float
+    measurement: TlsMeasurement,
+    residuals: TlsResiduals,
+    rows: np.ndarray[tuple[int], np.dtype[np.int64]],
+    mode: Mode,
+    angle: float,
 ) -> FloatArray:
     """(m,) range of a beam of divergence `angle` less that of its axis, m; 0 where either does not come back."""
-    model = measurement.model
-    assert isinstance(model, TlsModel)
-    plain = mean_model(model)
+    plain = mean_model(measurement.model)
     beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle, mode=mode))})
     geometry, random = residuals.geometry.part(rows), KeyedRandom(0, ("gap", "mean"))
     whole, axis = (simulate_ranges(measurement, each, geometry, random) for each in (beam, plain))

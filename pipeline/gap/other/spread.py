@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from scipy.spatial import cKDTree
 from pipeline.change.robust import nmad
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import Cells, block_numbers
-from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects import catalogue
@@ -120,7 +119,7 @@ def spread_candidates(residuals: Residuals) -> list[SpreadCandidate]:
     return found
 
 
-def _candidate(effect: type[Effect], geometry: Any, fixed: dict[str, float]) -> SpreadCandidate:
+def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]) -> SpreadCandidate:
     """Of the effect at its typical sizes, one column for each of them; a few extreme points must not carry a form alone."""
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)

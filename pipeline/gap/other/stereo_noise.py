@@ -20,7 +20,7 @@ from pipeline.gap.decisions import decided
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_raster import spacing
-from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -94,7 +94,7 @@ class _Form:
     blocks: FloatArray
 
 
-def told_apart(found: list[SpreadFound], part: Residuals, value: FloatArray, model: StereoModel) -> list[SpreadFound]:
+def told_apart(found: list[SpreadFound], part: StereoResiduals, value: FloatArray, model: StereoModel) -> list[SpreadFound]:
     """Noise that was taken for white, named by how neighbours differ; a class of both where that does not tell.
 
     Noise on nodes seems to change with any covariate, as few of them have one value of it: it goes before an empirical term.
@@ -104,7 +104,7 @@ def told_apart(found: list[SpreadFound], part: Residuals, value: FloatArray, mod
     return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
 
 
-def find_nodes(part: Residuals, value: FloatArray, model: StereoModel, random: KeyedRandom) -> SpreadFound | None:
+def find_nodes(part: StereoResiduals, value: FloatArray, model: StereoModel, random: KeyedRandom) -> SpreadFound | None:
     """Noise on nodes so far apart that the points around one do not differ by it; larger than a reference may be wrong.
 
     value: (n,) residuals without the mean effects found.
@@ -125,7 +125,7 @@ def find_nodes(part: Residuals, value: FloatArray, model: StereoModel, random: K
     return _on_nodes(found, form, step, near)
 
 
-def _named(white: SpreadFound, part: Residuals, value: FloatArray, model: StereoModel) -> SpreadFound:
+def _named(white: SpreadFound, part: StereoResiduals, value: FloatArray, model: StereoModel) -> SpreadFound:
     both = replace(white, alike=tuple(sorted({*white.alike, RegularizationNoise.tag()})))
     variogram = _variogram(part, value, model)
     if variogram is None:
@@ -162,7 +162,7 @@ def _with_variance(found: SpreadFound, form: _Form, share: float) -> SpreadFound
     )
 
 
-def _variogram(part: Residuals, value: FloatArray, model: StereoModel) -> _Variogram | None:
+def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> _Variogram | None:
     """Along rows and columns, with its covariance by blocks of the wall; None where the pixels are on no raster."""
     g = part.geometry
     step = spacing(g.u)

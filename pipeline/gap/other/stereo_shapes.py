@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import StereoMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
-from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening
@@ -68,7 +69,9 @@ class _Witnesses:
         return found[int(np.argmax(gains))]
 
 
-def find_shapes(measurement: Measurement, residuals: Residuals, rough: FloatArray, held_out: BoolArray) -> list[ShapeFound]:
+def find_shapes(
+    measurement: StereoMeasurement, residuals: StereoResiduals, rough: FloatArray, held_out: BoolArray
+) -> list[ShapeFound]:
     """The effects on the shape that the points ask for, one after another. rough: (n,) registered residuals, px; held_out: (n,)
     points that have no say.
 

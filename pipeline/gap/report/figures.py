@@ -17,10 +17,11 @@ from pipeline.gap.naming.verify import Gap
 from pipeline.gap.naming.workflow import Diagnosis
 from pipeline.gap.report.covariate_ranking import bins, standardised, steady
 from pipeline.gap.report.in_words import with_unit
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.report.figures import COLOURS, dress_map
 from pipeline.report.pictures import png
 from scene.mesh import FloatArray
-from sensors.model import StereoModel
+from sensors.model import StereoModel, TlsModel
 
 _BINS = 24
 _POINTS_PER_PIXEL = 8.0
@@ -81,10 +82,12 @@ def _bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: s
 
 def sigma_after(found: Diagnosis) -> FloatArray:
     """(n,) spread that the model with the named effects predicts, in the observable's unit."""
-    model, residuals = found.model_after, found.residuals
-    if isinstance(model, StereoModel):
-        return np.asarray(np.sqrt(np.broadcast_to(model.variance, len(residuals))))
-    return np.asarray(np.sqrt(model.variance(residuals.geometry)))
+    match found.model_after, found.residuals:
+        case TlsModel() as model, TlsResiduals(geometry=rays):
+            return np.asarray(np.sqrt(model.variance(rays)))
+        case StereoModel() as model, residuals:
+            return np.asarray(np.sqrt(np.broadcast_to(model.variance, len(residuals))))
+    raise TypeError("model and residuals are of different sensors")
 
 
 def profiles_figure(found: Diagnosis) -> bytes:

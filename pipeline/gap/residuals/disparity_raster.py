@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement
-from pipeline.gap.residuals.nominal_pair import NominalPair, StereoGeometry, is_hidden, project, rays, real_pair
+from pipeline.formats.measurement import StereoMeasurement
+from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, project, rays, real_pair
 from pipeline.gap.residuals.residuals import BoolArray
 from scene.mesh import FloatArray
 from sensors.effects.base import Effect
@@ -34,7 +34,7 @@ class DisparityRaster:
     column: NDArray[np.int64]
 
     @classmethod
-    def of(cls, measurement: Measurement, geometry: StereoGeometry) -> DisparityRaster | None:
+    def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
         """None where the pixels are on no raster, or on one of more than a million cells."""
         step = spacing(geometry.u)
         if step is None:

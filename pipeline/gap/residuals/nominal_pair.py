@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement
-from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.formats.measurement import StereoMeasurement
+from pipeline.gap.residuals.residuals import BoolArray, Rows, part_of
 from scene.backend import dr, mi
-from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
@@ -27,7 +25,7 @@ _HIDDEN_SHARE = 2e-4
 
 
 @dataclass(frozen=True)
-class StereoGeometry:
+class PixelGeometry:
     """Per point: left pixel (u, v) and row in the right image (px), disparity of the reference and as found (px), point and unit
     normal of the reference (n, 3), wall frame, m, and distances to the middles of both images (px)."""
 
@@ -44,9 +42,19 @@ class StereoGeometry:
     def __len__(self) -> int:
         return len(self.u)
 
-    def part(self, rows: Any) -> StereoGeometry:
+    def part(self, rows: Rows) -> PixelGeometry:
         """The same of some of the points."""
-        return StereoGeometry(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})
+        return part_of(self, rows)
+
+    @property
+    def plane(self) -> FloatArray:
+        """(n, 2) column and row in the left image, px."""
+        return np.stack([self.u, self.v], axis=1)
+
+    @property
+    def departure(self) -> FloatArray:
+        """(n,) found disparity less that of the reference, px."""
+        return np.asarray(self.found - self.disparity)
 
 
 @dataclass(frozen=True)
@@ -57,10 +65,7 @@ class NominalPair:
     geometry: Rectification
 
     @classmethod
-    def of(cls, measurement: Measurement) -> NominalPair:
-        """Raises InputError where a stereo measurement has no cameras."""
-        if measurement.cameras is None:
-            raise InputError("a stereo measurement needs `cameras`", where="measurement.yaml")
+    def of(cls, measurement: StereoMeasurement) -> NominalPair:
         pair = measurement.cameras.in_wall_frame(measurement.frame)
         return cls(pair, rectify(pair))
 
@@ -113,7 +118,7 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
     return np.asarray(scene.cast(position, back / length[:, None])[0] < length * (1 - _HIDDEN_SHARE))
 
 
-def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: StereoGeometry) -> list[FloatArray]:
+def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
     """(n,) of each real pair: the disparity that it gives on each point's tangent plane, in the nominal rectified pair."""
     u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
@@ -143,10 +148,9 @@ def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turn
     return CameraPair(*sides)
 
 
-def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: Measurement) -> CameraPair:
+def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
     """The nominal pair with camera effects, wall frame."""
     pair = measurement.cameras
-    assert pair is not None
     for effect in effects:
         pair = effect.apply(pair, KeyedRandom(0)) if effect.stage == Stage.CAMERA else pair
     return pair.in_wall_frame(measurement.frame)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import Measurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
-from pipeline.registration.rigid import rotation_matrix
 from scene.mesh import FloatArray
-from sensors.camera import Camera, CameraPair
 
 _ROUNDS = 6
 _FEWEST = 100
@@ -43,9 +42,14 @@ def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatA
     return np.asarray(np.linalg.lstsq(residuals.pose[rows] / sigma[:, None], residuals.value[rows] / sigma, rcond=None)[0])
 
 
+def raw_residuals(measurement: Measurement) -> Residuals:
+    """The raw residuals of either sensor."""
+    return tls_residuals(measurement) if isinstance(measurement, TlsMeasurement) else stereo_residuals(measurement)
+
+
 def residuals_of(measurement: Measurement) -> Residuals:
     """The raw residuals of either sensor; those of several epochs as if all had been taken from one place."""
-    found = tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
+    found = raw_residuals(measurement)
     epochs = measurement.epochs[found.index]
     numbers = np.unique(epochs)
     if len(numbers) < 2:
@@ -56,10 +60,16 @@ def residuals_of(measurement: Measurement) -> Residuals:
     return replace(found, value=found.value - away, away=away)
 
 
-def settled(
-    measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None
-) -> tuple[Measurement, Residuals, FloatArray]:
-    """The measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there.
+class Settled(NamedTuple):
+    """A measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there."""
+
+    measurement: Measurement
+    residuals: Residuals
+    pose: FloatArray
+
+
+def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None) -> Settled:
+    """The measurement with its sensor where its points say that it stood.
 
     trusted: rows of the measurement's points by which to register, all where None; found: its residuals, if known. A pose that
     moves the rays by more than some millimetres on the wall is gone along with, a few times at the most, since slopes at the
@@ -71,9 +81,9 @@ def settled(
         pose = registered(_only(found, trusted))[1]
         if not _is_far(pose, found):
             break
-        measurement, total = moved(measurement, pose), total + pose
+        measurement, total = measurement.moved(pose), total + pose
         found = residuals_of(measurement)
-    return measurement, found, total
+    return Settled(measurement, found, total)
 
 
 def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
@@ -83,34 +93,3 @@ def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
 def _is_far(pose: FloatArray, residuals: Residuals) -> bool:
     turn, shift = (float(np.linalg.norm(residuals.pose[:, columns], axis=1).mean()) for columns in (slice(3, 6), slice(3)))
     return float(np.linalg.norm(pose[:3]) + turn / shift * np.linalg.norm(pose[3:])) > _FAR_M
-
-
-def moved(measurement: Measurement, pose: FloatArray) -> Measurement:
-    """The measurement with its sensor shifted (m) and turned (rad) in the wall frame, and what it measured with it.
-
-    What the sensor recorded stays as it is. A pair of cameras turns about the left one.
-    """
-    turn = rotation_matrix(pose[3:])
-    centre = _centre(measurement)
-    points = (measurement.cloud.points - centre) @ turn.T + centre + pose[:3]
-    cloud = replace(measurement.cloud, points=points)
-    if measurement.station is not None:
-        position, rotation = measurement.station
-        return measurement.changed(cloud=cloud, station=(position + pose[:3], turn @ rotation))
-    assert measurement.cameras is not None
-    axes = measurement.frame.rotation
-    world, shift = axes.T @ turn @ axes, axes.T @ pose[:3]
-    left = measurement.cameras.left.position
-
-    def each(camera: Camera) -> Camera:
-        return replace(camera, rotation=world @ camera.rotation, position=left + world @ (camera.position - left) + shift)
-
-    cameras = CameraPair(each(measurement.cameras.left), each(measurement.cameras.right))
-    return measurement.changed(cloud=cloud, cameras=cameras)
-
-
-def _centre(measurement: Measurement) -> FloatArray:
-    if measurement.station is not None:
-        return measurement.station[0]
-    assert measurement.cameras is not None
-    return measurement.cameras.in_wall_frame(measurement.frame).left.position

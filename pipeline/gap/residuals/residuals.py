@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,13 @@ from sensors.effects.base import Sensor
 from sensors.effects.matching_noise import MatchingNoise
 from sensors.model import StereoModel
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 BoolArray = NDArray[np.bool_]
+Rows = BoolArray | NDArray[np.int64] | slice
+"""Some of n points: a mask or indices."""
+_Columns = TypeVar("_Columns", bound="DataclassInstance")
 _GRID = (np.arange(24) + 0.5) / 24
 """Distances within a square of side 1, along one side, over which a mean is taken."""
 
@@ -48,9 +55,32 @@ class SharedNoise:
 NOT_SHARED = SharedNoise()
 
 
+class Geometry(Protocol):
+    """What the equations of either sensor's effects look at, at n points."""
+
+    def __len__(self) -> int: ...
+
+    def part(self, rows: Rows) -> Self:
+        """The same of some of the points."""
+
+    @property
+    def plane(self) -> FloatArray:
+        """(n, 2) direction as the sensor counts it: azimuth and zenith, rad, or column and row, px."""
+
+    @property
+    def departure(self) -> FloatArray:
+        """(n,) measured minus geometric observable, m or px, without any effect of the model."""
+
+
+def part_of(columns: _Columns, rows: Rows) -> _Columns:
+    """Some rows of a dataclass of (n, ...) arrays, some of which may be None."""
+    values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
+    return replace(columns, **{name: value[rows] for name, value in values.items() if value is not None})
+
+
 @dataclass(frozen=True)
-class Residuals:
-    """Measured minus predicted observable of n points, with what it may depend on.
+class Residuals(ABC):
+    """Measured minus predicted observable of n points, with what it may depend on; what ranges and disparities have in common.
 
     value, sigma: (n,), m of range (TLS) or px of disparity (stereo), sigma being what the model predicts; unit_m: (n,) metres of
     range or depth per unit of the observable, without the sign that `depth_m` has; smooth: (n,) where the surface around the
@@ -62,7 +92,7 @@ class Residuals:
     shared_noise: predicted noise that neighbours share.
     """
 
-    sensor: Sensor
+    sensor: ClassVar[Sensor]
     value: FloatArray
     sigma: FloatArray
     unit_m: FloatArray
@@ -72,7 +102,7 @@ class Residuals:
     at: FloatArray
     covariates: dict[str, FloatArray]
     index: NDArray[np.int64]
-    geometry: Any = None
+    geometry: Geometry
     away: FloatArray | None = None
     notes: tuple[str, ...] = ()
     missing: Missing | None = None
@@ -82,15 +112,23 @@ class Residuals:
         return len(self.value)
 
     @property
+    @abstractmethod
     def depth_m(self) -> FloatArray:
-        """(n,) metres by which the surface lies deeper per unit of the observable: positive where rock is missing.
+        """(n,) metres by which the surface lies deeper per unit of the observable: positive where rock is missing."""
 
-        A range grows with the depth; a disparity, f B / Z, falls.
-        """
-        return self.unit_m if self.sensor == "tls" else -self.unit_m
+    @property
+    def observed(self) -> FloatArray:
+        """(n,) measured minus geometric observable, without any effect of the model, as if all epochs had one place."""
+        return self.geometry.departure if self.away is None else self.geometry.departure - self.away
 
-    def part(self, rows: Any) -> Residuals:
-        """The residuals of `rows` (a mask or indices)."""
+    def of_points(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
+        """(m,) values (n,) of these residuals at the measurement's points `index` (m,); NaN where there is no residual."""
+        found = np.full(int(max(self.index.max(initial=-1), index.max(initial=-1))) + 1, np.nan)
+        found[self.index] = values
+        return np.asarray(found[index])
+
+    def part(self, rows: Rows) -> Self:
+        """The residuals of some of the points."""
         return replace(
             self,
             value=self.value[rows],
@@ -102,7 +140,7 @@ class Residuals:
             at=self.at[rows],
             covariates={name: values[rows] for name, values in self.covariates.items()},
             index=self.index[rows],
-            geometry=None if self.geometry is None else self.geometry.part(rows),
+            geometry=self.geometry.part(rows),
             away=None if self.away is None else self.away[rows],
         )
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import TlsMeasurement
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from scene.raycast import RayCaster
 from scene.upload import on_device
 from sensors.effects.base import ShowsIn
 from sensors.footprint import Echo
 from sensors.model import TlsModel, TlsNoise
-from sensors.pulses import Pulses
+from sensors.pulses import PulseGeometry, Pulses
 from sensors.tls import LaserScanner, Pattern, ScannerConfig
 
 _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
@@ -24,12 +22,12 @@ _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
 
 @dataclass(frozen=True)
 class DirectedScanner(LaserScanner):
-    """A scanner whose pulses leave in the directions of `geometry` (a TlsGeometry), one after another.
+    """A scanner whose pulses leave in the directions of `geometry`, one after another.
 
     Recorded powers, where there are any, take the place of those that the albedo of the reference would give.
     """
 
-    geometry: Any = None
+    geometry: PulseGeometry = field(kw_only=True)
 
     def emit(self) -> Pulses:
         angles, count = self.geometry, len(self.geometry.azimuth)
@@ -56,19 +54,16 @@ class DirectedScanner(LaserScanner):
         return super()._measured(pulses, recorded, random)
 
 
-def _scanner(measurement: Measurement, model: TlsModel, geometry: Any) -> DirectedScanner:
-    assert measurement.station is not None
+def _scanner(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry) -> DirectedScanner:
     position, rotation = measurement.station
     pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
     config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
     return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry)
 
 
-def simulate_ranges(
-    measurement: Measurement, model: TlsModel, geometry: Any, random: KeyedRandom, scene: RayCaster | None = None
-) -> FloatArray:
+def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, random: KeyedRandom) -> FloatArray:
     """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
-    return _scanner(measurement, model, geometry).observe(scene or measurement.scene, random).depth.reshape(-1)
+    return _scanner(measurement, model, geometry).observe(measurement.scene, random).depth.reshape(-1)
 
 
 def mean_model(model: TlsModel) -> TlsModel:
@@ -77,15 +72,13 @@ def mean_model(model: TlsModel) -> TlsModel:
     return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
 
 
-def aimed(measurement: Measurement, geometry: Any) -> tuple[FloatArray, FloatArray]:
+def aimed(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
     """(n,) azimuth and zenith in which the pulses leave on average, by the measurement's model, scanner frame, rad."""
-    assert isinstance(measurement.model, TlsModel)
     scanner = _scanner(measurement, mean_model(measurement.model), geometry)
     pulses = scanner._aimed(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
     return np.array(pulses.aim_azimuth), np.array(pulses.aim_zenith)
 
 
-def simulated_ranges(measurement: Measurement, geometry: Any) -> FloatArray:
+def simulated_ranges(measurement: TlsMeasurement, geometry: PulseGeometry) -> FloatArray:
     """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise."""
-    assert isinstance(measurement.model, TlsModel)
     return simulate_ranges(measurement, mean_model(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair
-from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.residuals import Residuals, Rows
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.mesh import FloatArray
 
 NEIGHBOURS = 8
@@ -44,22 +45,21 @@ class Sight:
     @classmethod
     def of(cls, measurement: Measurement, residuals: Residuals) -> Sight:
         """Of the points of the residuals. A pair of cameras looks from the left one."""
-        geometry, epoch = residuals.geometry, measurement.epochs[residuals.index]
-        if measurement.station is not None:
-            plane, origin = np.stack([geometry.azimuth, geometry.zenith], axis=1), measurement.station[0]
-            towards, disparity = measurement.cloud.points[residuals.index] - origin, None
-        else:
-            assert measurement.cameras is not None
-            plane, origin = (
-                np.stack([geometry.u, geometry.v], axis=1),
-                measurement.cameras.in_wall_frame(measurement.frame).left.position,
-            )
-            towards, disparity = geometry.point - origin, geometry.disparity - NominalPair.of(measurement).geometry.offset
+        origin, reference, disparity = measurement.viewpoint, None, None
+        match measurement, residuals:
+            case StereoMeasurement(), StereoResiduals(geometry=pixels):
+                towards = pixels.point - origin
+                disparity = pixels.disparity - NominalPair.of(measurement).geometry.offset
+            case _, TlsResiduals(geometry=rays):
+                towards, reference = measurement.cloud.points[residuals.index] - origin, rays.range_m
+            case _:
+                raise TypeError("measurement and residuals are of different sensors")
         length = np.linalg.norm(towards, axis=1)
-        reference = geometry.range_m if disparity is None else length
-        return cls(plane, epoch, origin, towards / length[:, None], reference, disparity)
+        epoch = measurement.epochs[residuals.index]
+        reference = length if reference is None else reference
+        return cls(residuals.geometry.plane, epoch, origin, towards / length[:, None], reference, disparity)
 
-    def part(self, rows: Any) -> Sight:
+    def part(self, rows: Rows) -> Sight:
         """Of some of the points."""
         return replace(
             self,

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import StereoMeasurement
 from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
-    StereoGeometry,
+    PixelGeometry,
     is_hidden,
     moved_pair,
     project,
@@ -35,6 +37,19 @@ _LEAST_VARIANCE = 1e-8
 _REGISTRATION_STEPS, _NUDGE = 3, 1e-4
 _ON_RAY = 0.1
 """A registration counts as found where it leaves less than this share of the distance from the points to their rays."""
+
+
+@dataclass(frozen=True)
+class StereoResiduals(Residuals):
+    """Residuals of disparities, px."""
+
+    sensor = "stereo"
+    geometry: PixelGeometry
+
+    @property
+    def depth_m(self) -> FloatArray:
+        """(n,) m per px, below 0: a disparity, f B / Z, falls with the depth."""
+        return -self.unit_m
 
 
 def on_their_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
@@ -64,10 +79,9 @@ def _miss(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> Flo
     return np.concatenate([found[0] - u, found[1] - v])
 
 
-def stereo_residuals(measurement: Measurement) -> Residuals:
+def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     """Disparity residuals with predicted spread and covariates; points whose pixel does not see the surface are left out."""
     nominal, model = NominalPair.of(measurement), measurement.model
-    assert isinstance(model, StereoModel)
     points, extra = measurement.cloud.points, measurement.cloud.extra
     given = "pixel_x" in extra and "pixel_y" in extra
     if given:
@@ -84,8 +98,7 @@ def stereo_residuals(measurement: Measurement) -> Residuals:
     covariates = _covariates(nominal, geometry, depth, curvature)
     mean = _mean_error(model, geometry, measurement) + _empirical(model, covariates)
     even = hit & ~hidden & (curvature < _EDGE_PX)
-    whole = Residuals(
-        sensor="stereo",
+    whole = StereoResiduals(
         value=measured - geometry.disparity - mean,
         sigma=np.full(len(u), np.sqrt(max(model.variance, _LEAST_VARIANCE))),
         unit_m=1 / slope,
@@ -114,7 +127,7 @@ def _notes(given: bool, u: FloatArray) -> tuple[str, ...]:
 
 def _reference(
     nominal: NominalPair, real: CameraPair, scene: RayCaster, u: FloatArray, v: FloatArray, measured: FloatArray
-) -> tuple[StereoGeometry, FloatArray, FloatArray]:
+) -> tuple[PixelGeometry, FloatArray, FloatArray]:
     """What the pixels of the cameras as the model has them (`real`) see on the reference, its disparity in the nominal pair, the
     departure from the tangent plane beside it (px), and the depth (m)."""
     left = real.left
@@ -132,7 +145,7 @@ def _reference(
         step = nominal.geometry.f * nominal.geometry.base_m * (1 / seen - 1 / flat)
         curvature = np.maximum(curvature, np.nan_to_num(np.abs(step), nan=np.inf))
     camera = real.right
-    geometry = StereoGeometry(
+    geometry = PixelGeometry(
         u=u,
         v=v,
         v_right=right[1],
@@ -146,7 +159,7 @@ def _reference(
     return geometry, curvature, distance
 
 
-def _pose(nominal: NominalPair, geometry: StereoGeometry) -> FloatArray:
+def _pose(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
     """(n, 6) change of the disparity if both cameras stand shifted (m) and turned (rad) about the left one, wall frame."""
     centre, step = nominal.pair.left.position, 1e-4
     units = step * np.eye(3)
@@ -155,7 +168,7 @@ def _pose(nominal: NominalPair, geometry: StereoGeometry) -> FloatArray:
     return np.stack([(column - base) / step for column in columns], axis=1)
 
 
-def _mean_error(model: StereoModel, geometry: StereoGeometry, measurement: Measurement) -> FloatArray:
+def _mean_error(model: StereoModel, geometry: PixelGeometry, measurement: StereoMeasurement) -> FloatArray:
     """(n,) what those of the model's effects that are not in the cameras add to the disparity, px."""
     beside = [effect for effect in model.effects if not effect.empirical and not isinstance(effect, CameraEffect | RasterEffect)]
     found = np.asarray(sum((effect.mean(geometry) for effect in beside), np.zeros(len(geometry))))
@@ -174,9 +187,7 @@ def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatAr
     return total
 
 
-def _covariates(
-    nominal: NominalPair, geometry: StereoGeometry, depth: FloatArray, curvature: FloatArray
-) -> dict[str, FloatArray]:
+def _covariates(nominal: NominalPair, geometry: PixelGeometry, depth: FloatArray, curvature: FloatArray) -> dict[str, FloatArray]:
     ray = geometry.point - nominal.pair.left.position
     cosine = np.abs(np.einsum("ni,ni->n", ray, geometry.normal)) / np.linalg.norm(ray, axis=1)
     return {

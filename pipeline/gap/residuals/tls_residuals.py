@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement, ScanPattern
-from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, plane_slopes
+from pipeline.formats.measurement import ScanPattern, TlsMeasurement
+from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, Rows, part_of, plane_slopes
 from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
-from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.effects.base import Stage
-from sensors.model import TlsModel
 from sensors.polar import polar, polar_axes
 from sensors.pulses import PulseGeometry
 
@@ -28,42 +25,51 @@ _SHORTEST_STEP_RAD = 1e-6
 
 
 @dataclass(frozen=True)
-class Directions:
-    """What emits pulses: recorded angles (rad), scan line, share of the scan's duration and power, as TlsGeometry has them."""
-
-    azimuth: FloatArray
-    zenith: FloatArray
-    line: FloatArray | None
-    share: FloatArray | None
-    power: FloatArray | None
-
-
-@dataclass(frozen=True)
-class TlsGeometry(PulseGeometry):
+class RayGeometry(PulseGeometry):
     """Per point what the equations look at, where the beam goes on average by the model, and the measured range (m)."""
 
     measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def part(self, rows: Any) -> TlsGeometry:
+    def part(self, rows: Rows) -> RayGeometry:
         """The same of some of the points."""
-        values: dict[str, Any] = {column.name: getattr(self, column.name) for column in fields(self)}
-        return replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
+        return part_of(self, rows)
+
+    @property
+    def plane(self) -> FloatArray:
+        """(n, 2) azimuth and zenith, rad."""
+        return np.stack([self.azimuth, self.zenith], axis=1)
+
+    @property
+    def departure(self) -> FloatArray:
+        """(n,) measured range less that of the reference, m."""
+        return np.asarray(self.measured_m - self.range_m)
 
 
-def tls_residuals(measurement: Measurement) -> Residuals:
+@dataclass(frozen=True)
+class TlsResiduals(Residuals):
+    """Residuals of ranges, m."""
+
+    sensor = "tls"
+    geometry: RayGeometry
+
+    @property
+    def depth_m(self) -> FloatArray:
+        """(n,) 1: a range grows with the depth."""
+        return self.unit_m
+
+
+def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     """Range residuals with their predicted spread and covariates; points whose ray misses the surface are left out."""
-    position, rotation = _station(measurement)
-    model = measurement.model
-    assert isinstance(model, TlsModel)
+    (position, rotation), model = measurement.station, measurement.model
     azimuth, zenith, measured = _recorded(measurement)
     line, share = measurement.order or _order(measurement, azimuth)
     intensity = measurement.cloud.intensity
     real = azimuth, zenith
     if any(effect.stage == Stage.AIM for effect in model.effects):
-        real = aimed(measurement, Directions(azimuth, zenith, line, share, intensity))
+        real = aimed(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
     distance, normal, curvature = _surface(measurement.scene, position, axes)
-    geometry = TlsGeometry(
+    geometry = RayGeometry(
         azimuth=azimuth,
         zenith=zenith,
         range_m=distance,
@@ -80,8 +86,7 @@ def tls_residuals(measurement: Measurement) -> Residuals:
     slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
     hit = np.isfinite(predicted) & np.isfinite(distance)
     flat = (curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
-    whole = Residuals(
-        sensor="tls",
+    whole = TlsResiduals(
         value=measured - predicted,
         sigma=sigma,
         unit_m=np.ones_like(measured),
@@ -97,7 +102,7 @@ def tls_residuals(measurement: Measurement) -> Residuals:
     return whole.part(hit)
 
 
-def with_order(measurement: Measurement) -> Measurement:
+def with_order(measurement: TlsMeasurement) -> TlsMeasurement:
     """With scan lines and times of all points, so that a part of them keeps them."""
     return measurement.changed(order=_order(measurement, _recorded(measurement)[0]))
 
@@ -108,19 +113,13 @@ def log_over_median(power: FloatArray) -> FloatArray:
     return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
 
 
-def _recorded(measurement: Measurement) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(n,) azimuth, without jumps, and zenith (rad), and range (m)."""
-    position, rotation = _station(measurement)
+    position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
     measured, azimuth, zenith = polar(local)
     middle = np.angle(np.mean(np.exp(1j * azimuth)))  # whichever side of pi the points lie on
     return middle + np.angle(np.exp(1j * (azimuth - middle))), zenith, measured
-
-
-def _station(measurement: Measurement) -> tuple[FloatArray, FloatArray]:
-    if measurement.station is None:
-        raise InputError("a TLS measurement needs `scanner`", where="measurement.yaml")
-    return measurement.station
 
 
 def _surface(scene: RayCaster, position: FloatArray, axes: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -146,7 +145,7 @@ def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArr
     return np.concatenate([normal * scale, distance[:, None] * np.cross(ray, normal) * scale], axis=1)
 
 
-def _order(measurement: Measurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
+def _order(measurement: TlsMeasurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
     """Scan line (from the pattern, or counted in steps told by the gaps of the azimuths) and share of the duration."""
     line = _lines(measurement.pattern, azimuth)
     time = measurement.cloud.gps_time
@@ -175,7 +174,7 @@ def _lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | Non
     return np.asarray(np.rint((azimuth - azimuth.min()) / np.median(wide)), dtype=np.float64)
 
 
-def _covariates(geometry: TlsGeometry, curvature: FloatArray) -> dict[str, FloatArray]:
+def _covariates(geometry: RayGeometry, curvature: FloatArray) -> dict[str, FloatArray]:
     found = {
         "range": geometry.range_m,
         "azimuth": geometry.azimuth,
@@ -191,7 +190,7 @@ def _covariates(geometry: TlsGeometry, curvature: FloatArray) -> dict[str, Float
     return found | {name: values for name, values in optional.items() if values is not None}
 
 
-def _notes(measurement: Measurement) -> tuple[str, ...]:
+def _notes(measurement: TlsMeasurement) -> tuple[str, ...]:
     """What cannot be looked into for want of a field."""
     cloud = measurement.cloud
     absent = {
@@ -202,7 +201,7 @@ def _notes(measurement: Measurement) -> tuple[str, ...]:
     return (*measurement.notes, *(note for note, true in absent.items() if true))
 
 
-def missing_returns(measurement: Measurement, residuals: Residuals) -> Missing | None:
+def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Missing | None:
     """Every pulse of the pattern that should meet the wall, and whether it came back, epoch after epoch; None without a pattern.
 
     residuals: of all points of the measurement.
@@ -210,7 +209,7 @@ def missing_returns(measurement: Measurement, residuals: Residuals) -> Missing |
     pattern = measurement.pattern
     if pattern is None:
         return None
-    position, rotation = _station(measurement)
+    position, rotation = measurement.station
     sweeps = [_sweep(values) for values in (pattern.azimuth_rad, pattern.zenith_rad)]
     azimuth, zenith = (grid.ravel() for grid in np.meshgrid(*sweeps, indexing="ij"))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
@@ -231,7 +230,7 @@ def missing_returns(measurement: Measurement, residuals: Residuals) -> Missing |
     return Missing(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
 
 
-def _seen(pattern: ScanPattern, sweeps: list[FloatArray], geometry: TlsGeometry) -> BoolArray:
+def _seen(pattern: ScanPattern, sweeps: list[FloatArray], geometry: RayGeometry) -> BoolArray:
     """(m,) pulses of a pattern in whose direction a point stands."""
     turn = 2 * np.pi * np.round((geometry.azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
     columns = [np.rint((geometry.azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2])]

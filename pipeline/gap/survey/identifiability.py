@@ -178,18 +178,11 @@ def table(found: Identifiability) -> str:
 def _extended(survey: Survey) -> list[tuple[str, tuple[View, ...], KnownPoints | None]]:
     """The survey with one more measurement each: its name, all views, known points."""
     number = max(view.station for view in survey.views) + 1
-    first = survey.views[0]
     near, aside = survey.moved(0.5, 0.0, number), survey.moved(1.0, np.radians(40.0), number)
-    points = known_points(first)
-    what = "station" if survey.sensor == "tls" else "pair of exposures"
-    found: list[tuple[str, tuple[View, ...], KnownPoints | None]] = [
-        (f"a second {what} at half the range", (*survey.views, near), None),
-        (f"a second {what} at the same range, 40 degrees aside", (*survey.views, aside), None),
+    points, (again, repeated) = known_points(survey.views[0]), survey.repeated(number)
+    return [
+        (f"a second {survey.place} at half the range", (*survey.views, near), None),
+        (f"a second {survey.place} at the same range, 40 degrees aside", (*survey.views, aside), None),
+        (again, (*survey.views, repeated), None),
+        (points.title, survey.views, points),
     ]
-    if survey.sensor == "tls":
-        found.append(("the scan repeated in the second face", (*survey.views, survey.second_face()), None))
-    else:
-        found.append(
-            ("the pair repeated, its cameras rolled by 45 degrees either way", (*survey.views, survey.rolled(number)), None)
-        )
-    return [*found, (points.title, survey.views, points)]

@@ -10,9 +10,8 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.residuals.nominal_pair import NominalPair, moved_pair, project, real_pair
-from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.tls_residuals import TlsGeometry
-from pipeline.gap.survey.planned import View
+from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
+from pipeline.gap.survey.planned import StereoView, TlsView
 from scene.mesh import FloatArray
 from sensors.camera import CameraPair
 from sensors.effects import effect_of
@@ -39,12 +38,12 @@ class KnownPoints:
     columns: Callable[[list[Candidate]], FloatArray]
 
 
-def known_points(view: View) -> KnownPoints:
+def known_points(view: TlsView | StereoView) -> KnownPoints:
     """Targets around a scanner, or check points across the frame of a pair."""
-    return _targets(view) if view.residuals.sensor == "tls" else _check_points(view)
+    return _targets(view) if isinstance(view, TlsView) else _check_points(view)
 
 
-def _targets(view: View) -> KnownPoints:
+def _targets(view: TlsView) -> KnownPoints:
     """Twelve targets around the station. A point known in three dimensions says as much as three planes at right angles through
     it, here all inclined alike to the ray, so that the signatures of ranges serve."""
     from pipeline.gap.survey.survey_design import signature_columns
@@ -58,12 +57,11 @@ def _targets(view: View) -> KnownPoints:
     across, along = np.sqrt(2.0) * np.cos(angle), np.sqrt(2.0) * np.sin(angle)  # tangents of the planes' normals
     by_azimuth, by_zenith = -distance * across * np.sin(zenith), -distance * along
     ray, right, down = polar_axes(azimuth, zenith)
-    assert view.measurement.station is not None
     turn = view.measurement.station[1]
     normal = np.einsum("ij,nj->ni", turn, ray + across[:, None] * right + along[:, None] * down)
     ray = np.einsum("ij,nj->ni", turn, ray)
     pose = np.concatenate([-normal, -distance[:, None] * np.cross(ray, normal)], axis=1)
-    geometry = TlsGeometry(
+    geometry = RayGeometry(
         azimuth,
         zenith,
         range_m=distance,
@@ -87,7 +85,7 @@ def _ordered(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return x[order], y[order]
 
 
-def _only_geometry(like: Residuals, geometry: TlsGeometry, sigma: FloatArray, pose: FloatArray) -> Residuals:
+def _only_geometry(like: TlsResiduals, geometry: RayGeometry, sigma: FloatArray, pose: FloatArray) -> TlsResiduals:
     zero = np.zeros(len(sigma))
     return replace(
         like, value=zero, sigma=sigma, unit_m=zero + 1, smooth=zero < 1, even=zero < 1, pose=pose, at=np.zeros((len(sigma), 2)),
@@ -95,7 +93,7 @@ def _only_geometry(like: Residuals, geometry: TlsGeometry, sigma: FloatArray, po
     )  # fmt: skip
 
 
-def _check_points(view: View) -> KnownPoints:
+def _check_points(view: StereoView) -> KnownPoints:
     """A grid of points at two depths in front of the pair; columns and rows of both images are observed."""
     nominal = NominalPair.of(view.measurement)
     left, depth = nominal.pair.left, float(np.median(view.residuals.covariates["depth"]))

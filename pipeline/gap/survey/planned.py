@@ -8,21 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config.simulation import SensorName, SimulationConfig
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.stereo_residuals import stereo_residuals
-from pipeline.gap.residuals.tls_residuals import tls_residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
 from pipeline.run.site import prepare_site
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.camera import Camera, CameraPair
+from sensors.exchanged import pair_of
 from sensors.model import StereoModel, TlsModel, TlsNoise
 from sensors.stereo import REDUCTION, Quality, StereoPair
 from sensors.tls import LaserScanner, ScannerConfig
@@ -47,6 +50,18 @@ class View:
     station: int
     measurement: Measurement
 
+    @classmethod
+    def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
+        """On smooth parts of the wall. Raises InputError where there are next to none."""
+        smooth = np.flatnonzero(found.smooth)
+        if len(smooth) < _FEWEST_POINTS:
+            raise InputError(
+                f"{len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
+                where="station" if found.sensor == "tls" else "cameras",
+                remedy="aim at the wall, or scan in finer steps",
+            )
+        return cls(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
+
     @property
     def sigma(self) -> FloatArray:
         """(n,) predicted spread that gives the thinned points the weight of all."""
@@ -54,23 +69,61 @@ class View:
 
 
 @dataclass(frozen=True)
-class Survey:
-    """Views of one wall by one sensor. further(view, number): a view added to it, from another place."""
+class TlsView(View):
+    """What one station sees."""
 
-    sensor: SensorName
-    views: tuple[View, ...]
+    residuals: TlsResiduals
+    measurement: TlsMeasurement
+
+
+@dataclass(frozen=True)
+class StereoView(View):
+    """What one pair sees."""
+
+    residuals: StereoResiduals
+    measurement: StereoMeasurement
+
+
+@dataclass(frozen=True)
+class TlsSurvey:
+    """Views of one wall by a scanner. centre: (3,) of the wall; observe(measurement, number): a further view of it."""
+
+    views: tuple[TlsView, ...]
     centre: FloatArray
-    observe: Callable[[Measurement, int], View]
+    observe: Callable[[TlsMeasurement, int], TlsView]
+    sensor: ClassVar[SensorName] = "tls"
+    place: ClassVar[str] = "station"
 
-    def moved(self, scale: float, turn_rad: float, number: int) -> View:
+    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
         """The first view from a place that is brought nearer to the wall's centre by `scale` and turned about the vertical."""
         base = self.views[0].measurement
-        axis = base.frame.rotation[:, 2]  # the world's vertical in the wall frame
-        turn = _about(axis, turn_rad)
-        if base.station is not None:
-            position = self.centre + scale * turn @ (base.station[0] - self.centre)
-            return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
-        assert base.cameras is not None
+        turn = _about_vertical(base, turn_rad)
+        position = self.centre + scale * turn @ (base.station[0] - self.centre)
+        return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
+
+    def repeated(self, number: int) -> tuple[str, TlsView]:
+        """In words, and as a view: the first station's scan in the other face, azimuth turned by pi, the zenith angle 2 pi less
+        what it was; the pose is that of the first view, whatever `number`."""
+        first = self.views[0]
+        g = first.residuals.geometry
+        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
+        return "the scan repeated in the second face", replace(first, residuals=replace(first.residuals, geometry=turned))
+
+
+@dataclass(frozen=True)
+class StereoSurvey:
+    """Views of one wall by a pair of cameras. centre: (3,) of the wall; observe(measurement, number): a further view of it."""
+
+    views: tuple[StereoView, ...]
+    centre: FloatArray
+    observe: Callable[[StereoMeasurement, int], StereoView]
+    sensor: ClassVar[SensorName] = "stereo"
+    place: ClassVar[str] = "pair of exposures"
+
+    def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
+        """The first view from a place that is brought nearer to the wall's centre by `scale` and turned about the vertical."""
+        base = self.views[0].measurement
+        turn = _about_vertical(base, turn_rad)
         world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
 
         def place(camera: Camera) -> Camera:
@@ -80,65 +133,60 @@ class Survey:
         pair = CameraPair(place(base.cameras.left), place(base.cameras.right))
         return self.observe(base.changed(cameras=pair), number)
 
-    def rolled(self, number: int) -> View:
-        """The first pair with its cameras turned about their axes by 45 degrees, either way."""
+    def repeated(self, number: int) -> tuple[str, StereoView]:
+        """In words, and as a view: the first pair with its cameras turned about their axes by 45 degrees, either way."""
         base = self.views[0].measurement
-        assert base.cameras is not None
         pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
-        return self.observe(base.changed(cameras=pair), number)
+        return "the pair repeated, its cameras rolled by 45 degrees either way", self.observe(base.changed(cameras=pair), number)
 
-    def second_face(self) -> View:
-        """The first station's scan in the other face: azimuth turned by pi, the zenith angle 2 pi less what it was."""
-        first = self.views[0]
-        g = first.residuals.geometry
-        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
-        return replace(first, residuals=replace(first.residuals, geometry=turned))
+
+Survey = TlsSurvey | StereoSurvey
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
     """The survey that a simulation config describes. Raises InputError where the sensor sees next to nothing of the wall."""
     site = prepare_site(config, sensor, KeyedRandom(config.seed))
-    nothing = PointCloud(np.empty((0, 3)))
-    base = Measurement(sensor, nothing, site.mesh, site.frame, config.tls_model())
-    if sensor == "stereo":
-        base = replace(base, model=config.stereo_model(), cameras=_nominal(site.sensor))
-        observe = _pair_observer(config.depth_map)
-        views: tuple[View, ...] = (observe(base, 0),)
-    else:
-        observe = _scan_observer(config.scanner)
-        scanners = [site.sensor, *site.further_stations]
-        poses = [(scanner.position, scanner.rotation) for scanner in scanners if isinstance(scanner, LaserScanner)]
-        views = tuple(observe(base.changed(station=pose), number) for number, pose in enumerate(poses))
-    return Survey(sensor, views, site.mesh.bounds.mean(axis=0), observe)
+    nothing, mesh, frame, centre = PointCloud(np.empty((0, 3))), site.mesh, site.frame, site.mesh.bounds.mean(axis=0)
+    if not isinstance(site.sensor, LaserScanner):
+        model, cameras = config.stereo_model(), pair_of(site.sensor).cameras
+        pair = StereoMeasurement(cloud=nothing, reference=mesh, frame=frame, model=model, cameras=cameras)
+        expose = _pair_observer(config.depth_map)
+        return StereoSurvey((expose(pair, 0),), centre, expose)
+    poses = [(scanner.position, scanner.rotation) for scanner in (site.sensor, *site.further_stations)]
+    base = TlsMeasurement(cloud=nothing, reference=mesh, frame=frame, model=config.tls_model(), station=poses[0])
+    observe = _scan_observer(config.scanner)
+    views = tuple(observe(base.changed(station=pose), number) for number, pose in enumerate(poses))
+    return TlsSurvey(views, centre, observe)
 
 
 def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
     """The survey of a measurement: its own points, of which only the places count, not what they measured. most: points of the
     thinned grid."""
-    found = tls_residuals(measurement) if measurement.sensor == "tls" else stereo_residuals(measurement)
-    rows = np.flatnonzero(found.smooth)
-    some = rows[:: max(len(rows) // most, 1)]
-    view = View(found.part(some), len(rows), 0, measurement)
-    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(len(rows), 1)))
-    if measurement.station is None:
-        return Survey(measurement.sensor, (view,), measurement.reference.bounds.mean(axis=0), _pair_observer("medium"))
-    reach = float(np.median(found.geometry.range_m)) if measurement.sensor == "tls" else 1.0
+    centre = measurement.reference.bounds.mean(axis=0)
+    if isinstance(measurement, StereoMeasurement):
+        seen = stereo_residuals(measurement)
+        pair = StereoView(seen.part(_thinned(seen, most)), int(seen.smooth.sum()), 0, measurement)
+        return StereoSurvey((pair,), centre, _pair_observer("medium"))
+    measurement = measurement.changed(order=None)
+    found = tls_residuals(measurement)
+    view = TlsView(found.part(_thinned(found, most)), int(found.smooth.sum()), 0, measurement)
+    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.whole, 1)))
+    reach = float(np.median(found.geometry.range_m))
     steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than a scan where the wall is near
     scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
-    return Survey(measurement.sensor, (view,), measurement.reference.bounds.mean(axis=0), _scan_observer(scanner))
+    return TlsSurvey((view,), centre, _scan_observer(scanner))
 
 
-def _nominal(sensor: object) -> CameraPair:
-    pair = getattr(sensor, "pair", sensor)
-    assert isinstance(pair, StereoPair)
-    return pair.cameras
+def _thinned(found: Residuals, most: int) -> NDArray[np.int64]:
+    """About so many of the rows on smooth parts."""
+    rows = np.flatnonzero(found.smooth)
+    return rows[:: max(len(rows) // most, 1)]
 
 
-def _scan_observer(scanner: ScannerConfig) -> Callable[[Measurement, int], View]:
+def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], TlsView]:
     """Views of a laser scanner with the pose of the measurement, aimed at the whole wall unless the config has a window."""
 
-    def observe(base: Measurement, number: int) -> View:
-        assert base.station is not None
+    def observe(base: TlsMeasurement, number: int) -> TlsView:
         world = base.frame.to_world(base.station[0][None])[0], base.frame.rotation.T @ base.station[1]
         instrument = LaserScanner.aimed(world, base.frame, base.reference.vertices, scanner, _QUIET_TLS)
         pattern = instrument.pattern
@@ -162,7 +210,7 @@ def _scan_observer(scanner: ScannerConfig) -> Callable[[Measurement, int], View]
         found = tls_residuals(measurement)
         lines = found.geometry.line
         geometry = found.geometry if lines is None else replace(found.geometry, line=stride * lines)
-        return _view(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
+        return TlsView.of(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
 
     return observe
 
@@ -174,11 +222,10 @@ def _with_albedo(power: FloatArray, scene: RayCaster) -> FloatArray:
     return np.asarray(power * np.exp(_ALBEDO_SPREAD * random.standard_normal(len(power))), dtype=np.float64)
 
 
-def _pair_observer(quality: Quality) -> Callable[[Measurement, int], View]:
+def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], StereoView]:
     """Views of a pair of cameras, on its coarsest depth map."""
 
-    def observe(base: Measurement, number: int) -> View:
-        assert base.cameras is not None
+    def observe(base: StereoMeasurement, number: int) -> StereoView:
         pair = StereoPair(base.cameras, base.frame, _QUIET_STEREO, "low")
         points = pair.observe(base.scene, KeyedRandom(0, ("gap", "planned"))).points
         step = REDUCTION["low"]
@@ -190,24 +237,13 @@ def _pair_observer(quality: Quality) -> Callable[[Measurement, int], View]:
         cloud = PointCloud(some[valid], extra={name: values[valid] for name, values in pixels.items()})
         measurement = base.changed(cloud=cloud)
         whole = int(valid.sum() * stride**2 * (step / REDUCTION[quality]) ** 2)
-        return _view(stereo_residuals(measurement), whole, number, measurement)
+        return StereoView.of(stereo_residuals(measurement), whole, number, measurement)
 
     return observe
 
 
-def _view(found: Residuals, whole: int, number: int, measurement: Measurement) -> View:
-    smooth = np.flatnonzero(found.smooth)
-    if len(smooth) < _FEWEST_POINTS:
-        raise InputError(
-            f"{len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
-            where="station" if found.sensor == "tls" else "cameras",
-            remedy="aim at the wall, or scan in finer steps",
-        )
-    return View(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
-
-
-def _about(axis: FloatArray, angle: float) -> FloatArray:
-    """(3, 3) turn about a unit vector (Rodrigues)."""
-    x, y, z = axis
+def _about_vertical(measurement: Measurement, angle: float) -> FloatArray:
+    """(3, 3) turn about the world's vertical in the wall frame (Rodrigues)."""
+    x, y, z = measurement.frame.rotation[:, 2]
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew)

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.spread import spread_candidates
-from pipeline.gap.survey.planned import Survey, View
+from pipeline.gap.survey.planned import Survey, TlsView, View
 from pipeline.gap.survey.survey_design import SIGNAL_TO_NOISE, signatures
 from sensors.effects import catalogue
 from sensors.effects.base import Effect
@@ -45,7 +45,7 @@ def others(survey: Survey) -> tuple[OtherEffect, ...]:
     """Every effect of the catalogue that has no signature in the mean, with the value that would be seen where it is known."""
     view = survey.views[0]
     found = {each.name: each for each in _spread(view)}
-    if survey.sensor == "tls":
+    if isinstance(view, TlsView):
         found |= {each.name: each for each in (_steps(), _limit(view), _rain(view))}
     names = {f"{survey.sensor}.{effect.tag()}": effect for effect in catalogue(survey.sensor)}
     mean = _mean_names(view)
@@ -86,7 +86,7 @@ def _steps() -> OtherEffect:
     return OtherEffect(f"tls.{RangeQuantization.tag()}", "step_m", 1e-4, note)
 
 
-def _limit(view: View) -> OtherEffect:
+def _limit(view: TlsView) -> OtherEffect:
     """Losing the k weakest echoes gains k ln(1 / losses) in likelihood; S/N 5 is a gain of 12.5."""
     power = view.residuals.geometry.power
     if power is None:
@@ -98,7 +98,7 @@ def _limit(view: View) -> OtherEffect:
     )
 
 
-def _rain(view: View) -> OtherEffect:
+def _rain(view: TlsView) -> OtherEffect:
     """The share p = 1 - (1 - p0) exp(-2 beta R) of losses, p0 unknown: information on beta beside p0."""
     distance = view.residuals.geometry.range_m
     slopes = np.stack([2 * distance * (1 - _LOSSES), np.ones_like(distance)], axis=1)
