@@ -117,9 +117,8 @@ def block_meshes(mesh: TriangleMesh, blocks: Blocks, index: int) -> BlockMeshes:
 
 
 def _part(whole: Piece, chosen: NDArray[np.bool_], label: int | IntArray) -> TriangleMesh:
-    used, faces = np.unique(whole.faces[chosen], return_inverse=True)
-    labels = np.broadcast_to(np.asarray(label, dtype=np.int32), len(chosen))[chosen]
-    return TriangleMesh(whole.vertices[used], faces.reshape(-1, 3).astype(np.int32), face_block=labels)
+    labels = np.broadcast_to(np.asarray(label, dtype=np.int32), len(chosen))
+    return TriangleMesh(whole.vertices, whole.faces, face_block=labels).submesh(chosen)
 
 
 def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
@@ -220,15 +219,10 @@ def _put_back(mesh: TriangleMesh, rows: IntArray, surface: _Surface) -> Triangle
     niche = surface.label != WALL
     vertex_block[number[surface.faces[niche]]] = surface.label[niche, None]
     vertex_block[number[on_wall]] = WALL  # the rims
-    used = np.zeros(len(vertex_block), dtype=bool)
-    for start in range(0, len(faces), _CHUNK):
-        used[faces[start : start + _CHUNK].ravel()] = True
-    vertices = np.concatenate([mesh.vertices, surface.vertices[new]])[used]
-    albedo = None
+    vertices, albedo = np.concatenate([mesh.vertices, surface.vertices[new]]), None
     if surface.albedo is not None and mesh.vertex_albedo is not None:
-        albedo = np.concatenate([mesh.vertex_albedo, surface.albedo[new]])[used]
-    renumber = np.cumsum(used, dtype=np.int32) - 1
-    return TriangleMesh(vertices, renumber[faces], albedo, vertex_block[used], face_block)
+        albedo = np.concatenate([mesh.vertex_albedo, surface.albedo[new]])
+    return TriangleMesh(vertices, faces, albedo, vertex_block, face_block).submesh()
 
 
 def _volume(vertices: FloatArray, faces: IntArray, base_m: float) -> float:

@@ -139,14 +139,9 @@ def part_vertices(mesh: TriangleMesh) -> Mended:
 
 def drop_unused(mesh: TriangleMesh) -> Mended:
     """Remove the vertices that no triangle uses."""
-    used = np.zeros(len(mesh.vertices), bool)
-    used[mesh.faces] = True
-    if used.all():
-        return mesh, ""
-    place = (np.cumsum(used) - 1).astype(np.int32)
-    albedo = None if mesh.vertex_albedo is None else mesh.vertex_albedo[used]
-    kept = replace(mesh, vertices=mesh.vertices[used], faces=place[mesh.faces], vertex_albedo=albedo)
-    return kept, f"{int(np.sum(~used))} unused vertices removed"
+    kept = mesh.submesh()
+    unused = len(mesh.vertices) - len(kept.vertices)
+    return (kept, f"{unused} unused vertices removed") if unused else (mesh, "")
 
 
 def pieces(mesh: TriangleMesh) -> str:

@@ -22,6 +22,24 @@ def area_normals(corners: FloatArray) -> FloatArray:
     return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
+def signed_volumes(corners: FloatArray) -> FloatArray:
+    """(n,) six times the volumes of the tetrahedra from the origin to triangles of corners (n, 3, 3); positive where its normal
+    points away from there."""
+    return np.asarray(np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
+
+
+def renumbered(faces: NDArray[np.integer]) -> tuple[NDArray[np.int64], IntArray]:
+    """(k,) the vertices that faces (m, 3) use, in rising order, and the faces by their places among these."""
+    if not len(faces):
+        return np.empty(0, dtype=np.int64), np.empty((0, 3), dtype=np.int32)
+    low, high = int(faces.min()), int(faces.max())
+    used = np.zeros(high + 1 - low, dtype=bool)
+    for start in range(0, len(faces), _CHUNK):
+        used[faces[start : start + _CHUNK].ravel() - low] = True
+    place = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return np.flatnonzero(used) + low, place[faces - low if low else faces]
+
+
 @dataclass(frozen=True)
 class TriangleMesh:
     """Triangles with shared vertices, counter-clockwise seen from outside (from the sensors' side of a wall).
@@ -44,6 +62,17 @@ class TriangleMesh:
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
         """The same triangles over moved vertices."""
         return replace(self, vertices=vertices)
+
+    def submesh(self, faces: NDArray[np.integer] | NDArray[np.bool_] | slice = slice(None)) -> TriangleMesh:
+        """Some of the faces, or all, on the vertices that they use."""
+        used, numbered = renumbered(self.faces[faces])
+        return TriangleMesh(
+            self.vertices[used],
+            numbered,
+            None if self.vertex_albedo is None else self.vertex_albedo[used],
+            None if self.vertex_block is None else self.vertex_block[used],
+            None if self.face_block is None else self.face_block[faces],
+        )
 
     def corners(self, faces: NDArray[np.integer] | slice = slice(None)) -> FloatArray:
         """(k, 3, 3) corners of some faces, or of all."""

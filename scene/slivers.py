@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.mesh import FloatArray, IntArray
+from scene.mesh import FloatArray, IntArray, renumbered
 from scene.solid import boundary, prism_volumes
 
 SLIVER_M = 2e-5
@@ -106,8 +106,7 @@ def _gain(vertices: FloatArray, before: IntArray, label: IntArray, after: IntArr
     """(count,) the volume that each connected part of a surface has gained, under the largest label in it."""
     from scipy import sparse
 
-    used, number = np.unique(before, return_inverse=True)
-    number = number.reshape(-1, 3)
+    used, number = renumbered(before)
     links = np.concatenate([number[:, :2], number[:, 1:]]).T
     graph = sparse.coo_array((np.ones(links.shape[1], dtype=bool), (links[0], links[1])), shape=(len(used), len(used)))
     parts, part = sparse.csgraph.connected_components(graph, directed=False)
@@ -137,8 +136,7 @@ def _mend_part(
     vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[np.int8], cut: BoolArray, limit_m: float
 ) -> tuple[IntArray, IntArray]:
     """Mend a part of a surface as far as this can be done without its boundary; `cut` grows with the vertices collapsed onto."""
-    used, number = np.unique(faces, return_inverse=True)
-    faces = number.reshape(-1, 3).astype(np.int32)
+    used, faces = renumbered(faces)
     vertices, rank, part_cut = vertices[used], rank[used], cut[used]
     rank[boundary(faces)[0]] = 0
     for _ in range(_ROUNDS):

@@ -14,7 +14,7 @@ from manifold3d import Error, Manifold, Mesh64
 from numpy.typing import NDArray
 
 from scene.errors import InputError
-from scene.mesh import FloatArray, IntArray, TriangleMesh
+from scene.mesh import FloatArray, IntArray, TriangleMesh, renumbered
 
 _MARGIN_M = 1.0
 """Distance from the lowest point of patch and blocks to the closure's bottom."""
@@ -90,10 +90,8 @@ def close(mesh: TriangleMesh, rows: IntArray, bottom_m: float) -> tuple[Solid, F
 
     bottom_m: a z that the closure's bottom has to lie below. Returns the solid and the corners (r, 3, 3) of the patch's faces.
     """
-    used = np.zeros(len(mesh.vertices), dtype=bool)
-    used[mesh.faces[rows].ravel()] = True
-    number = np.cumsum(used, dtype=np.int32) - 1
-    vertices, faces = mesh.vertices[used], number[mesh.faces[rows]]
+    used, faces = renumbered(mesh.faces[rows])
+    vertices = mesh.vertices[used]
     start, end = boundary(faces)
     pinched = np.bincount(start, minlength=len(vertices)) > 1
     if pinched.any():

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scene.cleaning import Mended, flipped, groups, undirected_edges, weld, wound_otherwise
 from scene.errors import InputError
-from scene.mesh import FloatArray, TriangleMesh
+from scene.mesh import FloatArray, TriangleMesh, signed_volumes
 from scene.raycast import RayCaster
 
 _FARTHEST_M = 1e5
@@ -73,6 +73,5 @@ def _is_whole(mesh: TriangleMesh, piece: NDArray[np.int64], count: int) -> NDArr
     """(count,) pieces that are closed and wound counter-clockwise seen from outside: their signed volume is above 0."""
     _, inverse, uses = np.unique(undirected_edges(mesh), return_inverse=True, return_counts=True)
     rim = np.bincount(np.tile(piece, 3), uses[inverse] == 1, count)
-    corners = mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0)
-    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    volume = signed_volumes(mesh.corners() - mesh.vertices.mean(axis=0))
     return (rim == 0) & (np.bincount(piece, volume, count) > 0)

@@ -170,9 +170,9 @@ class LaserScanner:
 
     def _scan(self, real: LaserScanner, scene: RayCaster, random: KeyedRandom) -> Observation:
         """A scan in one face; real: the scanner where it really stands."""
-        pulses, beam = self._aimed(self.emit(), random)
+        pulses, beam = self.emitted(self.emit(), random)
         echoes = real._echoes(scene, pulses, beam)
-        pulses = self._measured(pulses, beam.received(echoes), random)
+        pulses = self.measured(pulses, beam.received(echoes), random)
         if not beam.records_several:
             return self._record(pulses, real)
         if self.config.faces == 2:
@@ -182,12 +182,12 @@ class LaserScanner:
         seen = self._record(pulses, real)
         return replace(seen, further=self._further(real, scene, random, seen, count)) if np.any(count.numpy() > 1) else seen
 
-    def _aimed(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
+    def emitted(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
         """The pulses as they really leave, and the beam."""
         effects = self.model.chain()
         return apply_stage(effects, Stage.AIM, pulses, random), apply_stage(effects, Stage.FOOTPRINT, Beam(), random)
 
-    def _measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
+    def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         """What the instrument makes of the return of each pulse."""
         pulses = replace(
             pulses,
@@ -309,10 +309,10 @@ class LaserScanner:
         found, emitted = [], self.emit().evaluated()
         for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
             index = dr.compress(count >= max(number, 2))
-            pulses, beam = self._aimed(emitted.at(index), random)
+            pulses, beam = self.emitted(emitted.at(index), random)
             echo, in_grid = beam.numbered(real._echoes(scene, pulses, beam), dr.opaque(mi.UInt32, number))
             dr.schedule(in_grid)
-            recorded = self._recorded(self._measured(pulses, echo, random.child("return", number)), real)
+            recorded = self._recorded(self.measured(pulses, echo, random.child("return", number)), real)
             found.append((index.numpy().astype(np.int64), in_grid.numpy().astype(bool), recorded))
         return further_returns(found, seen)
 

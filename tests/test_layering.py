@@ -171,3 +171,32 @@ def test_nothing_in_the_pipeline_is_decided_by_the_name_of_an_effect(file: Path)
     names |= {f"{sensor}.{name}" for sensor in ("tls", "stereo") for name in names}
     written = {node.value for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Constant)}
     assert written & names == set()
+
+
+OF_OTHERS = {"_exit", "_actions", "_repr_html_"}
+"""Names that begin with an underscore and are public: of os, of argparse, of Jupyter's protocol."""
+
+
+def private_of_others(source: str) -> set[str]:
+    """Names with a leading underscore that a module takes from another one: imported, or of an object whose class it has not."""
+    tree = ast.parse(source)
+    nodes = list(ast.walk(tree))
+    own = {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    own |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    own |= {node.attr for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)}
+    used = {node.attr for node in nodes if isinstance(node, ast.Attribute)} - own
+    used |= {alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    return {name for name in used if name.startswith("_") and not name.startswith("__")} - OF_OTHERS
+
+
+@pytest.mark.parametrize("folder", ["scene", "sensors", "pipeline"])
+def test_what_is_private_stays_in_its_module(folder: str) -> None:
+    found = {str(file.relative_to(ROOT)): private_of_others(file.read_text()) for file in sources(folder)}
+    assert {file: names for file, names in found.items() if names} == {}
+
+
+@pytest.mark.parametrize(
+    "line", ["from sensors.tls import _extent", "scanner._aimed()", "class A(B):\n    def f(self):\n        super()._g()"]
+)
+def test_the_rule_sees_what_is_private(line: str) -> None:
+    assert private_of_others(line)

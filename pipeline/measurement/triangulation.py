@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.errors import InputError
-from scene.mesh import FloatArray, TriangleMesh
+from scene.mesh import FloatArray, TriangleMesh, signed_volumes
 from scene.rounding import rounded_axes
 from sensors.polar import polar
 
@@ -68,12 +68,9 @@ def triangulated(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray
     faces = _towards(faces, local)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     spacing = float(np.median(np.linalg.norm(local[edges[:, 0]] - local[edges[:, 1]], axis=1)))
-    used = np.zeros(len(local), dtype=bool)
-    used[faces] = True
-    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
     smoothed = any(each.step_m > _COARSE_M for each in rounded_axes(points))
     vertices = _averaged(points[kept], edges) if smoothed else points[kept]
-    mesh = TriangleMesh(vertices[used], number[faces])
+    mesh = TriangleMesh(vertices, faces).submesh()
     return SeenSurface(mesh, spacing, _roughness(local, faces, edges), smoothed)
 
 
@@ -131,9 +128,7 @@ def _typical(lengths: FloatArray) -> float:
 
 def _towards(faces: NDArray[np.int32], local: FloatArray) -> NDArray[np.int32]:
     """The faces, wound counter-clockwise seen from the origin of the local frame."""
-    corners = local[faces]
-    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    away = volume > 0
+    away = signed_volumes(local[faces]) > 0
     faces = faces.copy()
     faces[away] = faces[away][:, ::-1]
     return faces

@@ -11,7 +11,7 @@ The first condition keeps noise from tearing a densely sampled surface, the seco
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -105,10 +105,9 @@ def labelled_surface(
             where="surface",
             remedy="raise surface.poisson_depth or surface.poisson_trim_spacings",
         )
-    used = np.zeros(len(vertices), dtype=bool)
-    used[faces] = True
-    nearest = cKDTree(labels[0]).query(vertices[used], workers=-1)[1]
-    return TriangleMesh(vertices[used], _numbers(used)[faces], vertex_block=labels[1][nearest].astype(np.int32))
+    mesh = TriangleMesh(vertices, faces).submesh()
+    nearest = cKDTree(labels[0]).query(mesh.vertices, workers=-1)[1]
+    return replace(mesh, vertex_block=labels[1][nearest].astype(np.int32))
 
 
 def octree_depth(points: FloatArray) -> int:

@@ -93,7 +93,7 @@ def merged(scanners: Sequence[LaserScanner], meshes: Sequence[TriangleMesh], con
         variance = np.where(np.isnan(heights), np.float32(np.inf), _variance(scanner, grid, float(np.nanmean(heights))))
         better = variance < least
         best[better], least[better] = number, variance[better]
-    parts = [_part(mesh, _needed(mesh, grid, best == number)) for number, mesh in enumerate(meshes)]
+    parts = [mesh.submesh(_needed(mesh, grid, best == number)) for number, mesh in enumerate(meshes)]
     return _concatenated([part for part in parts if len(part.faces)])
 
 
@@ -136,16 +136,6 @@ def _needed(mesh: TriangleMesh, grid: Grid, own: NDArray[np.bool_]) -> NDArray[n
         count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
         needed[start : start + _FACES] = count > 0
     return needed
-
-
-def _part(mesh: TriangleMesh, kept: NDArray[np.bool_]) -> TriangleMesh:
-    """The mesh of the kept faces and their vertices."""
-    faces = mesh.faces[kept]
-    used = np.zeros(len(mesh.vertices), dtype=bool)
-    used[faces] = True
-    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    label = None if mesh.vertex_block is None else mesh.vertex_block[used]
-    return TriangleMesh(mesh.vertices[used], number[faces], vertex_block=label)
 
 
 def _concatenated(meshes: Sequence[TriangleMesh]) -> TriangleMesh:

@@ -48,10 +48,10 @@ class DirectedScanner(LaserScanner):
             aim_zenith=zenith,
         )
 
-    def _measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
+    def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         power = self.geometry.power
         recorded = echo if power is None else replace(echo, power=on_device(mi.Float32, np.maximum(power, 1e-9)))
-        return super()._measured(pulses, recorded, random)
+        return super().measured(pulses, recorded, random)
 
 
 def _scanner(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry) -> DirectedScanner:
@@ -75,7 +75,7 @@ def mean_model(model: TlsModel) -> TlsModel:
 def aimed(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
     """(n,) azimuth and zenith in which the pulses leave on average, by the measurement's model, scanner frame, rad."""
     scanner = _scanner(measurement, mean_model(measurement.model), geometry)
-    pulses = scanner._aimed(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
+    pulses = scanner.emitted(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
     return np.array(pulses.aim_azimuth), np.array(pulses.aim_zenith)
 
 

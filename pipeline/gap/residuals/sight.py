@@ -14,7 +14,7 @@ from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.residuals import Residuals, Rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.mesh import FloatArray
+from scene.mesh import FloatArray, area_normals
 
 NEIGHBOURS = 8
 """The ring around a point of a raster."""
@@ -142,8 +142,7 @@ class Sight:
             near = np.unique(tree.query(self.even_plane[own], min(_AROUND, len(group)))[1])
             chosen = group[near.ravel()]
             corners = chosen[Delaunay(self.even_plane[chosen], qhull_options="Qbb QJ").simplices]
-            a, b, c = (self.ray[corners[:, each]] for each in range(3))
-            area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            area = 0.5 * np.linalg.norm(area_normals(self.ray[corners]), axis=1)
             touching = wanted[corners].any(axis=1)
             area = np.minimum(area, _LARGEST_CELL * np.median(area[touching]))
             total += np.bincount(corners.ravel(), np.repeat(area / 3, 3), len(total))
