@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from pipeline.calibration.calibrate import calibrate_material
-from pipeline.calibration.inputs import Material
+from pipeline.calibration.inputs import CalibrationInputs
 from pipeline.calibration.maps import noise_map
 from pipeline.calibration.parameters import parameters
 from pipeline.change.difference import raster_grid
@@ -74,7 +74,7 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
     grid = raster_grid(reconstruct(config, look(config, real, caster, random.child("grid"))).bounds, config.difference)
     maps = np.stack([noise_map(config, real, real, caster, random.child("map", epoch), grid) for epoch in range(EPOCHS)])
     names = tuple(f"epoch {epoch}" for epoch in range(EPOCHS))
-    material = Material(names, grid, maps, ~np.isnan(maps).any(axis=0), False, site, False)
+    material = CalibrationInputs(names, grid, maps, ~np.isnan(maps).any(axis=0), False, site, False)
     begun = time.process_time()
     found = calibrate_material(config, sensor, material, Progress(), with_greedy=False).found
     values = zip(fitted.names, true, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True)

@@ -20,7 +20,7 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SensorName
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs, simulation_of
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
 
@@ -46,7 +46,7 @@ def stds_mm(config: DatasetConfig, epochs: list[PlannedEpoch], maps: int) -> dic
     return found
 
 
-def _with_model(site: Site, model: object) -> Site:
+def _with_model(site: SensorSite, model: object) -> SensorSite:
     return replace(site, sensor=replace(site.sensor, model=model))  # type: ignore[type-var]
 
 

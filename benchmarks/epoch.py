@@ -23,7 +23,7 @@ from pipeline.config.simulation import SensorName, load_config
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.products import write_epoch, write_reference
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.backend import VARIANT, dr, mi
 from scene.blocks import place_blocks
 from scene.grid import Grid
@@ -35,7 +35,7 @@ from sensors.stereo import SHADOW_MARGIN, StereoPair
 from sensors.tls import LaserScanner
 
 
-def observation_casts(site: Site, caster: RayCaster) -> float:
+def observation_casts(site: SensorSite, caster: RayCaster) -> float:
     """Seconds of the bare casts that the sensor needs."""
     if isinstance(site.sensor, LaserScanner):
         pulses = site.sensor.emit()

@@ -26,7 +26,7 @@ from pipeline.calibration.maps import noise_map, with_model
 from pipeline.change.difference import statistics
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.config import load_yaml, parse
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
@@ -76,7 +76,7 @@ READINGS = (
 class Maps:
     """Statistics of noise maps of one site, each kept in a file of its own."""
 
-    def __init__(self, config: SimulationConfig, site: Site, folder: Path) -> None:
+    def __init__(self, config: SimulationConfig, site: SensorSite, folder: Path) -> None:
         self.config, self.site, self.folder, self.caster = config, site, folder, RayCaster(site.mesh)
         folder.mkdir(parents=True, exist_ok=True)
 

@@ -19,8 +19,8 @@ from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.procedural import ProceduralWall
 from scene.raycast import RayCaster
+from sensors.beam import Beam
 from sensors.device import rotated, vector
-from sensors.footprint import Beam
 from sensors.model import TlsModel
 from sensors.placement import StationConfig, Target
 from sensors.pulses import direction, tangents

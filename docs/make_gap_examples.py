@@ -26,7 +26,7 @@ from pipeline.formats.cameras import write_cameras_yaml
 from pipeline.formats.measurement import read_measurement
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.in_words import paragraph
 from pipeline.gap.report.report import summary, write
@@ -145,7 +145,7 @@ def rendered() -> Iterator[Pair]:
         yield Pair(name, world, frame.to_world(seen.points[rows, columns]), pixels, cameras)
 
 
-def run(pairs: Iterator[Pair], out: Path) -> list[tuple[str, Diagnosis]]:
+def run(pairs: Iterator[Pair], out: Path) -> list[tuple[str, GapDiagnosis]]:
     """Write and diagnose each measurement; folders under `out` hold the measurement and gap/ with the results."""
     found = []
     for pair in pairs:
@@ -159,7 +159,7 @@ def run(pairs: Iterator[Pair], out: Path) -> list[tuple[str, Diagnosis]]:
     return found
 
 
-def table(found: list[tuple[str, Diagnosis]]) -> str:
+def table(found: list[tuple[str, GapDiagnosis]]) -> str:
     """Verdict, effects and the gap of each."""
     rows = ["| matcher | verdict | what was named | before | after | floor | closed |", "|---|---|---|---|---|---|---|"]
     for name, each in found:
@@ -182,7 +182,7 @@ def _entry(entry: dict[str, Any]) -> str:
     return "`" + json.dumps(values).replace('"', "") + "`"
 
 
-def page(name: str, title: str, before: str, found: list[tuple[str, Diagnosis]]) -> None:
+def page(name: str, title: str, before: str, found: list[tuple[str, GapDiagnosis]]) -> None:
     """docs/gap/<name>.md up to the line that marks hand-written text, which is kept."""
     path, mark = FOLDER / f"{name}.md", "## What it could and could not say"
     kept = path.read_text().partition(mark)[2] if path.exists() else "\n"

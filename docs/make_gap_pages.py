@@ -28,7 +28,7 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.naming.verdict import VERDICTS
-from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import bins, where
 from pipeline.gap.report.figures import gap_figure, maps_figure
 from pipeline.gap.report.in_words import paragraph
@@ -343,7 +343,7 @@ def verdicts() -> dict[str, Verdict]:
     }  # fmt: skip
 
 
-def verdict_page(name: str, verdict: Verdict, found: Diagnosis) -> str:
+def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
     """The Markdown page."""
     pictures = [f"![maps](images/verdict_{name}.png)"] if found.gap is not None else []
     pictures += [f"![gap](images/gap_{name}.png)"] if found.gap is not None else []

@@ -147,7 +147,7 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
         solids = [_shaped(config, random.child("block", index)) for index in range(config.count)]
     _require_fit(solids, mesh)
     zone = safe_zone(caster, config.safe_zone_offset_m)
-    search = _Search(config, zone, solids, random)
+    search = _Placing(config, zone, solids, random)
     surface_under = highest_under if config.placement == "relief" else median_under
     position = np.zeros((len(solids), 3))
     area = np.array([np.ptp(solid.bbox[:, :2], axis=0).prod() for solid in solids])
@@ -175,7 +175,7 @@ def given_blocks(position_m: FloatArray, size_m: FloatArray, rotation_rad: Float
     return _packed(found, position_m)
 
 
-class _Search:
+class _Placing:
     """Rejection sampling of positions. boxes: (k, 2, 2) what is placed so far in x and y, NaN where not."""
 
     def __init__(self, config: RockfallConfig, zone: SafeZone, solids: Sequence[_Solid], random: KeyedRandom) -> None:

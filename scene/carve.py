@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from scene.blocks import Blocks
 from scene.errors import InputError
-from scene.footprint import faces_under
 from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh, area_normals
 from scene.slivers import mend
 from scene.solid import Piece, boundary, close, piece, prism_volumes, solid, split
+from scene.under_boxes import faces_under
 
 FRESH_ALBEDO = 0.6
 """Albedo of rock that no weather has darkened yet."""

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.footprint import faces_under
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import RayCaster
+from scene.under_boxes import faces_under
 
 _SIDE = 16
 """Heights are looked up at so many places across a contour and along it, and at four times as many on its edge."""

@@ -12,7 +12,7 @@ from scene.config import Config
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, IntArray, TriangleMesh
 from scene.plug_ins import plugged
-from scene.rock import BlockRule, Blocks, Field, Fractal, Noise, Notches, Size, Table, partings, ramp_knots
+from scene.rock import BlockRule, Field, Fractal, JointedBlocks, Notches, Size, SplineNoise, Table, partings, ramp_knots
 
 _ROWS_AT_ONCE = 64
 _DETREND_STEP_M = 0.5
@@ -232,21 +232,21 @@ class Rock:
     fault: Table
     ledge: Table
     bed_tone: Table
-    blocks: tuple[Blocks, ...]
+    blocks: tuple[JointedBlocks, ...]
     notches: Notches | None
     roughness: Fractal
-    patches: Noise
+    patches: SplineNoise
     streaks: Fractal
     grain: Fractal
-    band_blocks: tuple[Blocks, ...]
+    band_blocks: tuple[JointedBlocks, ...]
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, site: Site) -> Rock:
         def fractal(name: str, amplitude: float, hurst: float, steps_m: tuple[float, float], aspect: float = 1.0) -> Fractal:
             return Fractal.make(random.child(name), size, amplitude, hurst, steps_m, aspect)
 
-        def blocks(name: str, rules: tuple[BlockRule, ...]) -> tuple[Blocks, ...]:
-            return tuple(Blocks.make(random.child(name, k), size, rule) for k, rule in enumerate(rules))
+        def blocks(name: str, rules: tuple[BlockRule, ...]) -> tuple[JointedBlocks, ...]:
+            return tuple(JointedBlocks.make(random.child(name, k), size, rule) for k, rule in enumerate(rules))
 
         bend = site.bend_m / 8.0**0.9
         ledge, tone = _beds(random.child("beds"), size, site)
@@ -263,7 +263,7 @@ class Rock:
             blocks("blocks", site.blocks),
             notches,
             fractal("roughness", site.roughness, site.hurst, (2.0, 0.03125)),
-            Noise.make(random.child("patches"), size, 3.0),
+            SplineNoise.make(random.child("patches"), size, 3.0),
             fractal("streaks", 1.0, 0.5, (1.0, 0.25), aspect=8.0),
             fractal("grain", 0.035, 0.15, (0.5, 0.03125)),
             blocks("band", site.band.blocks if site.band else ()),
@@ -321,7 +321,7 @@ class Rock:
         return form, np.clip(albedo[0] + inside * (colour - albedo[0]) + albedo[1] * (1 - np.float32(0.6) * inside), 0.05, 0.9)
 
 
-def _pile(layers: tuple[Blocks, ...], u: Field, v: Field, broken: Field) -> tuple[Field, Field]:
+def _pile(layers: tuple[JointedBlocks, ...], u: Field, v: Field, broken: Field) -> tuple[Field, Field]:
     """Sum of the layers' heights, m, the smaller ones weighted by how broken the rock is, and of their tones."""
     height, tone = layers[0].at(u, v)
     for layer in layers[1:]:

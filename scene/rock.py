@@ -28,7 +28,7 @@ _RAMP_PER_STEP = 0.25
 
 
 @dataclass(frozen=True)
-class Noise:
+class SplineNoise:
     """Smooth noise of unit standard deviation: a uniform cubic B-spline over a lattice of keyed normal numbers.
 
     lattice: (rows, columns) control values, row k at v = (k - 1) step_v_m.
@@ -39,7 +39,7 @@ class Noise:
     step_v_m: float
 
     @classmethod
-    def make(cls, random: KeyedRandom, size: Size, step_u_m: float, step_v_m: float | None = None) -> Noise:
+    def make(cls, random: KeyedRandom, size: Size, step_u_m: float, step_v_m: float | None = None) -> SplineNoise:
         step_v_m = step_u_m if step_v_m is None else step_v_m
         shape = int(size[1] / step_v_m) + 5, int(size[0] / step_u_m) + 5
         deviation = 0.4795  # of the spline between knots, as the mean square over a cell is (151/315)^2
@@ -66,7 +66,7 @@ def _spline_weights(x: FloatArray, step: float) -> tuple[NDArray[np.intp], Field
 class Fractal:
     """Noise summed over octaves whose amplitude follows amplitude_m (step / 1 m)^hurst: self-affine roughness."""
 
-    octaves: tuple[tuple[float, Noise], ...]
+    octaves: tuple[tuple[float, SplineNoise], ...]
 
     @classmethod
     def make(
@@ -75,7 +75,7 @@ class Fractal:
         """Octaves from the coarsest step halved down to the finest; aspect: how much longer the grain is up the wall."""
         coarsest, finest = steps_m
         steps = [coarsest / 2**k for k in range(round(np.log2(coarsest / finest)) + 1)]
-        noises = (Noise.make(random.child(k), size, step, step * aspect) for k, step in enumerate(steps))
+        noises = (SplineNoise.make(random.child(k), size, step, step * aspect) for k, step in enumerate(steps))
         return cls(tuple((amplitude * step**hurst, noise) for step, noise in zip(steps, noises, strict=True)))
 
     def at(self, u: FloatArray, v: FloatArray) -> Field:
@@ -124,7 +124,7 @@ class BlockRule:
 
 
 @dataclass(frozen=True)
-class Blocks:
+class JointedBlocks:
     """Blocks between beds and joints: tables over (bed, t) of the face's height, its slope across the bed and its tone.
 
     row: the table row of s, whole inside a bed and running to the next over the ramp, so that bilinear interpolation of the
@@ -140,7 +140,7 @@ class Blocks:
     tone: Field
 
     @classmethod
-    def make(cls, random: KeyedRandom, size: Size, rule: BlockRule) -> Blocks:
+    def make(cls, random: KeyedRandom, size: Size, rule: BlockRule) -> JointedBlocks:
         draw = random.generator()
         reach_s, reach_t = _MARGIN_M + abs(rule.dip) * size[0], _MARGIN_M + abs(rule.lean) * size[1]
         beds = partings(draw, -reach_s, size[1] + reach_s, rule.bed_m, rule.spread)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.errors import InputError
-from scene.footprint import integral
 from scene.grid import Grid
 from scene.mesh import FloatArray, IntArray
 from scene.raycast import RayCaster, heights
+from scene.under_boxes import integral
 
 _CELLS = 2e6
 """Cells of the raster; on a wall of 70 x 45 m they measure 4 cm."""

@@ -48,7 +48,7 @@ def _normal(corners: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Edges:
+class _RankedEdges:
     """Edges (start, end) to work on, in order of preference, and the faces that meet them.
 
     operation, face: (p,) pairs of an edge's number and a face with its start or end in it.
@@ -59,10 +59,10 @@ class _Edges:
     operation: IndexArray
     face: IndexArray
 
-    def only(self, chosen: BoolArray) -> _Edges:
+    def only(self, chosen: BoolArray) -> _RankedEdges:
         number = np.cumsum(chosen) - 1
         kept = chosen[self.operation]
-        return _Edges(self.start[chosen], self.end[chosen], number[self.operation[kept]], self.face[kept])
+        return _RankedEdges(self.start[chosen], self.end[chosen], number[self.operation[kept]], self.face[kept])
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _collapsible_edges(
     return start[order], end[order]
 
 
-def _with_faces(faces: IntArray, start: IndexArray, end: IndexArray, count: int) -> _Edges:
+def _with_faces(faces: IntArray, start: IndexArray, end: IndexArray, count: int) -> _RankedEdges:
     near = np.zeros(count, dtype=bool)
     near[start] = near[end] = True
     rows = np.flatnonzero(_at(near, faces))
@@ -202,10 +202,10 @@ def _with_faces(faces: IntArray, start: IndexArray, end: IndexArray, count: int)
     within = np.arange(len(pair)) - np.repeat(np.cumsum(last - first) - (last - first), last - first)
     face = rows[order[np.repeat(first, last - first) + within] // 3]
     both = np.unique(np.stack([pair, face]), axis=1)
-    return _Edges(start, end, both[0], both[1])
+    return _RankedEdges(start, end, both[0], both[1])
 
 
-def _keeps_manifold(faces: IntArray, edges: _Edges) -> BoolArray:
+def _keeps_manifold(faces: IntArray, edges: _RankedEdges) -> BoolArray:
     """The link condition: the two ends share as many neighbours as the edge has faces, which are two."""
     corners = faces[edges.face]
     at_start = (corners == edges.start[edges.operation, None]).any(axis=1)
@@ -217,7 +217,7 @@ def _keeps_manifold(faces: IntArray, edges: _Edges) -> BoolArray:
     return (np.bincount(edges.operation[at_start & at_end], minlength=count) == 2) & (common == 2)
 
 
-def _turns_no_face(vertices: FloatArray, faces: IntArray, edges: _Edges) -> BoolArray:
+def _turns_no_face(vertices: FloatArray, faces: IntArray, edges: _RankedEdges) -> BoolArray:
     """Whether no face that is sound and stays turns by more than a right angle when start moves to end."""
     corners = faces[edges.face]
     start, end = edges.start[edges.operation, None], edges.end[edges.operation, None]
@@ -228,7 +228,7 @@ def _turns_no_face(vertices: FloatArray, faces: IntArray, edges: _Edges) -> Bool
     return np.bincount(edges.operation[turns], minlength=len(edges.start)) == 0
 
 
-def _independent(faces: IntArray, edges: _Edges, count: int) -> BoolArray:
+def _independent(faces: IntArray, edges: _RankedEdges, count: int) -> BoolArray:
     """The edges that come first at every vertex of their faces, so that no two of them share a neighbourhood."""
     best = np.full(count, len(edges.start))
     around, operation = faces[edges.face].ravel(), np.repeat(edges.operation, 3)

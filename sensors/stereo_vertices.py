@@ -51,7 +51,7 @@ def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) ->
     block = mi.Int32(WALL) if mesh.vertex_block is None else on_device(mi.Int32, mesh.vertex_block)
     index, size = dr.arange(mi.UInt32, len(mesh.vertices)), (nominal.left.width, nominal.left.height, REDUCTION[pair.quality])
     matches: Matches = VertexMatches(
-        index, u, v, disparity, in_left & in_right, block, depth, albedo, *size, _Cells(pair, scene, effects, random)
+        index, u, v, disparity, in_left & in_right, block, depth, albedo, *size, _TracedCells(pair, scene, effects, random)
     )
     for stage in (Stage.MATCH, Stage.FILL):
         matches = apply_stage(effects, stage, matches, random)
@@ -92,7 +92,7 @@ def _kept(mesh: TriangleMesh, kept: np.ndarray) -> TriangleMesh:
     )
 
 
-class _Cells:
+class _TracedCells:
     """The ray-traced matches of the same look, made where an effect asks for them."""
 
     def __init__(self, pair: StereoPair, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom) -> None:
@@ -111,7 +111,7 @@ class VertexMatches(Matches):
     cells: the depth map that effects look at which need neighbours; before: its disparities as they are by now.
     """
 
-    cells: _Cells
+    cells: _TracedCells
     before: FloatArray | None = None
 
     def raster(self) -> FloatArray:

@@ -17,11 +17,11 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray
 from scene.raycast import RayCaster
 from sensors.atmosphere import extinction_per_m
+from sensors.beam import Beam, Echo
 from sensors.camera import axis_rotation
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Stage, apply_stage
 from sensors.faces import mean_of_faces
-from sensors.footprint import Beam, Echo
 from sensors.model import TlsModel
 from sensors.observation import FurtherReturns, Observation, offset_of, packed
 from sensors.placement import EXACT_POSE, PoseSigma

@@ -200,3 +200,13 @@ def test_what_is_private_stays_in_its_module(folder: str) -> None:
 )
 def test_the_rule_sees_what_is_private(line: str) -> None:
     assert private_of_others(line)
+
+
+def test_no_two_classes_have_one_name() -> None:
+    places: dict[str, list[str]] = {}
+    for folder in ("scene", "sensors", "pipeline"):
+        for file in sources(folder):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.ClassDef):
+                    places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}

@@ -18,7 +18,7 @@ from pipeline.change import difference as rasters
 from pipeline.config.simulation import SensorName
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.registration import register as icp
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from pipeline.surface.from_cloud import surface_of_cloud
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from scene import blocks as solids
@@ -55,7 +55,7 @@ def stage(
     seed: int | None = None,
     model: Any = None,
     **overrides: Any,
-) -> Site:
+) -> SensorSite:
     """A wall (world frame; none: the config's) in its frame with a sensor before it: `.mesh`, `.frame`, `.sensor`, `.viewpoints`.
 
     The wall frame's z axis points to the sensor, which the config places; config, model, overrides: as `configure` takes them.

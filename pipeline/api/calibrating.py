@@ -57,7 +57,7 @@ def calibrate(
 class Calibration:
     """Fitted noise. figures: everything, as `pipeline.calibration` has it; inputs: what it was fitted to."""
 
-    figures: fitting.Calibration
+    figures: fitting.CalibrationResult
     inputs: tuple[Path, ...]
 
     @property

@@ -11,8 +11,8 @@ from pipeline.api.configs import Show, configure, keywords, paths
 from pipeline.api.maps import DIFFERENCE, data_array, dataset
 from pipeline.api.pictures import Picture, html_table, pick
 from pipeline.api.tables import frame
-from pipeline.comparison.assess import Assessment
-from pipeline.comparison.comparison import Comparison as Figures
+from pipeline.comparison.assess import SensorAssessment
+from pipeline.comparison.comparison import ComparedSensors as Figures
 from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.report import answer, pictures, summary, write_comparison
 from pipeline.comparison.sensors_compared import Given, contestants
@@ -127,7 +127,7 @@ def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any
     ]
 
 
-def _row(found: Assessment) -> dict[str, Any]:
+def _row(found: SensorAssessment) -> dict[str, Any]:
     curve, blocks = found.detection.by_size, found.detection.blocks
     return {
         "name": found.name,

@@ -153,7 +153,7 @@ def diagnose(
 class Diagnosis:
     """What was found. found: everything, as `pipeline.gap` has it; measurement: of what."""
 
-    found: workflow.Diagnosis
+    found: workflow.GapDiagnosis
     measurement: Measurement
 
     @property

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from pipeline.calibration.epochs import EpochNoise, Trend, epoch_noise, systematic, trend
 from pipeline.calibration.greedy import Greedy, greedy
-from pipeline.calibration.inputs import Material, read_material
+from pipeline.calibration.inputs import CalibrationInputs, read_material
 from pipeline.calibration.parameters import Model, Parameters, parameters
 from pipeline.calibration.reobserve import Reobserver
-from pipeline.calibration.search import OBSERVATION_S, Found, Search, fresh_cost
+from pipeline.calibration.search import OBSERVATION_S, Found, NoiseSearch, fresh_cost
 from pipeline.calibration.signature import Signature
 from pipeline.calibration.windows import Windows
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.report.progress import Progress
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.camera import Side
@@ -67,12 +67,12 @@ class Baseline:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CalibrationResult:
     """The result. predicted: (k, n, n) windows of one simulated map; rate: observations per second; cells: traced in each."""
 
     config: SimulationConfig
     sensor: SensorName
-    material: Material
+    material: CalibrationInputs
     windows: Windows
     epochs: tuple[EpochNoise, ...]
     median_trend: Trend
@@ -94,7 +94,7 @@ class Calibration:
         """Of the intervals."""
         return self.config.calibration.confidence
 
-    def simulated_site(self) -> Site:
+    def simulated_site(self) -> SensorSite:
         """The site with the calibrated model."""
         sensor: Any = self.material.site.sensor
         return replace(self.material.site, sensor=replace(sensor, model=self.model))
@@ -113,7 +113,7 @@ class Calibration:
 
 def calibrate(
     config: SimulationConfig, sensor: SensorName, paths: Sequence[Path], progress: Progress, *, with_greedy: bool = True
-) -> Calibration:
+) -> CalibrationResult:
     """Calibrate the noise of a sensor's model on measured maps; `config.seed` keys all random numbers.
 
     paths: see `inputs.read_material`. Raises InputError for whatever is wrong with them or with the config.
@@ -128,12 +128,12 @@ def calibrate(
 def calibrate_material(
     config: SimulationConfig,
     sensor: SensorName,
-    material: Material,
+    material: CalibrationInputs,
     progress: Progress,
     *,
     with_greedy: bool = True,
     began: float | None = None,
-) -> Calibration:
+) -> CalibrationResult:
     """The same with maps that are in memory."""
     began = time.perf_counter() if began is None else began
     random, settings = KeyedRandom(config.seed).child("calibrate"), config.calibration
@@ -153,7 +153,7 @@ def calibrate_material(
     def simulate(values: FloatArray, count: int, source: KeyedRandom) -> FloatArray:
         return signature.of(simulator.maps(fitted.model(values), count, source))
 
-    search = Search(simulate, fitted, len(measured), random, progress)
+    search = NoiseSearch(simulate, fitted, len(measured), random, progress)
     started, before = time.perf_counter(), simulator.observations
     found = search.run(observed, settings.simulations, settings.confidence)
     rate = (simulator.observations - before) / (time.perf_counter() - started)
@@ -161,7 +161,7 @@ def calibrate_material(
         baseline = _baseline(search, found, signature, observed, random) if with_greedy else None
         patterns = _patterns(simulator, material.site.sensor) if isinstance(material.site.sensor, StereoPair) else None
         predicted = simulator.maps(fitted.model(np.exp(found.x)), 1, random.child("predicted"))[0]
-    return Calibration(
+    return CalibrationResult(
         config=config,
         sensor=sensor,
         material=material,
@@ -183,7 +183,7 @@ def calibrate_material(
     )
 
 
-def _baseline(search: Search, found: Found, signature: Signature, observed: FloatArray, random: KeyedRandom) -> Baseline:
+def _baseline(search: NoiseSearch, found: Found, signature: Signature, observed: FloatArray, random: KeyedRandom) -> Baseline:
     """The thesis's search on the same maps, from the values of the model that was there before."""
     std, fitted = signature.names.index("size.std"), search.parameters
     result = greedy(search.simulate, fitted, _present(fitted), std, observed[std], random)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.change.difference import DifferenceStatistics, statistics
-from pipeline.noise.statistics import Normality, Tails, normality, tails, without_outliers
+from pipeline.noise.statistics import Normality, TailFigures, normality, tails, without_outliers
 from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -26,7 +26,7 @@ class EpochNoise:
 
     name: str
     size: DifferenceStatistics
-    tails: Tails
+    tails: TailFigures
     normality: Normality
     variogram: Variogram
     model: VariogramModel

@@ -15,7 +15,7 @@ from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
@@ -28,7 +28,7 @@ _REACH_PX = 2
 
 
 @dataclass(frozen=True)
-class Material:
+class CalibrationInputs:
     """names: of the e maps; grid, maps: (e, h, w), m; stable: (h, w); drawn: whether the user drew it; site: what measured;
     of_points: the maps are mean differences of points to the known surface, not of two surfaces."""
 
@@ -37,7 +37,7 @@ class Material:
     maps: NDArray[np.float32]
     stable: BoolArray
     drawn: bool
-    site: Site
+    site: SensorSite
     of_points: bool
 
     def windows(self, config: SimulationConfig) -> Windows:
@@ -77,7 +77,7 @@ def _agreed(found: SensorName, wanted: SensorName | None, path: Path) -> SensorN
     return found
 
 
-def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> Material:
+def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> CalibrationInputs:
     """Read the measured maps and find their stable ground. Raises InputError for maps that differ in their grids."""
     measured, names = _maps(paths, config, random)
     _check_noise(measured.maps, names)
@@ -86,7 +86,7 @@ def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: Senso
     areas = config.calibration.stable_areas
     drawn = area_mask(areas, measured.grid) if areas else measured.stable
     stable = _covered(measured.maps, of_points) & (unchanged(list(measured.maps)) if drawn is None else drawn)
-    return Material(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points)
+    return CalibrationInputs(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points)
 
 
 def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) -> tuple[MeasuredMaps, tuple[str, ...]]:
@@ -126,7 +126,7 @@ def _covered(maps: NDArray[np.floating], of_points: bool) -> BoolArray:
     return known.all(axis=0)
 
 
-def _measured_site(measurement: Measurement, config: SimulationConfig) -> Site:
+def _measured_site(measurement: Measurement, config: SimulationConfig) -> SensorSite:
     """The instrument of a measurement in front of its reference surface."""
     sensor: StereoPair | LaserScanner
     if isinstance(measurement, StereoMeasurement):
@@ -134,7 +134,7 @@ def _measured_site(measurement: Measurement, config: SimulationConfig) -> Site:
     else:
         name, sensor = "scanner", _scanner(measurement, config)
     eyes = {name: measurement.viewpoint}
-    return Site("measured", measurement.notes, measurement.reference, measurement.frame, sensor, eyes)
+    return SensorSite("measured", measurement.notes, measurement.reference, measurement.frame, sensor, eyes)
 
 
 def _scanner(measurement: TlsMeasurement, config: SimulationConfig) -> LaserScanner:

@@ -12,7 +12,7 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.registration.register import register_to
 from pipeline.run.acquisition import look, reconstruct
 from pipeline.run.registered import reference_and_target
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.keyed_random import KeyedRandom
@@ -22,7 +22,7 @@ from sensors.model import StereoModel
 from sensors.stereo import StereoPair
 
 
-def with_model(site: Site, model: StereoModel) -> Site:
+def with_model(site: SensorSite, model: StereoModel) -> SensorSite:
     """The site with another model of its pair; InputError for one that is not seen by a simulated stereo pair."""
     if not isinstance(site.sensor, StereoPair):
         raise InputError("noise maps are made of simulated matching", where="matcher", remedy="take the stereo sensor")
@@ -30,7 +30,12 @@ def with_model(site: Site, model: StereoModel) -> Site:
 
 
 def noise_map(
-    config: SimulationConfig, before: Site, after: Site, caster: RayCaster, random: KeyedRandom, grid: Grid | None = None
+    config: SimulationConfig,
+    before: SensorSite,
+    after: SensorSite,
+    caster: RayCaster,
+    random: KeyedRandom,
+    grid: Grid | None = None,
 ) -> NDArray[np.float32]:
     """(h, w) differences, m, of two observations of the untouched wall (`caster`), NaN without data.
 
@@ -47,5 +52,5 @@ def noise_map(
     return difference(surface_raster(reference, grid), surface_raster(later, grid))
 
 
-def _surface(config: SimulationConfig, site: Site, caster: RayCaster, random: KeyedRandom) -> TriangleMesh:
+def _surface(config: SimulationConfig, site: SensorSite, caster: RayCaster, random: KeyedRandom) -> TriangleMesh:
     return reconstruct(config, look(config, site, caster, random))

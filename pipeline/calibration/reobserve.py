@@ -26,7 +26,7 @@ from pipeline.noise.measured import point_differences
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, register_to
 from pipeline.registration.rigid import RigidTransform
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from pipeline.surface.mesh import mesh_observation
 from scene.backend import mi
 from scene.errors import InputError
@@ -91,7 +91,7 @@ class Reobserver:
     simulated cell by cell.
     """
 
-    def __init__(self, config: SimulationConfig, site: Site, windows: Windows, *, of_points: bool = False) -> None:
+    def __init__(self, config: SimulationConfig, site: SensorSite, windows: Windows, *, of_points: bool = False) -> None:
         self.sensor = _checked(config, site)
         self.config, self.site, self.windows, self.of_points = config, site, windows, of_points
         self.caster = RayCaster(site.mesh)
@@ -234,7 +234,7 @@ def _asked(sensor: StereoPair | LaserScanner, model: Model, cells: NDArray[np.ui
     return ChosenCells(**own) if isinstance(sensor, StereoPair) else ChosenPulses(**own)
 
 
-def _checked(config: SimulationConfig, site: Site) -> StereoPair | LaserScanner:
+def _checked(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
     """The sensor, if it can be asked for single cells."""
     if not isinstance(site.sensor, StereoPair | LaserScanner):
         raise InputError("the noise of real matching is its own", where="matcher", allowed="simulated")

@@ -12,7 +12,7 @@ import yaml
 from matplotlib.figure import Figure
 from scipy import stats
 
-from pipeline.calibration.calibrate import Baseline, Calibration
+from pipeline.calibration.calibrate import Baseline, CalibrationResult
 from pipeline.change.difference import statistics
 from pipeline.formats.atomic import write_text
 from pipeline.report.figures import DIFFERENCE_LABEL, DPI, FAMILY, difference_figure, dress, plain_numbers, png_bytes
@@ -35,7 +35,7 @@ class _Table:
     rows: list[list[str]]
 
 
-def summary(result: Calibration) -> str:
+def summary(result: CalibrationResult) -> str:
     """The result in a few lines of text."""
     found = result.found
     lines = [f"{_maps(len(result.epochs))} of a {_INSTRUMENTS[result.sensor]}"]
@@ -45,7 +45,7 @@ def summary(result: Calibration) -> str:
     return "\n".join(lines)
 
 
-def warnings(result: Calibration) -> list[str]:
+def warnings(result: CalibrationResult) -> list[str]:
     """What a reader has to know before using the values."""
     found = result.found
     texts = [
@@ -67,7 +67,7 @@ def warnings(result: Calibration) -> list[str]:
     return texts
 
 
-def pictures(result: Calibration, simulated: FloatArray | None) -> Pictures:
+def pictures(result: CalibrationResult, simulated: FloatArray | None) -> Pictures:
     """All pictures. simulated: (h, w) a map of the whole wall, m, where there is one."""
     material, sigma = result.material, max(statistics(result.windows.cut(result.material.maps[-1])).nmad, 1e-6)
     none = np.zeros(material.grid.shape, dtype=np.int32)
@@ -107,7 +107,7 @@ def pictures(result: Calibration, simulated: FloatArray | None) -> Pictures:
     return shown
 
 
-def write_calibration_report(path: Path, result: Calibration, shown: Pictures, config: Mapping[str, Any]) -> None:
+def write_calibration_report(path: Path, result: CalibrationResult, shown: Pictures, config: Mapping[str, Any]) -> None:
     """Write report.html, whole or not at all."""
     page = template("calibration/report.html.jinja").render(
         title=f"Noise of a {_INSTRUMENTS[result.sensor]}, calibrated",
@@ -124,7 +124,7 @@ def _maps(count: int) -> str:
     return f"{count} difference map{'' if count == 1 else 's'}"
 
 
-def _sentence(result: Calibration) -> str:
+def _sentence(result: CalibrationResult) -> str:
     deviations = [each.size.standard_deviation * 1e3 for each in result.epochs]
     ground = "drawn by the user" if result.material.drawn else "found by the program"
     return (
@@ -134,7 +134,7 @@ def _sentence(result: Calibration) -> str:
     )
 
 
-def _values(result: Calibration) -> list[tuple[str, str]]:
+def _values(result: CalibrationResult) -> list[tuple[str, str]]:
     found = result.found
     columns = (np.exp(each) for each in (found.x, found.low, found.high))
     return [
@@ -143,7 +143,7 @@ def _values(result: Calibration) -> list[tuple[str, str]]:
     ]
 
 
-def _tables(result: Calibration) -> list[_Table]:
+def _tables(result: CalibrationResult) -> list[_Table]:
     names = list(result.parameters.names)
     share = percent(result.confidence, 0)
     tables = [
@@ -168,7 +168,7 @@ def _tables(result: Calibration) -> list[_Table]:
     return tables
 
 
-def _greedy(result: Calibration, baseline: Baseline) -> _Table:
+def _greedy(result: CalibrationResult, baseline: Baseline) -> _Table:
     rows = [["one parameter at a time, by StD", str(baseline.result.tests), f"{baseline.cost:.0f}"]]
     rows += [
         [f"this search, after round {number}", str(maps), f"{cost:.0f}"] for number, (maps, cost) in enumerate(baseline.costs, 1)
@@ -187,7 +187,7 @@ def _signed(value: float) -> str:
     return ("+" if value >= 0 else "") + true_minus(value, 2)
 
 
-def _epochs(result: Calibration) -> _Table:
+def _epochs(result: CalibrationResult) -> _Table:
     rows = []
     for each in result.epochs:
         p = each.normality.p_value
@@ -212,7 +212,7 @@ def _epochs(result: Calibration) -> _Table:
     return _Table(caption, head, rows)
 
 
-def _mosaics(result: Calibration, sigma: float) -> bytes:
+def _mosaics(result: CalibrationResult, sigma: float) -> bytes:
     measured = result.windows.cut(result.material.maps[-1])
     figure = Figure(figsize=(11.0, 5.6), dpi=DPI, layout="constrained")
     for axes, windows, title in zip(figure.subplots(1, 2), (measured, result.predicted), ("Measured", "Simulated"), strict=True):
@@ -237,7 +237,7 @@ def _mosaic(windows: FloatArray) -> FloatArray:
     return picture
 
 
-def _size_and_variogram(result: Calibration) -> bytes:
+def _size_and_variogram(result: CalibrationResult) -> bytes:
     figure = Figure(figsize=(11.0, 4.2), dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
     measured = np.concatenate([result.windows.cut(values).ravel() for values in result.material.maps])
@@ -274,7 +274,7 @@ def _size_and_variogram(result: Calibration) -> bytes:
     return png_bytes(figure)
 
 
-def _statistics(result: Calibration) -> bytes:
+def _statistics(result: CalibrationResult) -> bytes:
     expected, scatter = result.found.surface.mean(result.found.x), np.sqrt(np.diag(result.found.surface.covariance))
     place = np.arange(len(expected))[::-1]
     figure = Figure(figsize=(11.0, 0.2 * len(expected) + 1.0), dpi=DPI, layout="constrained")
@@ -295,7 +295,7 @@ def _in_words(statistic: str) -> str:
     return f"{group}: {name.replace('_', ' ').replace('std', 'StD').replace('nmad', 'NMAD')}"
 
 
-def _over_time(result: Calibration) -> bytes:
+def _over_time(result: CalibrationResult) -> bytes:
     figure = Figure(figsize=(11.0, 3.2), dpi=DPI, layout="constrained")
     for axes, name, label in zip(
         figure.subplots(1, 2), ("median", "standard_deviation"), ("median, mm", "standard deviation, mm"), strict=True

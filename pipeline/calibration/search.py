@@ -59,17 +59,17 @@ Simulate = Callable[[FloatArray, int, KeyedRandom], FloatArray]
 
 
 @dataclass(frozen=True)
-class Sample:
+class Simulations:
     """Simulations: x (n, k) logarithms of the parameters, s (n, m) statistics."""
 
     x: FloatArray
     s: FloatArray
 
-    def with_more(self, other: Sample) -> Sample:
-        return Sample(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
+    def with_more(self, other: Simulations) -> Simulations:
+        return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
-    def at(self, rows: NDArray[Any]) -> Sample:
-        return Sample(self.x[rows], self.s[rows])
+    def at(self, rows: NDArray[Any]) -> Simulations:
+        return Simulations(self.x[rows], self.s[rows])
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Surface:
     whitening: FloatArray
 
     @classmethod
-    def fit(cls, sample: Sample) -> Surface:
+    def fit(cls, sample: Simulations) -> Surface:
         """Least squares over a sample."""
         centre, scale = np.mean(sample.x, axis=0), np.maximum(np.std(sample.x, axis=0), 1e-6)
         design = _design((sample.x - centre) / scale)
@@ -152,7 +152,7 @@ class Found:
         return np.atleast_2d(np.corrcoef(self.errors.T))
 
 
-class Search:
+class NoiseSearch:
     """One search. simulate: see Simulate; epochs: of the measurement; random: keys the simulations by their number.
 
     approached: (m,) statistics of every simulation in its order, with the number of maps simulated up to it.
@@ -211,7 +211,7 @@ class Search:
         size = self._round_size
         generator = np.random.default_rng(self.random.child("sobol").key)
         sobol = stats.qmc.Sobol(len(self.low), rng=generator).random(self._first_size(density))
-        sample = Sample(np.empty((0, len(self.low))), np.empty((0, len(observed))))
+        sample = Simulations(np.empty((0, len(self.low))), np.empty((0, len(observed))))
         points, history = self.low + sobol * (self.high - self.low), []
         for number in range(_APPROACHES):
             with self.progress.stage(f"round {number + 1}"):
@@ -240,7 +240,7 @@ class Search:
         mirrored = np.where(mirrored > self.high, 2 * self.high - mirrored, mirrored)
         return np.clip(mirrored, self.low, self.high)
 
-    def _sample(self, points: FloatArray, epochs: int) -> Sample:
+    def _sample(self, points: FloatArray, epochs: int) -> Simulations:
         """Simulate; points at which the pipeline gives up, as noise leaves nothing to register, drop out."""
         used, found = [], []
         for number, x in enumerate(points):
@@ -253,12 +253,12 @@ class Search:
             self.progress.advance((number + 1) / len(points))
         if len(found) < len(points) / 2:
             raise InputError("most simulations fail", where="calibration", remedy="simulate the site once to see why")
-        return Sample(np.array(used), np.array(found))
+        return Simulations(np.array(used), np.array(found))
 
     def _judged(
         self,
         observed: FloatArray,
-        sample: Sample,
+        sample: Simulations,
         surface: Surface,
         minimum: FloatArray,
         confidence: float,
@@ -285,7 +285,7 @@ class Search:
         return Found(x, low, high, errors, surface, cost, float(np.mean(costs >= cost)), scaled, history, self.maps, settled)
 
 
-def fresh_cost(search: Search, surface: Surface, observed: FloatArray, x: FloatArray, sets: int = 4) -> float:
+def fresh_cost(search: NoiseSearch, surface: Surface, observed: FloatArray, x: FloatArray, sets: int = 4) -> float:
     """The cost of parameters by sets simulated anew: of their mean, less what the sets' own scatter adds."""
     source = replace(search.random, path=(*search.random.path, "fresh"))
     values = search.parameters.values(x)
@@ -299,7 +299,7 @@ def _distance(s: FloatArray, observed: FloatArray) -> FloatArray:
     return np.sqrt(np.mean((s - observed) ** 2, axis=1))
 
 
-def _nearest(surface: Surface, sample: Sample, observed: FloatArray) -> FloatArray:
+def _nearest(surface: Surface, sample: Simulations, observed: FloatArray) -> FloatArray:
     """The parameters of the simulation whose statistics are nearest."""
     return sample.x[np.argmin(np.sum((surface.whitening @ (sample.s - observed).T) ** 2, axis=0))]
 

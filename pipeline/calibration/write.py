@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibration.calibrate import Baseline, Calibration
+from pipeline.calibration.calibrate import Baseline, CalibrationResult
 from pipeline.calibration.maps import noise_map
 from pipeline.calibration.report import pictures, write_calibration_report
 from pipeline.config.simulation import SimulationConfig
@@ -23,14 +23,14 @@ from scene.yaml_text import yaml_line
 MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "report.html"
 
 
-def write(out: Path, config: SimulationConfig, result: Calibration, inputs: Sequence[Path]) -> Path:
+def write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> Path:
     """Write everything; returns the report's path. The folder appears when all of it is there; InputError where it is in use."""
     with filling(out) as folder:
         _write(folder, config, result, inputs)
     return out / REPORT_FILE
 
 
-def _write(out: Path, config: SimulationConfig, result: Calibration, inputs: Sequence[Path]) -> None:
+def _write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> None:
     write_text(out / MODEL_FILE, model_yaml(result))
     write_geotiff(out / "systematic.tif", result.systematic, result.material.grid, description="mean of the measured maps")
     whole = None if result.material.of_points else _whole_map(config, result)
@@ -44,7 +44,7 @@ def _write(out: Path, config: SimulationConfig, result: Calibration, inputs: Seq
     write_calibration_report(out / REPORT_FILE, result, shown, config.model_dump(mode="json"))
 
 
-def _whole_map(config: SimulationConfig, result: Calibration) -> FloatArray:
+def _whole_map(config: SimulationConfig, result: CalibrationResult) -> FloatArray:
     """One map of the whole wall by the whole simulation, on the measured maps' grid, m; NaN where those have no data."""
     site = result.simulated_site()
     random = KeyedRandom(config.seed).child("calibrate", "whole")
@@ -52,7 +52,7 @@ def _whole_map(config: SimulationConfig, result: Calibration) -> FloatArray:
     return np.where(np.isnan(result.material.maps[-1]), np.float32(np.nan), values)
 
 
-def model_yaml(result: Calibration) -> str:
+def model_yaml(result: CalibrationResult) -> str:
     """The calibrated sensor model as `simulate --set sensor=calibrated.yaml` reads it, each fitted value with its interval."""
     found, names = result.found, result.parameters.names
     share = result.confidence
@@ -84,7 +84,7 @@ def _rounded(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def to_dict(result: Calibration) -> dict[str, Any]:
+def to_dict(result: CalibrationResult) -> dict[str, Any]:
     """The result as calibration.json holds it."""
     found, names = result.found, result.parameters.names
     values = zip(names, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True)
@@ -122,7 +122,7 @@ def to_dict(result: Calibration) -> dict[str, Any]:
     }
 
 
-def _baseline(result: Calibration, baseline: Baseline) -> dict[str, Any]:
+def _baseline(result: CalibrationResult, baseline: Baseline) -> dict[str, Any]:
     return {
         "parameters": dict(zip(result.parameters.names, np.exp(baseline.result.x), strict=True)),
         "simulated_maps": baseline.result.tests,

@@ -26,7 +26,7 @@ from pipeline.noise.statistics import (
     Bin,
     DensityHistogram,
     Normality,
-    Tails,
+    TailFigures,
     binned,
     histogram,
     normality,
@@ -51,7 +51,7 @@ _SIZE_CLASSES = 8
 
 
 @dataclass(frozen=True)
-class Noise:
+class MapNoise:
     """The noise of a stack of difference maps over stable ground.
 
     stable: pooled over the epochs; per_epoch; tails, normality, histogram: of all; variogram, model: of the differences within
@@ -60,7 +60,7 @@ class Noise:
 
     stable: DifferenceStatistics
     per_epoch: list[DifferenceStatistics]
-    tails: Tails
+    tails: TailFigures
     normality: Normality
     histogram: DensityHistogram
     variogram: Variogram
@@ -91,7 +91,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class SizeClass:
+class SizeInterval:
     """Blocks whose size (or depth) lies in [low_m, high_m).
 
     interval: 95 %, of the share seen; volume_error, volume_spread: median and NMAD of measured over true volume minus one, None
@@ -121,7 +121,7 @@ class SizeClass:
 
 
 @dataclass(frozen=True)
-class Detection:
+class SeenBlocks:
     """The blocks and how many were seen.
 
     by_size, by_depth: curves over the blocks in view, None for fewer than ten, and classes of them; table: shares seen of them,
@@ -131,8 +131,8 @@ class Detection:
     blocks: list[BlockSeen]
     by_size: DetectionCurve | None
     by_depth: DetectionCurve | None
-    size_classes: list[SizeClass]
-    depth_classes: list[SizeClass]
+    size_classes: list[SizeInterval]
+    depth_classes: list[SizeInterval]
     table: FloatArray
     alarms: int
     trials: int
@@ -153,16 +153,16 @@ class Detection:
 
 
 @dataclass(frozen=True)
-class Assessment:
+class SensorAssessment:
     """All figures of one sensor. wall: errors everywhere, within the niches too; complete: share of the wall with data, mean over
     the epochs; visible: share that the sensor can see; complete_of_visible; by: statistics against each covariate."""
 
     name: str
     sensor: str
-    noise: Noise
+    noise: MapNoise
     wall: DifferenceStatistics
     by: dict[str, list[Bin]]
-    detection: Detection
+    detection: SeenBlocks
     visible: float
     complete: float
     complete_of_visible: float
@@ -190,13 +190,13 @@ class Assessment:
         }
 
 
-def noise_of(stable: Raster, gsd_m: float, random: KeyedRandom) -> Noise:
+def noise_of(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
     """The noise of difference maps (e, h, w), m, NaN where not stable or without data."""
     found = variogram(np.stack([without_outliers(each) for each in stable[:_VARIOGRAM_MAPS]]), gsd_m)
     model = fit_variogram(found)
     known = ~np.isnan(stable[0])
     effective = effective_sample_size(model, known, gsd_m) if known.any() else 0.0
-    return Noise(
+    return MapNoise(
         stable=statistics(stable),
         per_epoch=[statistics(each) for each in stable],
         tails=tails(stable),
@@ -217,7 +217,7 @@ def _cell_px(stable: Raster, gsd_m: float) -> int:
     return min(max(round(_CELL_M / gsd_m), enough), max(stable.shape[1:]))
 
 
-def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> Assessment:
+def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> SensorAssessment:
     """The figures of one sensor of a trial; `random` draws samples, footprints' places and resamples."""
     gsd = trial.grid.gsd
     random = random.child("compare", seen.contestant.name)
@@ -226,7 +226,7 @@ def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> Assessment:
     noise = noise_of(stable, gsd, random)
     data, surface = ~np.isnan(seen.changes), trial.ground.found
     in_view = seen.visible & surface
-    return Assessment(
+    return SensorAssessment(
         name=seen.contestant.name,
         sensor=seen.contestant.sensor,
         noise=noise,
@@ -243,7 +243,7 @@ def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> Assessment:
     )
 
 
-def assess_measured(found: MeasuredMaps, random: KeyedRandom) -> Noise:
+def assess_measured(found: MeasuredMaps, random: KeyedRandom) -> MapNoise:
     """The noise of measured epochs over the stable areas as drawn; where none are, over all but gross differences."""
     stable = (
         np.where(found.stable, found.maps, np.nan)
@@ -280,7 +280,7 @@ def _by_covariates(stable: Raster, trial: Trial, seen: Seen) -> dict[str, list[B
     }
 
 
-def _detection(trial: Trial, seen: Seen, stable: Raster, test: MeanTest, random: KeyedRandom) -> Detection:
+def _detection(trial: Trial, seen: Seen, stable: Raster, test: MeanTest, random: KeyedRandom) -> SeenBlocks:
     blocks: list[BlockSeen] = []
     alarms = trials = 0
     for number, (epoch, change) in enumerate(zip(trial.epochs, seen.changes, strict=True)):
@@ -291,7 +291,7 @@ def _detection(trial: Trial, seen: Seen, stable: Raster, test: MeanTest, random:
     shown = [block for block in blocks if block.in_view]
     size, depth = (np.array([getattr(block, name) for block in shown]) for name in ("size_m", "depth_m"))
     hit = np.array([block.seen for block in shown], dtype=bool)
-    return Detection(
+    return SeenBlocks(
         blocks,
         detection_curve(size, hit),
         detection_curve(depth, hit),
@@ -311,7 +311,7 @@ def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
     return np.geomspace(low, max(high, low * 1.01) * (1 + 1e-9), classes + 1)
 
 
-def size_classes(blocks: list[BlockSeen], values: FloatArray, edges: FloatArray) -> list[SizeClass]:
+def size_classes(blocks: list[BlockSeen], values: FloatArray, edges: FloatArray) -> list[SizeInterval]:
     """The blocks by classes of one of their measures, (k,), m."""
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     return [
@@ -320,12 +320,12 @@ def size_classes(blocks: list[BlockSeen], values: FloatArray, edges: FloatArray)
     ]
 
 
-def _class(low: float, high: float, blocks: list[BlockSeen]) -> SizeClass:
+def _class(low: float, high: float, blocks: list[BlockSeen]) -> SizeInterval:
     seen = sum(block.seen for block in blocks)
     ratio = np.array([block.measured_volume_m3 / block.volume_m3 - 1 for block in blocks if block.volume_m3 > 0])
     size = statistics(ratio)
     error = (size.median, size.nmad) if size.count else (None, None)
-    return SizeClass(low, high, len(blocks), seen, wilson_interval(seen, len(blocks)), *error)
+    return SizeInterval(low, high, len(blocks), seen, wilson_interval(seen, len(blocks)), *error)
 
 
 def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
@@ -336,7 +336,7 @@ def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
     return np.divide(seen, count, out=np.full(count.shape, np.nan), where=count > 0)
 
 
-def shared_scale_m(noises: list[Noise]) -> float:
+def shared_scale_m(noises: list[MapNoise]) -> float:
     """The sigma of a colour scale for all: the largest NMAD over stable ground, so that nobody's noise saturates."""
     return max((each.stable.nmad for each in noises if each.stable.count), default=1e-3) or 1e-3
 

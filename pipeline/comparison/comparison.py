@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.comparison.assess import Assessment, Noise, assess, assess_measured
+from pipeline.comparison.assess import MapNoise, SensorAssessment, assess, assess_measured
 from pipeline.comparison.sensors_compared import Contestant
 from pipeline.comparison.trial import Trial, compare
 from pipeline.noise.measured import MeasuredMaps, read_measured
@@ -20,15 +20,15 @@ _FIGURES_S = 3.0
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparedSensors:
     """A trial with its figures, and measured epochs with theirs. config: the first sensor's, as JSON types."""
 
     trial: Trial
-    found: list[Assessment]
-    measured: list[tuple[MeasuredMaps, Noise]]
+    found: list[SensorAssessment]
+    measured: list[tuple[MeasuredMaps, MapNoise]]
     config: dict[str, Any]
 
-    def noises(self) -> dict[str, Noise]:
+    def noises(self) -> dict[str, MapNoise]:
         """Noise by name, the measured epochs' last."""
         return {each.name: each.noise for each in self.found} | {
             f"{maps.name} (measured)": noise for maps, noise in self.measured
@@ -41,7 +41,7 @@ def compare_sensors(
     epochs: int = 6,
     sizes_m: tuple[float, float] | None = (0.05, 0.8),
     progress: Progress | None = None,
-) -> Comparison:
+) -> ComparedSensors:
     """Compare sensors as `pipeline.comparison.trial.compare` does, and put measured epochs beside them.
 
     measured: folders as `read_measured` takes them, at the first config's GSD and registered by its ICP. They are read first, as
@@ -61,4 +61,4 @@ def compare_sensors(
             progress.advance(number / len(trial.seen))
             found.append(assess(trial, seen, random))
         beside = [(each, assess_measured(each, random)) for each in maps]
-    return Comparison(trial, found, beside, config.model_dump(mode="json"))
+    return ComparedSensors(trial, found, beside, config.model_dump(mode="json"))

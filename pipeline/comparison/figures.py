@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.comparison.assess import Assessment, Noise, SizeClass
+from pipeline.comparison.assess import MapNoise, SensorAssessment, SizeInterval
 from pipeline.comparison.detection_curve import DetectionCurve
 from pipeline.report.figures import (
     COLOURS,
@@ -82,7 +82,7 @@ def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, sign
     return png_bytes(figure)
 
 
-def noise_figure(noises: Mapping[str, Noise]) -> bytes:
+def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
     """Histograms (dashed: normal, of the same median and NMAD), linear and logarithmic, and variograms with their models."""
     figure = Figure(figsize=(_WIDTH_IN, 4.4), dpi=DPI, layout="constrained")
     linear, logarithmic, correlation = figure.subplots(1, 3)
@@ -106,7 +106,7 @@ def noise_figure(noises: Mapping[str, Noise]) -> bytes:
     return png_bytes(figure)
 
 
-def covariate_figure(found: Sequence[Assessment]) -> bytes:
+def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
     """NMAD over stable ground against range, incidence, distance from edges and albedo."""
     figure = Figure(figsize=(_WIDTH_IN, 6.4), dpi=DPI, layout="constrained")
     panels = figure.subplots(2, 2, sharey=True).ravel()
@@ -126,7 +126,7 @@ def covariate_figure(found: Sequence[Assessment]) -> bytes:
     return png_bytes(figure)
 
 
-def detection_figure(found: Sequence[Assessment]) -> bytes:
+def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
     """Share of blocks seen against size and depth (points: classes with 95 % intervals; lines: the curve), and volume errors.
 
     The latter for classes of which at least half are seen: below, noise is as large as the volume.
@@ -157,7 +157,7 @@ def detection_figure(found: Sequence[Assessment]) -> bytes:
     return png_bytes(figure)
 
 
-def table_figure(found: Sequence[Assessment]) -> bytes:
+def table_figure(found: Sequence[SensorAssessment]) -> bytes:
     """Share of blocks seen by size and depth, one panel a sensor; white: no such block."""
     figure = Figure(figsize=(_WIDTH_IN, 4.0), dpi=DPI, layout="constrained")
     row = np.atleast_1d(figure.subplots(1, len(found), sharey=True))
@@ -180,13 +180,15 @@ def scale_limit_m(sigma_m: float) -> float:
     return SCALE_SIGMAS * sigma_m
 
 
-def level_limit_m(noises: Sequence[Noise]) -> float:
+def level_limit_m(noises: Sequence[MapNoise]) -> float:
     """Where the colours of levels of detection end, m: at the 98 % quantile of the noisiest."""
     tops = [float(np.nanquantile(noise.level, 0.98)) for noise in noises if np.isfinite(noise.level).any()]
     return max(tops, default=1e-3) or 1e-3
 
 
-def _shares(axes: Axes, classes: Sequence[SizeClass], curve: DetectionCurve | None, colour: str, shift: float, name: str) -> None:
+def _shares(
+    axes: Axes, classes: Sequence[SizeInterval], curve: DetectionCurve | None, colour: str, shift: float, name: str
+) -> None:
     shown = [item for item in classes if item.blocks]
     middle = np.array([np.sqrt(item.low_m * item.high_m) * shift for item in shown])
     share = np.array([100 * item.seen / item.blocks for item in shown])

@@ -10,8 +10,8 @@ from typing import Any
 
 import yaml
 
-from pipeline.comparison.assess import Assessment, grid_record, shared_scale_m
-from pipeline.comparison.comparison import Comparison
+from pipeline.comparison.assess import SensorAssessment, grid_record, shared_scale_m
+from pipeline.comparison.comparison import ComparedSensors
 from pipeline.comparison.detection_curve import LEAST_BLOCKS, DetectionCurve
 from pipeline.comparison.figures import (
     MapPanel,
@@ -36,14 +36,14 @@ COMPARISON_FILE = "comparison.json"
 _NOTHING = "\N{EN DASH}"
 
 
-def write_comparison(out: Path, comparison: Comparison) -> Path:
+def write_comparison(out: Path, comparison: ComparedSensors) -> Path:
     """Write everything; returns the report's path. The folder appears when all of it is there."""
     with filling(out) as folder:
         _write(folder, comparison)
     return out / "report.html"
 
 
-def _write(out: Path, comparison: Comparison) -> None:
+def _write(out: Path, comparison: ComparedSensors) -> None:
     trial, found = comparison.trial, comparison.found
     sizes = _write_products(out, comparison)
     write_csv(out / "noise.csv", _noise_rows(comparison))
@@ -80,7 +80,7 @@ def _write(out: Path, comparison: Comparison) -> None:
     write_text(out / "report.html", page)
 
 
-def answer(found: Assessment) -> str:
+def answer(found: SensorAssessment) -> str:
     """The sentence that people ask for: the smallest block that a sensor sees in 95 % of cases, and from which blocks."""
     curve = found.detection.by_size
     if curve is None:
@@ -124,7 +124,7 @@ def _cm(size_m: float) -> str:
     return f"{100 * size_m:.1f} cm"
 
 
-def summary(comparison: Comparison) -> str:
+def summary(comparison: ComparedSensors) -> str:
     """The main figures as lines of text."""
     steps = [(seen.contestant.name, seen.contestant.angular_step_rad) for seen in comparison.trial.seen]
     lines = [f"{name}: angular step {_step(step)}" for name, step in steps if step is not None]
@@ -144,7 +144,7 @@ def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     write_text(path, text.getvalue())
 
 
-def _write_products(out: Path, comparison: Comparison) -> dict[str, dict[str, int]]:
+def _write_products(out: Path, comparison: ComparedSensors) -> dict[str, dict[str, int]]:
     """Write maps, level of detection and the reference's points of each sensor; returns files' sizes by sensor, bytes."""
     trial, sizes = comparison.trial, {}
     for seen, each in zip(trial.seen, comparison.found, strict=True):
@@ -163,7 +163,7 @@ def _shown(trial: Trial) -> int:
     return trial.epochs[len(trial.epochs) // 2].number
 
 
-def pictures(comparison: Comparison) -> dict[str, bytes]:
+def pictures(comparison: ComparedSensors) -> dict[str, bytes]:
     """The report's pictures as PNG, by the names of their files."""
     trial, found, noises = comparison.trial, comparison.found, comparison.noises()
     number = _shown(trial)
@@ -186,7 +186,7 @@ def pictures(comparison: Comparison) -> dict[str, bytes]:
     }
 
 
-def _rows(comparison: Comparison, sizes: Mapping[str, Mapping[str, int]]) -> list[tuple[str, list[str]]]:
+def _rows(comparison: ComparedSensors, sizes: Mapping[str, Mapping[str, int]]) -> list[tuple[str, list[str]]]:
     """The table of the report: a title and one text a sensor, the measured epochs last."""
     noises, found = list(comparison.noises().values()), comparison.found
     blank = [_NOTHING] * len(comparison.measured)
@@ -241,12 +241,12 @@ def _step(step_rad: tuple[float, float] | None) -> str:
     return _NOTHING if step_rad is None else " by ".join(f"{1e3 * step:.3g}" for step in step_rad) + " mrad"
 
 
-def _share(found: Assessment, field: str) -> str:
+def _share(found: SensorAssessment, field: str) -> str:
     """How many of the blocks have a field set."""
     return f"{sum(getattr(block, field) for block in found.detection.blocks)} of {len(found.detection.blocks)}"
 
 
-def _noise_rows(comparison: Comparison) -> Iterable[dict[str, Any]]:
+def _noise_rows(comparison: ComparedSensors) -> Iterable[dict[str, Any]]:
     for name, noise in comparison.noises().items():
         for number, each in enumerate([noise.stable, *noise.per_epoch]):
             yield {
@@ -259,13 +259,13 @@ def _noise_rows(comparison: Comparison) -> Iterable[dict[str, Any]]:
             }
 
 
-def _covariate_rows(found: Sequence[Assessment]) -> Iterable[dict[str, Any]]:
+def _covariate_rows(found: Sequence[SensorAssessment]) -> Iterable[dict[str, Any]]:
     for each in found:
         for name, bins in each.by.items():
             yield from ({"sensor": each.name, "covariate": name, **item.to_dict()} for item in bins)
 
 
-def _class_rows(found: Sequence[Assessment]) -> Iterable[dict[str, Any]]:
+def _class_rows(found: Sequence[SensorAssessment]) -> Iterable[dict[str, Any]]:
     for each in found:
         for name, classes in (("size", each.detection.size_classes), ("depth", each.detection.depth_classes)):
             yield from ({"sensor": each.name, "by": name, **item.to_dict()} for item in classes)

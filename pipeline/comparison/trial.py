@@ -23,7 +23,7 @@ from pipeline.report.progress import Progress
 from pipeline.run.acquisition import Look, look, reconstruct
 from pipeline.run.epoch import as_observed
 from pipeline.run.registered import reference_and_target, reference_sensor
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.blocks import RockfallConfig, place_blocks
 from scene.carve import carve, carved_records
 from scene.distributions import Gaussian
@@ -62,7 +62,7 @@ class Seen:
     first look; range_m, incidence_rad, visible: (h, w) of the untouched wall."""
 
     contestant: Contestant
-    site: Site
+    site: SensorSite
     changes: Raster
     points: tuple[int, ...]
     seconds: tuple[float, ...]
@@ -106,7 +106,7 @@ def compare(
     runs = []
     for each, site in zip(sensors, sites, strict=True):
         with progress.stage(f"{each.name}: epoch 0"):
-            runs.append(_Run(each, site, caster, grid, random))
+            runs.append(_SensorRun(each, site, caster, grid, random))
     truths = []
     for number, rockfall in zip(numbers, rockfalls(config.rockfall, sites[0].mesh.bounds, epochs, sizes_m), strict=True):
         keyed = random.child("epoch", number)
@@ -138,7 +138,7 @@ def rockfalls(
     return result
 
 
-def _check_one_frame(sensors: Sequence[Contestant], sites: Sequence[Site]) -> None:
+def _check_one_frame(sensors: Sequence[Contestant], sites: Sequence[SensorSite]) -> None:
     for each, site in zip(sensors, sites, strict=True):
         if not np.allclose(site.frame.matrix, sites[0].frame.matrix, atol=1e-9):
             raise InputError(
@@ -157,10 +157,10 @@ def _true_epoch(number: int, records: list[dict[str, Any]], before: SurfaceRaste
     return TrueEpoch(number, records, after.block, change, distance > reach)
 
 
-class _Run:
+class _SensorRun:
     """One sensor's observations, epoch by epoch."""
 
-    def __init__(self, contestant: Contestant, site: Site, caster: RayCaster, grid: Grid, random: KeyedRandom) -> None:
+    def __init__(self, contestant: Contestant, site: SensorSite, caster: RayCaster, grid: Grid, random: KeyedRandom) -> None:
         self.contestant, self.site, self.config = contestant, site, contestant.config
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, f"{contestant.name}: {where}")

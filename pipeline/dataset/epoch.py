@@ -25,8 +25,8 @@ from pipeline.dataset.plan import (
     simulation_of,
 )
 from pipeline.report.progress import Progress
-from pipeline.run.epoch import Epoch, Reference, observe_epoch, observe_reference
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.epoch import LaterEpoch, ReferenceEpoch, observe_epoch, observe_reference
+from pipeline.run.site import SensorSite, prepare_site
 from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import WALL
@@ -36,12 +36,12 @@ _DRAWS = 5
 
 
 @dataclass(frozen=True)
-class Stage:
+class EpochStage:
     """What the epochs of one wall, sensor, noise and reference share. true: raster of the untouched wall, on request; spacing_m:
     of ray-traced samples on the wall, None of a surface of the wall's own vertices."""
 
-    site: Site
-    reference: Reference
+    site: SensorSite
+    reference: ReferenceEpoch
     spacing_m: float | None
     true: SurfaceRaster | None
 
@@ -72,11 +72,11 @@ class Stages:
 
     def __init__(self, config: DatasetConfig) -> None:
         self._config = config
-        self._kept: Stage | None = None
+        self._kept: EpochStage | None = None
         self._key: object = None
         self.made = 0
 
-    def of(self, epoch: PlannedEpoch, progress: Progress) -> Stage:
+    def of(self, epoch: PlannedEpoch, progress: Progress) -> EpochStage:
         """The stage of an epoch; a new one takes the place of the last."""
         if self._kept is None or self._key != epoch.stage:
             self._kept = None  # before the new one is made, so that there are never two
@@ -85,7 +85,7 @@ class Stages:
         return self._kept
 
 
-def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> Stage:
+def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> EpochStage:
     simulation = simulation_of(config, epoch)
     with progress.stage("wall"):
         site = prepare_site(simulation, epoch.sensor, random_of_wall(config, epoch.wall))
@@ -94,7 +94,7 @@ def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> S
     grid, samples = reference.raster.grid, len(reference.surface.vertices)
     by_vertices = reference.seen is not None and reference.seen.vertices is not None
     spacing = None if by_vertices else float(np.sqrt(grid.width * grid.height / samples) * grid.gsd)
-    return Stage(site, replace(reference, seen=None), spacing, true)
+    return EpochStage(site, replace(reference, seen=None), spacing, true)
 
 
 def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progress: Progress) -> MadeEpoch:
@@ -136,8 +136,8 @@ def no_tile(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np.float
 
 
 def _observed(
-    config: DatasetConfig, simulation: SimulationConfig, epoch: PlannedEpoch, stage: Stage, progress: Progress
-) -> tuple[Epoch, int]:
+    config: DatasetConfig, simulation: SimulationConfig, epoch: PlannedEpoch, stage: EpochStage, progress: Progress
+) -> tuple[LaterEpoch, int]:
     """The epoch, and the draw that it came from: where blocks find no room all are drawn anew, a few times."""
     for draw in range(1, _DRAWS + 1):
         try:
@@ -153,12 +153,12 @@ def with_count(simulation: SimulationConfig, count: int) -> SimulationConfig:
     return simulation.model_copy(update={"rockfall": simulation.rockfall.model_copy(update={"count": count})})
 
 
-def true_difference(wall: SurfaceRaster, epoch: Epoch) -> NDArray[np.float32]:
+def true_difference(wall: SurfaceRaster, epoch: LaterEpoch) -> NDArray[np.float32]:
     """(h, w) m, NaN where there is no wall: the wall before minus the wall after, without any sensor."""
     return difference(wall, surface_raster(epoch.carved.mesh, wall.grid))
 
 
-def _cut(config: DatasetConfig, epoch: Epoch, grid: Grid, truth: NDArray[np.float32] | None) -> Iterator[EpochTile]:
+def _cut(config: DatasetConfig, epoch: LaterEpoch, grid: Grid, truth: NDArray[np.float32] | None) -> Iterator[EpochTile]:
     labels = np.where(np.isnan(epoch.difference), np.int32(WALL), epoch.raster.block)
     whole = np.bincount(labels.ravel(), minlength=len(epoch.blocks) + 1)
     size = config.tiles.size_px
@@ -191,7 +191,7 @@ def _described(
     }
 
 
-def _record(config: DatasetConfig, epoch: PlannedEpoch, found: Epoch, simulation: SimulationConfig) -> dict[str, Any]:
+def _record(config: DatasetConfig, epoch: PlannedEpoch, found: LaterEpoch, simulation: SimulationConfig) -> dict[str, Any]:
     return {
         "epoch": epoch.to_dict(),
         "seed": config.seed,

@@ -60,13 +60,13 @@ class _DatasetFile(BaseModel):
         return self
 
 
-class _Image(BaseModel):
+class _ShardImage(BaseModel):
     file_name: str
     truth_file_name: str = ""
 
 
 class _Tile(BaseModel):
-    image: _Image
+    image: _ShardImage
     sha256: str
     truth_sha256: str | None
     annotations: list[dict[str, Any]]

@@ -33,7 +33,7 @@ class CellStatistics:
 
 
 @dataclass(frozen=True)
-class Sample:
+class ShownTile:
     """A tile to show. file: relative to the set's folder; record: its entry in the shard."""
 
     cell: Cell
@@ -47,7 +47,7 @@ class SetStatistics:
 
     def __init__(self) -> None:
         self.cells: dict[Cell, CellStatistics] = defaultdict(CellStatistics)
-        self.samples: dict[tuple[str, str, str], Sample] = {}
+        self.samples: dict[tuple[str, str, str], ShownTile] = {}
         self.seeds: set[int] = set()
         self.spacing_m: dict[tuple[str, str], float] = {}
         self.smallest_m: dict[tuple[str, str], float] = {}
@@ -75,7 +75,7 @@ class SetStatistics:
         shown = key[1], key[3], key[4]
         if shown not in self.samples:
             tile = max(record["tiles"], key=lambda each: (len(each["annotations"]), each["image"]["file_name"]))
-            self.samples[shown] = Sample(key, f"{epoch['split']}/{tile['image']['file_name']}", tile, noise or 1e-3)
+            self.samples[shown] = ShownTile(key, f"{epoch['split']}/{tile['image']['file_name']}", tile, noise or 1e-3)
 
     def _compare_spacing(self, place: tuple[str, str], spacing_m: float, annotations: list[dict[str, Any]]) -> None:
         self.spacing_m[place] = max(spacing_m, self.spacing_m.get(place, 0.0))

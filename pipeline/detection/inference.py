@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.detection.detections import Detection, cropped
 from pipeline.detection.normalisation import nmad, normalised
-from pipeline.detection.seams import Part, Tile, part, without_seams
+from pipeline.detection.seams import BlockPart, MapTile, part, without_seams
 
 _BATCH = 4
 
@@ -24,8 +24,8 @@ def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0
     """
     size = model.size
     noise = nmad(difference)
-    parts: list[Part] = []
-    tiles = [Tile(row, column, size, difference.shape) for row, column in tile_places(difference.shape, size)]
+    parts: list[BlockPart] = []
+    tiles = [MapTile(row, column, size, difference.shape) for row, column in tile_places(difference.shape, size)]
     for first in range(0, len(tiles), _BATCH):
         group = tiles[first : first + _BATCH]
         images = [normalised(_pixels(difference, tile), model.config.normalisation, noise) for tile in group]
@@ -68,14 +68,14 @@ def _starts(length: int, size: int) -> list[int]:
     return [round(number * (length - size) / (count - 1)) for number in range(count)]
 
 
-def _pixels(difference: NDArray[np.float32], tile: Tile) -> NDArray[np.float32]:
+def _pixels(difference: NDArray[np.float32], tile: MapTile) -> NDArray[np.float32]:
     """(size, size) what the tile shows, NaN beyond the map."""
     cut = difference[tile.row : tile.row + tile.size, tile.column : tile.column + tile.size]
     missing = [(0, tile.size - length) for length in cut.shape]
     return np.pad(cut, missing, constant_values=np.nan)
 
 
-def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, tile: Tile) -> Iterator[Detection]:
+def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, tile: MapTile) -> Iterator[Detection]:
     """What the network found in the tile, in the map's frame."""
     top, bottom, left, right = tile.bounds
     for box, score, mask in zip(answer["boxes"], answer["scores"], answer["masks"], strict=True):

@@ -19,7 +19,7 @@ _MARGIN = 16
 
 
 @dataclass(frozen=True)
-class Tile:
+class MapTile:
     """A square of a map. row, column: its first pixel in the map; size: its side, px; shape: of the map."""
 
     row: int
@@ -48,15 +48,15 @@ class Border:
 
 
 @dataclass(frozen=True)
-class Part:
+class BlockPart:
     """What one tile shows of a block. item: in the map's frame; cuts: the tile's borders that may have cut it."""
 
     item: Detection
-    tile: Tile
+    tile: MapTile
     cuts: tuple[Border, ...]
 
 
-def part(item: Detection, tile: Tile) -> Part:
+def part(item: Detection, tile: MapTile) -> BlockPart:
     """A detection in the map's frame, with the borders of the tile that it comes near to."""
     margin = tile.size // _MARGIN
     cuts = []
@@ -66,10 +66,10 @@ def part(item: Detection, tile: Tile) -> Part:
             cuts.append(Border(axis, begin, -1))
         if end < tile.shape[axis] and last >= end - margin:
             cuts.append(Border(axis, end, 1))
-    return Part(item, tile, tuple(cuts))
+    return BlockPart(item, tile, tuple(cuts))
 
 
-def without_seams(parts: Sequence[Part]) -> list[Detection]:
+def without_seams(parts: Sequence[BlockPart]) -> list[Detection]:
     """The blocks of which the tiles show the parts, each once, best first.
 
     Parts that a border may have cut are put together with those of other tiles that agree with them where both see. Where a tile
@@ -81,7 +81,7 @@ def without_seams(parts: Sequence[Part]) -> list[Detection]:
     return without_doubles([*whole, *not_mostly_in(joined, whole)])
 
 
-def _joined(parts: Sequence[Part]) -> Detection | None:
+def _joined(parts: Sequence[BlockPart]) -> Detection | None:
     """The parts of one block as one, None where a tile sees it whole and denies it."""
     item = united([each.item for each in parts])
     ends = [cut for each in parts for cut in each.cuts if not cut.passed_by(item)]
@@ -90,7 +90,7 @@ def _joined(parts: Sequence[Part]) -> Detection | None:
     return None if any(item.mask.shape[end.axis] < seen_whole for end in ends) else item
 
 
-def _groups(parts: Sequence[Part]) -> list[list[Part]]:
+def _groups(parts: Sequence[BlockPart]) -> list[list[BlockPart]]:
     """The parts by the block that they are of: linked, directly or through others, by what they agree on."""
     bounds = np.array([each.item.bounds for each in parts]).reshape(-1, 4)
     group = np.arange(len(parts))
@@ -101,7 +101,7 @@ def _groups(parts: Sequence[Part]) -> list[list[Part]]:
     return [[parts[index] for index in np.flatnonzero(group == label).tolist()] for label in np.unique(group)]
 
 
-def _agree(one: Part, other: Part) -> bool:
+def _agree(one: BlockPart, other: BlockPart) -> bool:
     """Whether they come from two tiles and show the same where both tiles see."""
     if one.tile == other.tile:
         return False

@@ -31,7 +31,7 @@ _STATE, _OPTIMIZER = "state.json", "optimizer.npz"
 _NO_CHECKPOINT = "train anew, with another --out"
 
 
-class _State(Config):
+class _TrainingState(Config):
     """state.json of a checkpoint: the names of its files, and the losses of the epochs before it."""
 
     weights: str
@@ -133,7 +133,7 @@ def _begun(out: Path, config: TrainConfig, model: MaskRCNN, *, resume: bool) -> 
         raise InputError(
             "holds a training already", where=str(out), remedy="add --resume to go on with it, or choose another --out"
         )
-    state = parse(_State, read_json(path, remedy=_NO_CHECKPOINT), str(path))
+    state = parse(_TrainingState, read_json(path, remedy=_NO_CHECKPOINT), str(path))
     if state.config != config.model_dump(mode="json"):
         raise InputError("holds a training with another config", where=str(out), remedy="use its config, or choose another --out")
     try:

@@ -16,7 +16,7 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 from pipeline.change.areas import Area, in_areas
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import read_cameras_yaml
-from pipeline.formats.measurement_checks import Fit, Sweep, check_frame, check_inside, check_pulses, finite
+from pipeline.formats.measurement_checks import PointFit, Sweep, check_frame, check_inside, check_pulses, finite
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
@@ -178,9 +178,9 @@ class MeasurementBase(ABC):
         """(3,) where the rays begin, wall frame, m: the scanner's centre, the left camera's."""
 
     @property
-    def fit(self) -> Fit:
+    def fit(self) -> PointFit:
         """How the points lie against the reference."""
-        return Fit.of(self.cloud.points, self.viewpoint, self.scene)
+        return PointFit.of(self.cloud.points, self.viewpoint, self.scene)
 
     def changed(self, **values: Any) -> Self:
         """The same with other points, cameras or pose, in front of the same ray caster."""

@@ -33,7 +33,7 @@ _LEAST_SIGMA = {"tls": (1e-6, "m", "range_sigma_m"), "stereo": (2e-4, "px", "par
 
 
 @dataclass(frozen=True)
-class Fit:
+class PointFit:
     """How a sample of the points lies against the reference. hits: share whose rays meet it; near: of these, share near it;
     off_m: median distance behind it along the rays (negative: before it), NaN without hits."""
 
@@ -42,7 +42,7 @@ class Fit:
     off_m: float
 
     @classmethod
-    def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster) -> Fit:
+    def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster) -> PointFit:
         """points: (n, 3), origin: (3,) of the rays; wall frame, m."""
         away = points[:: max(len(points) // _SAMPLE, 1)] - origin
         length = np.linalg.norm(away, axis=1)
@@ -76,7 +76,7 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
     return cloud if keep.all() else cloud.part(keep)
 
 
-def check_frame(here: Fit, other: Fit | None, frame: str, where: str) -> None:
+def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) -> None:
     """Raise InputError where the points do not look at the reference, naming the frame in which they would.
 
     here: in the frame that the file names, other: in the one that it does not.
@@ -93,7 +93,7 @@ def check_frame(here: Fit, other: Fit | None, frame: str, where: str) -> None:
         raise InputError(problem, where=where, allowed=f"{100 * _FEWEST_HITS:g} % and more", remedy=remedy)
 
 
-def check_near(here: Fit) -> None:
+def check_near(here: PointFit) -> None:
     """Raise InputError where most points lie far from the reference, so that no pose or effect explains it."""
     if here.good:
         return

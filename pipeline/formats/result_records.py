@@ -42,7 +42,7 @@ class _Block(_Record):
     measured_mean_depth_m: float | None
 
 
-class _Epoch(_Record):
+class _EpochRecord(_Record):
     epoch: int = Field(ge=0, le=9999)
     registration: _Registration | None = None
     statistics: _Statistics | None = None
@@ -53,13 +53,13 @@ class _Wall(_Record):
     name: str
 
 
-class _Run(_Record):
+class _RunRecord(_Record):
     """schema: of the file; products: checksums of each finished epoch's files."""
 
     sensor: Literal["stereo", "tls"]
     config: dict[str, Any]
     wall: _Wall | None = None
-    epochs: list[_Epoch] = Field([], max_length=10_000)
+    epochs: list[_EpochRecord] = Field([], max_length=10_000)
     products: dict[Annotated[str, StringConstraints(pattern=r"^epoch_\d+$")], dict[str, str]] = {}
 
 
@@ -77,7 +77,7 @@ class _Gap(_Record):
 def read_run(path: Path, remedy: str) -> dict[str, Any]:
     """The record of a run, finished or not. Raises InputError, which ends with `remedy`, for a file that is none."""
     values = read_json(path, remedy=remedy)
-    parse(_Run, values, str(path))
+    parse(_RunRecord, values, str(path))
     return dict(values)
 
 

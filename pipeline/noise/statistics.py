@@ -28,7 +28,7 @@ _MOST_SAMPLE = 5000
 
 
 @dataclass(frozen=True)
-class Tails:
+class TailFigures:
     """What the tails hold, of n differences, m.
 
     quantile_025_m ... quantile_975_m: quantiles at 2.5, 25, 75 and 97.5 %; skewness, excess_kurtosis: 0 for a normal
@@ -49,18 +49,18 @@ class Tails:
         return {name: None if np.isnan(value) else value for name, value in dataclasses.asdict(self).items()}
 
 
-def tails(values: NDArray[np.floating]) -> Tails:
+def tails(values: NDArray[np.floating]) -> TailFigures:
     """The tails of the values (any shape, m) that are not NaN; all NaN where there are none."""
     known = values[~np.isnan(values)].astype(np.float64)
     if known.size == 0:
-        return Tails(*[float("nan")] * 8)
+        return TailFigures(*[float("nan")] * 8)
     size = statistics(known)
     spread = size.standard_deviation
     skewness = float(np.mean(((known - size.mean) / spread) ** 3)) if spread else 0.0
     kurtosis = float(np.mean(((known - size.mean) / spread) ** 4)) - 3.0 if spread else 0.0
     low, lower, upper, high = np.quantile(known, [0.025, 0.25, 0.75, 0.975]).tolist()
     beyond = float(np.mean(np.abs(known - size.median) > 3 * size.nmad))
-    return Tails(low, lower, upper, high, skewness, kurtosis, beyond, float(np.abs(known).max()))
+    return TailFigures(low, lower, upper, high, skewness, kurtosis, beyond, float(np.abs(known).max()))
 
 
 @dataclass(frozen=True)

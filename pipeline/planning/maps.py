@@ -20,7 +20,7 @@ from pipeline.precision.detectability import (
     smallest_findable,
 )
 from pipeline.precision.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
@@ -125,7 +125,7 @@ class Plan:
         }
 
 
-def plans(config: SimulationConfig, site: Site) -> list[Plan]:
+def plans(config: SimulationConfig, site: SensorSite) -> list[Plan]:
     """Map what the sensor of `site` promises; of several stations, what they promise together and then one by one.
 
     The rock is as wet as the config says. Raises InputError where the sensor, or one of its stations, sees nothing of the wall.

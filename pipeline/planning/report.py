@@ -34,7 +34,7 @@ _FIGURES: dict[str, tuple[str, str, float]] = {
 
 
 @dataclass(frozen=True)
-class _Row:
+class _PlanRow:
     title: str
     unit: str
     values: list[str]
@@ -56,7 +56,7 @@ class _Part:
     instrument: str
     answer: str
     figures: list[tuple[str, str]]
-    rows: list[_Row]
+    rows: list[_PlanRow]
     ignored: str
     curves: bytes | None
     pictures: list[_Picture]
@@ -116,9 +116,9 @@ def _figures(plan: Plan) -> list[tuple[str, str]]:
     return [(title, f"{value * factor:.3g} {unit}") for title, unit, factor, value in entries]
 
 
-def _rows(plan: Plan) -> list[_Row]:
+def _rows(plan: Plan) -> list[_PlanRow]:
     middle = plan.middle()
-    return [_Row(found.title, found.unit, _values(found, found.summary(middle))) for found in plan.maps]
+    return [_PlanRow(found.title, found.unit, _values(found, found.summary(middle))) for found in plan.maps]
 
 
 def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:

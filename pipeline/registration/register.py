@@ -224,9 +224,9 @@ def register_to(
     normals = _normals(surface, config)
     moving = checked_cloud(moving, "moving points")
     if threads == 1:  # a pool of one thread would only cost the hand-over
-        return _Search(surface, normals, moving, config, map).run(random)
+        return _Alignment(surface, normals, moving, config, map).run(random)
     with _executor(threads) as executor:
-        return _Search(surface, normals, moving, config, executor.map).run(random)
+        return _Alignment(surface, normals, moving, config, executor.map).run(random)
 
 
 def fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, threads: int | None = None) -> Fit:
@@ -268,7 +268,7 @@ class _Step:
     undetermined: int = 0
 
 
-class _Search:
+class _Alignment:
     """One registration: the moving points about their centroid, coarse to fine."""
 
     def __init__(

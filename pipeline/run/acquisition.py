@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipeline.config.simulation import SimulationConfig
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from pipeline.surface.depth_maps import DepthMap
 from pipeline.surface.mesh import mesh_observation
 from pipeline.surface.reconstruct import colmap_surface
@@ -41,7 +41,7 @@ class Look:
         return (self.observation,) if self.joined is None else self.joined.observations
 
 
-def look(config: SimulationConfig, site: Site, scene: RayCaster, random: KeyedRandom) -> Look:
+def look(config: SimulationConfig, site: SensorSite, scene: RayCaster, random: KeyedRandom) -> Look:
     """Observe `scene`; the right depth map costs a second observation and is made only where it is needed.
 
     Raises InputError where a laser scanner's points should be reconstructed by COLMAP, or any but simulated ones by vertices.
@@ -80,7 +80,7 @@ def reconstruct(config: SimulationConfig, seen: Look) -> TriangleMesh:
 
 
 def _join_stations(
-    config: SimulationConfig, site: Site, scene: RayCaster, first: Observation, random: KeyedRandom
+    config: SimulationConfig, site: SensorSite, scene: RayCaster, first: Observation, random: KeyedRandom
 ) -> Joined | None:
     """Observe from the further stations of a laser scanner, if there are any, and join all."""
     if not (isinstance(site.sensor, LaserScanner) and site.further_stations):

@@ -18,7 +18,7 @@ from pipeline.report.progress import Progress
 from pipeline.run.acquisition import Look, look, reconstruct
 from pipeline.run.displacement import displacement
 from pipeline.run.registered import reference_and_target, reference_sensor
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from scene.blocks import Blocks, place_blocks
 from scene.carve import Carved, carve, carved_records
 from scene.keyed_random import KeyedRandom
@@ -28,7 +28,7 @@ from sensors.placement import check_in_front
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceEpoch:
     """The first epoch, of the untouched wall: all later ones are compared with it.
 
     seen: what the sensor saw, None once it is written, which spares its memory; caster: the untouched wall; surface:
@@ -44,7 +44,7 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Epoch:
+class LaterEpoch:
     """A later epoch.
 
     seen: what the sensor saw; solids: the blocks; blocks: records of what was carved, with what the difference map shows of each;
@@ -69,7 +69,7 @@ STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "differenc
 """The stages of an epoch and their rough weights for the time left."""
 
 
-def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom, progress: Progress) -> Reference:
+def observe_reference(config: SimulationConfig, site: SensorSite, random: KeyedRandom, progress: Progress) -> ReferenceEpoch:
     """Observe the untouched wall, reconstruct and rasterise it; `random` is the run's."""
     with progress.stage("epoch 0: observe"):
         caster = RayCaster(as_observed(config, site.mesh))
@@ -81,12 +81,12 @@ def observe_reference(config: SimulationConfig, site: Site, random: KeyedRandom,
         surface, target = reference_and_target(config, found, caster.mesh, keyed)
     with progress.stage("epoch 0: difference"):
         raster = surface_raster(surface, raster_grid(surface.bounds, config.difference))
-    return Reference(seen, caster, surface, raster, target)
+    return ReferenceEpoch(seen, caster, surface, raster, target)
 
 
 def observe_epoch(
-    config: SimulationConfig, site: Site, reference: Reference, number: int, random: KeyedRandom, progress: Progress
-) -> Epoch:
+    config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, number: int, random: KeyedRandom, progress: Progress
+) -> LaterEpoch:
     """Carve blocks from the untouched wall, observe it and compare with the reference.
 
     A pure function of config, site and (seed, number): the result does not depend on other epochs.
@@ -122,7 +122,7 @@ def observe_epoch(
         {**record, "world_position_m": to_world(site, record["position_m"]), **values}
         for record, values in zip(records, measured, strict=True)
     ]
-    return Epoch(number, seen, carved, blocks, found, surface, registration, raster, change, statistics, clouds)
+    return LaterEpoch(number, seen, carved, blocks, found, surface, registration, raster, change, statistics, clouds)
 
 
 def as_observed(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:
@@ -153,7 +153,7 @@ def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: Fl
     ]
 
 
-def to_world(site: Site, position: list[float]) -> list[float]:
+def to_world(site: SensorSite, position: list[float]) -> list[float]:
     """A wall-frame position, m, in the wall's own (world) coordinates."""
     world: FloatArray = site.frame.to_world(np.array(position))
     return world.tolist()

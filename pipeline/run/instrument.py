@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.report.page import true_minus
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from scene.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.exchanged import StereoSensor, pair_of
@@ -21,13 +21,13 @@ _ARCSEC = np.degrees(1.0) * 3600
 _ONE_SIGMA = "(1 \N{GREEK SMALL LETTER SIGMA})"
 
 
-def instrument_figures(site: Site) -> dict[str, str]:
+def instrument_figures(site: SensorSite) -> dict[str, str]:
     """Name to value, with its unit, of what a reader looks for first: which sensor saw the wall, from where, how well."""
     own = _scanner_figures(site.sensor, site) if isinstance(site.sensor, LaserScanner) else _pair_figures(site.sensor, site)
     return {**own, **_places(site)}
 
 
-def _scanner_figures(scanner: LaserScanner, site: Site) -> dict[str, str]:
+def _scanner_figures(scanner: LaserScanner, site: SensorSite) -> dict[str, str]:
     config, noise = scanner.config, scanner.model.noise
     steps = config.azimuth_step_rad, config.zenith_step_rad
     on_the_wall = [step * _ranges(site.mesh.vertices, scanner.position)[1] * 1e3 for step in steps]
@@ -44,7 +44,7 @@ def _scanner_figures(scanner: LaserScanner, site: Site) -> dict[str, str]:
     }
 
 
-def _pair_figures(sensor: StereoSensor, site: Site) -> dict[str, str]:
+def _pair_figures(sensor: StereoSensor, site: SensorSite) -> dict[str, str]:
     pair = pair_of(sensor)
     left, right, noise = pair.cameras.left, pair.cameras.right, pair.model.noise
     base = float(np.linalg.norm(right.position - left.position))
@@ -79,7 +79,7 @@ def _with_parameters(effect: Effect) -> str:
     return f"{effect.name} ({told})" if told else effect.name
 
 
-def _places(site: Site) -> dict[str, str]:
+def _places(site: SensorSite) -> dict[str, str]:
     """World coordinates of the sensor's eyes and how far the wall is from each."""
     return {
         row: value

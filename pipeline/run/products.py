@@ -34,9 +34,9 @@ from pipeline.formats.xyz import write_xyz
 from pipeline.report.figures import blocks_figure, convergence_figure, difference_figure, hillshade_figure, histogram_figure
 from pipeline.report.page import litres
 from pipeline.run.acquisition import Look
-from pipeline.run.epoch import Epoch, Reference
+from pipeline.run.epoch import LaterEpoch, ReferenceEpoch
 from pipeline.run.recorded_points import recorded_points, scans_of
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from pipeline.surface.metashape_export import write_metashape_export
 from scene.blocks import Blocks
 from scene.carve import block_meshes
@@ -60,7 +60,7 @@ def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
     return bool(files) and all(path.is_file() and sha256(path) == digest for path, digest in files.items())
 
 
-def write_reference(out: Path, config: SimulationConfig, site: Site, reference: Reference, seen: Look) -> Checksums:
+def write_reference(out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, seen: Look) -> Checksums:
     """Write epoch_000, of what the sensor has `seen`, and the hillshade of the reference."""
     with noting() as written, _folder(out, 0) as folder:
         _write_common(folder, config, site, seen, reference.surface, reference.caster.mesh, [])
@@ -75,7 +75,7 @@ def write_reference(out: Path, config: SimulationConfig, site: Site, reference: 
     return _checksums(out, written)
 
 
-def write_epoch(out: Path, config: SimulationConfig, site: Site, reference: Reference, epoch: Epoch) -> Checksums:
+def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, epoch: LaterEpoch) -> Checksums:
     """Write an epoch's folder, its difference map, tiles and pictures."""
     name = f"difference_{epoch.number:03d}"
     grid = reference.raster.grid
@@ -112,7 +112,7 @@ def _checksums(out: Path, written: list[Path]) -> Checksums:
     return {str(path.relative_to(out)): sha256(path) for path in written if path.exists()}
 
 
-def _record(config: SimulationConfig, epoch: Epoch, images: list[LabelledImage], sigma: float) -> dict[str, Any]:
+def _record(config: SimulationConfig, epoch: LaterEpoch, images: list[LabelledImage], sigma: float) -> dict[str, Any]:
     return {
         "epoch": epoch.number,
         **_seen_record(epoch.seen),
@@ -155,7 +155,9 @@ def _seen_record(seen: Look) -> dict[str, Any]:
     return {"points": points} | ({"stations": [found.to_dict() for found in registered]} if registered else {})
 
 
-def _images(out: Path, config: SimulationConfig, epoch: Epoch, reference: Reference, name: str) -> Iterator[LabelledImage]:
+def _images(
+    out: Path, config: SimulationConfig, epoch: LaterEpoch, reference: ReferenceEpoch, name: str
+) -> Iterator[LabelledImage]:
     """The images of the data set: the difference map, or its tiles, which are written here."""
     labels = np.where(np.isnan(epoch.difference), WALL, epoch.raster.block)
     if config.tiles is None:
@@ -170,7 +172,7 @@ def _images(out: Path, config: SimulationConfig, epoch: Epoch, reference: Refere
 def _write_common(
     folder: Path,
     config: SimulationConfig,
-    site: Site,
+    site: SensorSite,
     seen: Look,
     surface: TriangleMesh,
     truth: TriangleMesh,
@@ -233,7 +235,7 @@ def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> Non
             write_ply(folder / f"block_{index + 1:04d}_{field.name}.ply", getattr(meshes, field.name))
 
 
-def _in_world(mesh: TriangleMesh, site: Site) -> TriangleMesh:
+def _in_world(mesh: TriangleMesh, site: SensorSite) -> TriangleMesh:
     vertices: FloatArray = site.frame.to_world(mesh.vertices)
     return replace(mesh, vertices=vertices)
 

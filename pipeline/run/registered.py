@@ -7,7 +7,7 @@ from dataclasses import replace
 from pipeline.config.simulation import SimulationConfig
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import register_to
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 from sensors.exchanged import StereoSensor
@@ -16,7 +16,7 @@ from sensors.stereo_matched import MatchedStereoPair
 from sensors.tls import LaserScanner
 
 
-def reference_sensor(config: SimulationConfig, site: Site) -> Site:
+def reference_sensor(config: SimulationConfig, site: SensorSite) -> SensorSite:
     """The site as the reference epoch is observed from it: without the sensor's noise where the config says so."""
     if config.noisy_reference:
         return site

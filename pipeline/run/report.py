@@ -7,10 +7,12 @@ from typing import Any
 
 from pipeline.run.instrument import instrument_figures
 from pipeline.run.page import BlockRow, EpochReport, RegistrationSummary, RunReport, write_report
-from pipeline.run.site import Site
+from pipeline.run.site import SensorSite
 
 
-def write_run_report(out: Path, identity: dict[str, Any], site: Site, records: list[dict[str, Any]], *, complete: bool) -> Path:
+def write_run_report(
+    out: Path, identity: dict[str, Any], site: SensorSite, records: list[dict[str, Any]], *, complete: bool
+) -> Path:
     """Write report.html of a run folder.
 
     identity: sensor, seed and config as in run.json; records: of the finished epochs, the reference first. Returns its path.
@@ -35,7 +37,7 @@ def _instrument(sensor: str) -> str:
     return "a stereo pair" if sensor == "stereo" else "a laser scanner"
 
 
-def _key_figures(site: Site, config: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, str]:
+def _key_figures(site: SensorSite, config: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, str]:
     width, height, _ = site.mesh.bounds[1] - site.mesh.bounds[0]
     figures = {
         **instrument_figures(site),

@@ -33,7 +33,7 @@ from pipeline.run.products import (
     write_reference,
 )
 from pipeline.run.report import write_run_report
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.backend import VARIANT
 from scene.errors import InputError
 from scene.imported import ImportedWall
@@ -59,7 +59,7 @@ class _Run:
     identity: dict[str, Any]
     progress: Progress
     products: dict[str, Checksums] = field(default_factory=dict)
-    site: Site | None = None
+    site: SensorSite | None = None
 
     def has(self, number: int) -> bool:
         return epoch_folder(self.out, number).name in self.products
@@ -105,7 +105,7 @@ def simulate(
             return _finish(run, site, complete=True)
 
 
-def _observe(run: _Run, config: SimulationConfig, sensor: SensorName) -> Site:
+def _observe(run: _Run, config: SimulationConfig, sensor: SensorName) -> SensorSite:
     """Make the epochs that are not there; returns what they were observed of."""
     out, progress, random = run.out, run.progress, KeyedRandom(config.seed)
     with progress.stage("wall"):
@@ -197,7 +197,7 @@ def _leave_nothing_half_written(run: _Run, resumed: bool, written: list[Path]) -
     remove_written(run.out, written)
 
 
-def _finish(run: _Run, site: Site, *, complete: bool) -> RunSummary:
+def _finish(run: _Run, site: SensorSite, *, complete: bool) -> RunSummary:
     """Write what covers all epochs: annotations.json, report.html and run.json."""
     out, identity = run.out, run.identity
     records = [json.loads((out / name / EPOCH_RECORD).read_text(encoding="utf-8")) for name in run.products]

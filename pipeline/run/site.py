@@ -21,7 +21,7 @@ from sensors.tls import LaserScanner
 
 
 @dataclass(frozen=True)
-class Site:
+class SensorSite:
     """The untouched wall (wall frame), its frame, and the sensor that observes it.
 
     name: of the wall; repairs: what was mended in an imported mesh; viewpoints: where the sensor's eyes are, by their place in
@@ -37,7 +37,7 @@ class Site:
     further_stations: tuple[LaserScanner, ...] = ()
 
 
-def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom, given: Wall | None = None) -> Site:
+def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom, given: Wall | None = None) -> SensorSite:
     """Build the wall, place the sensor and fit the wall's frame, whose z axis points to the sensor.
 
     given: a wall that takes the place of the config's.
@@ -53,7 +53,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         mesh, repairs = _faced(wall, frame, positions, foreign=foreign)
         pair = _stereo(config, cameras, frame, random)
         eyes = {name: frame.to_wall(position) for name, position in positions.items()}
-        return Site(wall.name, repairs, mesh, frame, pair, eyes)
+        return SensorSite(wall.name, repairs, mesh, frame, pair, eyes)
     stations = config.stations_of_the_scanner()
     poses = [station.place(target) for station in stations]
     frame = WallFrame.fit(wall.mesh.vertices, poses[0][0])
@@ -66,7 +66,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         for pose, station in zip(poses, stations, strict=True)
     ]
     eyes = {name: scanner.position for name, scanner in zip(positions, scanners, strict=True)}
-    return Site(wall.name, repairs, mesh, frame, scanners[0], eyes, tuple(scanners[1:]))
+    return SensorSite(wall.name, repairs, mesh, frame, scanners[0], eyes, tuple(scanners[1:]))
 
 
 def _faced(

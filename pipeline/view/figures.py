@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.colors import diverging, sequential
 
-from pipeline.view.results import Item, Layer, Patch, Points, Window
+from pipeline.view.results import Item, Layer, Patch, PointLayer, ViewWindow
 
 ITEM_TRACES = ("block", "detection", "scene change")
 _COLOURS = {"block": "#000000", "detection": "#D55E00", "scene change": "#009E73"}
@@ -34,7 +34,12 @@ _MARKER_PX, _FEW = 4.5, 80
 
 
 def wall_figure(
-    patch: Patch, points: Points | None, items: Sequence[Item], layer: Layer, shown: Collection[str], selected: int | None = None
+    patch: Patch,
+    points: PointLayer | None,
+    items: Sequence[Item],
+    layer: Layer,
+    shown: Collection[str],
+    selected: int | None = None,
 ) -> go.Figure:
     """The wall in 3D. shown: of surface, points and the kinds of items; selected: the item to mark."""
     figure = go.Figure()
@@ -78,7 +83,12 @@ def _eye(patch: Patch) -> dict[str, float]:
 
 
 def map_figure(
-    patch: Patch, items: Sequence[Item], layer: Layer, shown: Collection[str], window: Window | None, selected: int | None = None
+    patch: Patch,
+    items: Sequence[Item],
+    layer: Layer,
+    shown: Collection[str],
+    window: ViewWindow | None,
+    selected: int | None = None,
 ) -> go.Figure:
     """The window as a map; to zoom it is to choose the window of both pictures."""
     figure = go.Figure(_heatmap(patch, layer))
@@ -175,7 +185,7 @@ def hillshade(patch: Patch) -> NDArray[np.floating]:
     return np.asarray((-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / slope)
 
 
-def _cloud(points: Points, layer: Layer, *, coloured_alone: bool) -> go.Scatter3d:
+def _cloud(points: PointLayer, layer: Layer, *, coloured_alone: bool) -> go.Scatter3d:
     """The measured points; what is known of each stands in its label."""
     facts = {name.replace("_", " "): channel for name, channel in list(points.facts.items())[:_FACTS_SHOWN]}
     if points.value is not None:
@@ -278,5 +288,5 @@ def _outlines(items: Sequence[Item]) -> tuple[list[float | None], list[float | N
     return x, y
 
 
-def _extent(patch: Patch) -> Window:
-    return Window(float(patch.x.min()), float(patch.x.max()), float(patch.y.min()), float(patch.y.max()))
+def _extent(patch: Patch) -> ViewWindow:
+    return ViewWindow(float(patch.x.min()), float(patch.x.max()), float(patch.y.min()), float(patch.y.max()))

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.formats.laz import read_laz
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.result_records import GAP_FILE, read_gap
-from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, Points, Window, inside
+from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, inside
 from scene.errors import InputError
 from scene.frame import WallFrame
 from scene.mesh import FloatArray
@@ -48,16 +48,16 @@ class GapResults:
     def layers(self, step: str) -> list[Layer]:
         return [Layer("residual", "deeper than predicted (missing rock positive)", "mm", _MM, diverging=True, limit=self._limit)]
 
-    def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
+    def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
         return self._cells(step, window, budget)
 
-    def points(self, step: str, layer: Layer, window: Window | None, budget: int) -> Points | None:
+    def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
         shown = np.flatnonzero(inside(self._local[step], window))
         shown = shown[:: max(1, int(np.ceil(len(shown) / budget)))]
         cloud = self._clouds[step]
         held_out = np.where(cloud.extra["held_out"][shown] > 0, "yes", "no")
         world = {f"world {axis}": column for axis, column in zip("xyz", cloud.points[shown].T, strict=True)}
-        return Points(
+        return PointLayer(
             self._local[step][shown], _residual(cloud)[shown], {"held out": held_out, **world}, len(shown) / len(cloud.points)
         )
 
@@ -72,13 +72,13 @@ class GapResults:
         facts = {"volume": f"{change['volume_m3']:.4g} m³"}
         return Item("scene change", f"scene change {number}", (x0, x1, y0, y1, z0, z1), facts)
 
-    def _binned(self, step: str, window: Window | None, budget: int) -> Patch:
+    def _binned(self, step: str, window: ViewWindow | None, budget: int) -> Patch:
         """Means of residual and height over cells of about four points."""
         chosen = inside(self._local[step], window)
         points, residual = self._local[step][chosen], _residual(self._clouds[step])[chosen]
         if not len(points):
             empty = np.full((1, 1), np.nan)
-            at = window or Window(0, 1, 0, 1)
+            at = window or ViewWindow(0, 1, 0, 1)
             return Patch(np.array([(at.x0 + at.x1) / 2]), np.array([(at.y0 + at.y1) / 2]), empty, empty, np.zeros((1, 1), int), 1)
         low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
         cells = min(budget, max(len(points) / _POINTS_PER_CELL, 1))

@@ -9,7 +9,7 @@ import dash
 from dash import Input, Output, State, ctx, dcc, html, no_update
 
 from pipeline.view.figures import ITEM_TRACES, map_figure, wall_figure
-from pipeline.view.results import Item, Layer, Results, Window
+from pipeline.view.results import Item, Layer, Results, ViewWindow
 
 CELLS, POINTS = 60_000, 40_000
 """What a window is thinned to: it turns smoothly on a laptop without a graphics card."""
@@ -121,11 +121,11 @@ def register_callbacks(app: dash.Dash, results: Results, lock: Lock) -> None:
         if key not in layers:
             return no_update, no_update, no_update
         with lock:
-            return pictures(results, step, surface, layers[key], shown, number, Window(*window) if window else None)
+            return pictures(results, step, surface, layers[key], shown, number, ViewWindow(*window) if window else None)
 
 
 def pictures(
-    results: Results, step: str, surface: str, layer: Layer, shown: list[str], number: int | None, window: Window | None
+    results: Results, step: str, surface: str, layer: Layer, shown: list[str], number: int | None, window: ViewWindow | None
 ) -> tuple[Any, Any, str]:
     """Both pictures of a window, and what is to be known about them."""
     patch = results.patch(step, surface, layer, window, CELLS)

@@ -16,7 +16,7 @@ _SURROUNDINGS, _LEAST_M, _ASPECT = 4.0, 1.0, 2.5
 """An item is shown with this many times its size, and the smallest as if it were so large; width over height of the view."""
 
 
-class Window(NamedTuple):
+class ViewWindow(NamedTuple):
     """A part of the wall, m, wall frame."""
 
     x0: float
@@ -57,7 +57,7 @@ class Patch:
 
 
 @dataclass(frozen=True)
-class Points:
+class PointLayer:
     """Points in a window. points: (n, 3) m; value: (n,) of the layer, or None; facts: (n,) by name; share: of all there are."""
 
     points: FloatArray
@@ -75,12 +75,12 @@ class Item:
     box: tuple[float, float, float, float, float, float]
     facts: Mapping[str, str] = field(default_factory=dict)
 
-    def window(self) -> Window:
+    def window(self) -> ViewWindow:
         """The item with its surroundings, of the page's wide shape."""
         x0, x1, y0, y1 = self.box[:4]
         half = max(x1 - x0, y1 - y0, _LEAST_M) * _SURROUNDINGS / 2
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
-        return Window(x - _ASPECT * half, x + _ASPECT * half, y - half, y + half)
+        return ViewWindow(x - _ASPECT * half, x + _ASPECT * half, y - half, y + half)
 
 
 class Results(Protocol):
@@ -98,11 +98,11 @@ class Results(Protocol):
         """What the wall can be coloured by."""
         ...
 
-    def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
+    def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
         """The surface in a window (None: all of it), coloured by the layer, of at most about `budget` cells."""
         ...
 
-    def points(self, step: str, layer: Layer, window: Window | None, budget: int) -> Points | None:
+    def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
         """The measured points in a window, at most about `budget` of them; None where the folder holds none."""
         ...
 
@@ -111,9 +111,9 @@ class Results(Protocol):
         ...
 
 
-def cut(grid: Grid, window: Window | None, budget: int) -> tuple[slice, slice, int]:
+def cut(grid: Grid, window: ViewWindow | None, budget: int) -> tuple[slice, slice, int]:
     """Rows and columns of `grid` inside `window` (at least one), and how many pixels, each way, to take together for `budget`."""
-    window = window or Window(-np.inf, np.inf, -np.inf, np.inf)
+    window = window or ViewWindow(-np.inf, np.inf, -np.inf, np.inf)
     columns = _inside(grid.columns(np.array([window.x0, window.x1])), grid.width)
     rows = _inside(grid.rows(np.array([window.y1, window.y0])), grid.height)
     cells = (rows.stop - rows.start) * (columns.stop - columns.start)
@@ -134,7 +134,7 @@ def centres(grid: Grid, rows: slice, columns: slice, factor: int) -> tuple[Float
     return x, y
 
 
-def inside(points: FloatArray, window: Window | None) -> NDArray[np.bool_]:
+def inside(points: FloatArray, window: ViewWindow | None) -> NDArray[np.bool_]:
     """(n,) which of the points (n, 3) lie in the window."""
     if window is None:
         return np.ones(len(points), bool)

@@ -19,7 +19,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
 from pipeline.run.products import epoch_folder
-from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, Points, Window, centres, cut, inside
+from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, centres, cut, inside
 from scene.errors import InputError
 from scene.grid import Grid
 
@@ -57,7 +57,7 @@ class RunResults:
             maps.append(Layer("m3c2", "M3C2 distance", "mm", _MM, diverging=True, limit=limit))
         return [*maps, _ROCK, _HEIGHT]
 
-    def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
+    def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
         grid = self._map(self._map_path("difference", step))[1]
         raster = self._heights(self._surface_path(step, surface), grid)
         rows, columns, factor = cut(grid, window, budget)
@@ -67,14 +67,14 @@ class RunResults:
         middle = label[factor // 2 :: factor, factor // 2 :: factor][: height.shape[0], : height.shape[1]]
         return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
 
-    def points(self, step: str, layer: Layer, window: Window | None, budget: int) -> Points | None:
+    def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
         path = epoch_folder(self.folder, int(step)) / "points.laz"
         if not path.exists():
             return None
         cloud = self._cloud(path)
         shown = _thinned(np.flatnonzero(inside(cloud.points, window)), budget)
         facts = {name: channel[shown] for name, channel in _channels(cloud).items()}
-        return Points(cloud.points[shown], None, facts, len(shown) / max(len(cloud.points), 1))
+        return PointLayer(cloud.points[shown], None, facts, len(shown) / max(len(cloud.points), 1))
 
     def items(self, step: str) -> list[Item]:
         blocks = [_block(each) for each in self._epochs[step]["blocks"]]

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.detection.data import CocoFolder
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
-from pipeline.view.results import Item, Layer, Patch, Points, Window, centres, cut
+from pipeline.view.results import Item, Layer, Patch, PointLayer, ViewWindow, centres, cut
 
 _MM = 1e3
 _SIGMA_M = 0.01
@@ -45,13 +45,13 @@ class TileResults:
             )
         ]
 
-    def patch(self, step: str, surface: str, layer: Layer, window: Window | None, budget: int) -> Patch:
+    def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
         values, grid = self._map(self._coco.path(self._images[step]))
         rows, columns, factor = cut(grid, window, budget)
         shown = mean_pooled(values[rows, columns], factor)
         return Patch(*centres(grid, rows, columns, factor), -shown, shown * _MM, np.zeros(shown.shape, int), factor)
 
-    def points(self, step: str, layer: Layer, window: Window | None, budget: int) -> Points | None:
+    def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
         return None
 
     def items(self, step: str) -> list[Item]:

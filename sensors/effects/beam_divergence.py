@@ -7,8 +7,8 @@ from typing import Literal
 from pydantic import Field
 
 from scene.keyed_random import KeyedRandom
+from sensors.beam import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
-from sensors.footprint import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
 
 
 class BeamDivergence(Effect):

@@ -15,11 +15,11 @@ from scipy import stats
 
 from pipeline.calibration.calibrate import calibrate_material
 from pipeline.calibration.greedy import greedy
-from pipeline.calibration.inputs import Material
+from pipeline.calibration.inputs import CalibrationInputs
 from pipeline.calibration.maps import noise_map
 from pipeline.calibration.parameters import Parameters, parameters
 from pipeline.calibration.reobserve import Reobserver
-from pipeline.calibration.search import Search
+from pipeline.calibration.search import NoiseSearch
 from pipeline.calibration.signature import Signature
 from pipeline.calibration.windows import Windows, choose_windows, unchanged
 from pipeline.change.difference import raster_grid
@@ -30,7 +30,7 @@ from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import look, reconstruct
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.config import parse
 from scene.errors import InputError
 from scene.grid import Grid
@@ -56,18 +56,18 @@ SMALL = [
 GRID = Grid(0.0, 4.0, 0.02, 320, 200)
 
 
-def small(sensor: str, *more: str) -> tuple[SimulationConfig, Site]:
+def small(sensor: str, *more: str) -> tuple[SimulationConfig, SensorSite]:
     config = load_config(bundled_config("", "demo"), [*SMALL, *more], sensor, None)  # type: ignore[arg-type]
     return config, prepare_site(config, sensor, KeyedRandom(config.seed))  # type: ignore[arg-type]
 
 
-def seen_by(config: SimulationConfig, site: Site, epochs: int, seed: int) -> Material:
+def seen_by(config: SimulationConfig, site: SensorSite, epochs: int, seed: int) -> CalibrationInputs:
     """Difference maps of the whole simulation, each of two observations of its own."""
     caster, random = RayCaster(site.mesh), KeyedRandom(seed)
     grid = raster_grid(reconstruct(config, look(config, site, caster, random)).bounds, config.difference)
     maps = [noise_map(config, site, site, caster, random.child("map", number), grid) for number in range(epochs)]
     names = tuple(f"epoch {number}" for number in range(epochs))
-    return Material(names, grid, np.stack(maps), ~np.isnan(maps).any(axis=0), False, site, False)
+    return CalibrationInputs(names, grid, np.stack(maps), ~np.isnan(maps).any(axis=0), False, site, False)
 
 
 def test_what_moved_is_not_stable_and_what_is_wrong_by_itself_is() -> None:
@@ -204,10 +204,10 @@ class Known:
         chance = random.generator().chisquare(count, len(self.shares)) / count
         return 0.5 * np.log(self.shares @ np.asarray(theta) ** 2 * chance)
 
-    def search(self, seed: int) -> Search:
+    def search(self, seed: int) -> NoiseSearch:
         bounds = np.array([0.05, 0.05]), np.array([5.0, 5.0])
         named = Parameters(TlsModel(), ("range_sigma_m", "angle_sigma_rad"), *bounds)
-        return Search(self, named, 2, KeyedRandom(seed), Progress())
+        return NoiseSearch(self, named, 2, KeyedRandom(seed), Progress())
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:

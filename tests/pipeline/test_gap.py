@@ -15,7 +15,7 @@ from gap_cases import Scan, write_scan
 
 from pipeline.cli.main import main
 from pipeline.formats.measurement import read_measurement
-from pipeline.gap.naming.workflow import STEPS, Diagnosis, diagnose
+from pipeline.gap.naming.workflow import STEPS, GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.in_words import paragraph
 from pipeline.gap.report.report import summary, to_dict
@@ -24,7 +24,7 @@ from scene.backend import dr
 ROOT = Path(__file__).parents[2]
 
 
-def found_in(folder: Path, seed: int, **case: Any) -> Diagnosis:
+def found_in(folder: Path, seed: int, **case: Any) -> GapDiagnosis:
     write_scan(folder, seed, **case)
     return diagnose(read_measurement(folder))
 

@@ -15,7 +15,7 @@ from gap_cases import write_scan
 from pipeline.cli.main import main
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import read_measurement
-from pipeline.formats.measurement_checks import Fit
+from pipeline.formats.measurement_checks import PointFit
 from pipeline.formats.points import read_points
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
@@ -152,7 +152,7 @@ def test_fit_tells_how_far_points_lie_behind_the_reference(case: Path) -> None:
     away = good.cloud.points - origin
     behind = origin + away * (1 + 3.0 / np.linalg.norm(away, axis=1, keepdims=True))
     assert good.fit.good
-    fit = Fit.of(behind, origin, good.scene)
+    fit = PointFit.of(behind, origin, good.scene)
     assert not fit.good
     assert fit.off_m == pytest.approx(3.0, abs=0.01)  # noise of 3 mm, pose off by some millimetres
 

@@ -9,11 +9,11 @@ import numpy as np
 from gap_cases import Scan, write_scan
 
 from pipeline.formats.measurement import read_measurement
-from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.residuals.registration import residuals_of
 
 
-def found_in(folder: Path, seed: int, **how: Any) -> Diagnosis:
+def found_in(folder: Path, seed: int, **how: Any) -> GapDiagnosis:
     write_scan(folder, seed, step_rad=0.007, **how)
     return diagnose(read_measurement(folder))
 

@@ -19,7 +19,7 @@ from pipeline.formats.measurement import Measurement, read_measurement
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.verify import Gap
-from pipeline.gap.naming.workflow import Diagnosis, diagnose
+from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report import figures, report
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.figures import gap_figure, maps_figure
@@ -35,7 +35,7 @@ MATRIX = {"names": ["tls.range_offset", "tls.range_scale"], "cosines": [[1.0, 0.
 
 
 @pytest.fixture(scope="module")
-def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[Diagnosis, Measurement]:
+def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[GapDiagnosis, Measurement]:
     """A diagnosis of some hundred points."""
     folder = tmp_path_factory.mktemp("few")
     write_scan(folder, 1, step_rad=0.05)
@@ -46,7 +46,7 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[Diagnosis, Measuremen
 @pytest.mark.parametrize("pictures", [True, False])
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_has_a_report(
-    few: tuple[Diagnosis, Measurement], verdict: str, pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    few: tuple[GapDiagnosis, Measurement], verdict: str, pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found, measurement = few
     told = verdict != "insufficient_data"
@@ -68,7 +68,7 @@ def test_every_verdict_has_a_report(
 
 
 def test_nothing_is_written_where_the_report_cannot_be_made(
-    few: tuple[Diagnosis, Measurement], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    few: tuple[GapDiagnosis, Measurement], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: Any) -> str:
         raise RuntimeError("a fault in the page")
@@ -106,7 +106,7 @@ def _keep(path: Path, count: int) -> None:
 
 
 @pytest.mark.parametrize("sensor", ["tls", "stereo"])
-def test_missing_rock_is_positive_of_both_sensors(few: tuple[Diagnosis, Measurement], sensor: str, tmp_path: Path) -> None:
+def test_missing_rock_is_positive_of_both_sensors(few: tuple[GapDiagnosis, Measurement], sensor: str, tmp_path: Path) -> None:
     """A surface 20 mm behind the reference: ranges 20 mm longer, disparities smaller by 20 mm over the depth of a pixel."""
     found, measurement = few
     unit = 1.0 if sensor == "tls" else 0.25
@@ -123,7 +123,7 @@ def test_missing_rock_is_positive_of_both_sensors(few: tuple[Diagnosis, Measurem
 
 
 def test_missing_rock_is_red_and_one_bad_cell_does_not_set_the_colours(
-    few: tuple[Diagnosis, Measurement], monkeypatch: pytest.MonkeyPatch
+    few: tuple[GapDiagnosis, Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found, _ = few
     values = 0.003 * np.random.default_rng(5).standard_normal(len(found.residuals))

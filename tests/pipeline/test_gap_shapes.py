@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import Measurement, read_measurement
-from pipeline.gap.other.footprint import find_footprint
+from pipeline.gap.other.mixed_pixels import find_footprint
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.other.stereo_shapes import find_shapes

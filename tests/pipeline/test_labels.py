@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.config.simulation import SimulationConfig
 from pipeline.report.progress import Progress
-from pipeline.run.epoch import Epoch, Reference, observe_epoch, observe_reference
+from pipeline.run.epoch import LaterEpoch, ReferenceEpoch, observe_epoch, observe_reference
 from pipeline.run.site import prepare_site
 from scene.config import parse
 from scene.keyed_random import KeyedRandom
@@ -22,7 +22,7 @@ BARS = {"small": (0.8, 0.11), "medium": (0.95, 0.3), "large": (0.95, 0.8)}
 """Share of blocks whose label overlaps the true outline by 0.75 or more, and their size, m (issue 22)."""
 
 
-def epoch(sensor: str, model: Any, size: float, **changes: Any) -> tuple[Reference, Epoch]:
+def epoch(sensor: str, model: Any, size: float, **changes: Any) -> tuple[ReferenceEpoch, LaterEpoch]:
     values = {
         "wall": {"style": "glendale", "width_m": 9.0, "height_m": 6.0, "resolution_m": 0.05, "seed": 2},
         "cameras": {"distance_m": 105.0, "base_m": 28.0},
@@ -38,7 +38,7 @@ def epoch(sensor: str, model: Any, size: float, **changes: Any) -> tuple[Referen
     return reference, observe_epoch(config, site, reference, 1, KeyedRandom(1), Progress())
 
 
-def true_outlines(reference: Reference, seen: Epoch) -> IntArray:
+def true_outlines(reference: ReferenceEpoch, seen: LaterEpoch) -> IntArray:
     """(h, w) the block whose solid the wall's surface lies in, from the blocks' own meshes: no carving, no labels of faces."""
     grid = reference.raster.grid
     surface = heights(reference.caster, grid)
@@ -85,7 +85,7 @@ def test_labels_go_where_the_sensors_errors_put_the_niches(reconstruction: str) 
     assert niche > 0.05 > 0.002 > outside
 
 
-def x_of(seen: Epoch, label: int) -> float:
+def x_of(seen: LaterEpoch, label: int) -> float:
     """The middle of a label in the wall frame, m."""
     grid = seen.raster.grid
     return grid.x_min + grid.gsd * (float(np.nonzero(seen.raster.block == label)[1].mean()) + 0.5)

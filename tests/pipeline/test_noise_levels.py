@@ -11,7 +11,7 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.run.acquisition import look, reconstruct
 from pipeline.run.registered import reference_sensor
-from pipeline.run.site import Site, prepare_site
+from pipeline.run.site import SensorSite, prepare_site
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
@@ -41,7 +41,7 @@ READINGS = ("", "independent_")
 
 
 @pytest.fixture(scope="module")
-def stage() -> tuple[SimulationConfig, Site, RayCaster]:
+def stage() -> tuple[SimulationConfig, SensorSite, RayCaster]:
     config = load_config(GLENDALE, FAST, "stereo", None)
     site = prepare_site(config, "stereo", KeyedRandom(config.seed))
     return config, site, RayCaster(site.mesh)
@@ -104,7 +104,7 @@ def test_an_unknown_name_is_told_the_nearest() -> None:
 
 
 @pytest.mark.parametrize("level", DOCUMENTED_MM)
-def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConfig, Site, RayCaster]) -> None:
+def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConfig, SensorSite, RayCaster]) -> None:
     config, site, caster = stage
     noisy = with_model(site, model(f"independent_{level}"))
     maps = [noise_map(config, noisy, noisy, caster, KeyedRandom(50 + number)) for number in range(MAPS)]
@@ -114,7 +114,7 @@ def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConf
 
 
 def test_by_vertices_and_against_a_silent_reference_the_printed_numbers_give_the_theses_noise(
-    stage: tuple[SimulationConfig, Site, RayCaster],
+    stage: tuple[SimulationConfig, SensorSite, RayCaster],
 ) -> None:
     """Matching alone 17 mm (docs/noise.md), to which each map's draw of the orientation adds; the seeds are fixed."""
     config, site, caster = stage
@@ -126,7 +126,7 @@ def test_by_vertices_and_against_a_silent_reference_the_printed_numbers_give_the
     assert np.median(deviation) == pytest.approx(23.8, rel=TOLERANCE)
 
 
-def test_a_reference_without_noise_is_the_wall_itself(stage: tuple[SimulationConfig, Site, RayCaster]) -> None:
+def test_a_reference_without_noise_is_the_wall_itself(stage: tuple[SimulationConfig, SensorSite, RayCaster]) -> None:
     config, site, caster = stage
     config = config.model_copy(update={"reconstruction": "vertices", "noisy_reference": False})
     quiet = reference_sensor(config, with_model(site, model("high")))
@@ -134,7 +134,7 @@ def test_a_reference_without_noise_is_the_wall_itself(stage: tuple[SimulationCon
     np.testing.assert_allclose(surface.corners()[:1000], caster.mesh.corners()[:1000], atol=1e-8)
 
 
-def test_without_noise_a_map_is_null(stage: tuple[SimulationConfig, Site, RayCaster]) -> None:
+def test_without_noise_a_map_is_null(stage: tuple[SimulationConfig, SensorSite, RayCaster]) -> None:
     config, site, caster = stage
     silent = StereoModel.model_validate({"noise": {"parallax_sigma_px": 0, "regularization_sigma_px": 0}})
     silenced = with_model(site, silent)

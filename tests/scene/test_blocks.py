@@ -15,10 +15,10 @@ from scene.carve import carve
 from scene.config import parse
 from scene.contour import highest_under
 from scene.errors import InputError
-from scene.footprint import faces_under
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 from scene.raycast import RayCaster
+from scene.under_boxes import faces_under
 
 RANDOM = KeyedRandom(5).child("rockfall")
 

@@ -13,7 +13,7 @@ from scene.frame import WallFrame
 from scene.imported import ImportedWall
 from scene.keyed_random import KeyedRandom
 from scene.procedural import SITES, ProceduralWall
-from scene.rock import Noise
+from scene.rock import SplineNoise
 from scene.wall import WallConfig, build_wall
 
 STYLES = get_args(ProceduralWall.model_fields["style"].annotation)
@@ -131,7 +131,7 @@ def test_the_number_of_threads_changes_no_bit():
 
 def test_noise_has_unit_deviation():
     # 200 x 200 lattice: the deviation of a B-spline surface scatters by about 0.5 %; 3 % fails falsely below 1e-6
-    noise = Noise.make(KeyedRandom(5), (200.0, 200.0), 1.0)
+    noise = SplineNoise.make(KeyedRandom(5), (200.0, 200.0), 1.0)
     axis = np.arange(0.0, 200.0, 0.25)
     assert noise.at(axis, axis).std() == pytest.approx(1.0, abs=0.03)
 

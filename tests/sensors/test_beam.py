@@ -14,7 +14,7 @@ from test_tls import POSITION, ROTATION, scan, scanner
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import DEFAULT_ALBEDO, RayCaster
-from sensors.footprint import unit_offsets
+from sensors.beam import unit_offsets
 from sensors.observation import Observation
 from sensors.tls import LaserScanner, Pattern
 

@@ -12,7 +12,7 @@ from test_tls import scanner
 
 from scene.keyed_random import KeyedRandom
 from scene.raycast import RayCaster
-from sensors.footprint import unit_offsets
+from sensors.beam import unit_offsets
 from sensors.observation import FurtherReturns, Observation
 from sensors.tls import Pattern
 

@@ -29,7 +29,7 @@ from pipeline.formats.ply import read_ply
 from pipeline.run.simulation import simulate
 from pipeline.view.figures import map_figure, wall_figure
 from pipeline.view.page import clicked, zoom
-from pipeline.view.results import Item, Layer, Patch, Window, cut
+from pipeline.view.results import Item, Layer, Patch, ViewWindow, cut
 from pipeline.view.server import cookie_name, make_app, make_page_server, open_results
 from scene.config import parse
 from scene.errors import InputError
@@ -111,7 +111,7 @@ def test_other_surfaces_and_layers(run: Path) -> None:
 
 
 def test_a_window_is_thinned_to_the_budget_by_means(run: Path) -> None:
-    results, window = open_results(run), Window(2.0, 4.0, 1.0, 3.0)
+    results, window = open_results(run), ViewWindow(2.0, 4.0, 1.0, 3.0)
     layer = results.layers("1")[0]
     fine, coarse = (results.patch("1", "surface", layer, window, budget) for budget in (MANY, 300))
     assert fine.pooled == 1
@@ -130,7 +130,7 @@ def test_the_points_of_a_run(run: Path) -> None:
     assert len(points.points) <= 1000
     assert points.share == pytest.approx(len(points.points) / len(cloud.points))
     assert {"intensity", "true_range_m", "block"} <= set(points.facts)
-    inside = results.points("1", results.layers("1")[0], Window(2.0, 4.0, 1.0, 3.0), MANY)
+    inside = results.points("1", results.layers("1")[0], ViewWindow(2.0, 4.0, 1.0, 3.0), MANY)
     assert inside is not None
     assert inside.points[:, :2].min(axis=0) == pytest.approx([2, 1], abs=0.1)
 
@@ -181,7 +181,7 @@ def test_a_tile_as_relief(tiles: Path) -> None:
 
 def test_windows_beyond_the_raster_keep_a_pixel() -> None:
     grid = Grid(0.0, 10.0, 1.0, 20, 10)
-    for window in (Window(-50, -40, 0, 5), Window(30, 40, 20, 30), Window(5.2, 5.3, 5.2, 5.3)):
+    for window in (ViewWindow(-50, -40, 0, 5), ViewWindow(30, 40, 20, 30), ViewWindow(5.2, 5.3, 5.2, 5.3)):
         rows, columns, factor = cut(grid, window, 100)
         assert (rows.stop > rows.start, columns.stop > columns.start, factor) == (True, True, 1)
     assert cut(grid, None, 2)[2] == 10

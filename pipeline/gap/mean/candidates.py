@@ -97,7 +97,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class SineGrid:
     """A sine of which evenly spaced frequencies are tried. amplitude: name of the parameter; fixed: values of all variants."""
 
     name: str
@@ -141,18 +141,18 @@ class Grid:
                 phasor = phasor * turn
             yield slice(start, stop), columns.T
 
-    def part(self, rows: Rows) -> Grid:
+    def part(self, rows: Rows) -> SineGrid:
         """The grid on some of the points."""
         return replace(self, wave=self.wave.part(rows))
 
 
-def variants(families: list[Candidate | Grid]) -> list[Candidate]:
+def variants(families: list[Candidate | SineGrid]) -> list[Candidate]:
     """Every candidate, the searched ones at each of their frequencies."""
     return [
         candidate
         for family in families
         for candidate in (
-            [family.candidate(index) for index in range(len(family.frequencies))] if isinstance(family, Grid) else [family]
+            [family.candidate(index) for index in range(len(family.frequencies))] if isinstance(family, SineGrid) else [family]
         )
     ]
 
@@ -167,7 +167,7 @@ def frequencies(low: float, high: float, step: float, most: int = 200) -> FloatA
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
-def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> list[Candidate | Grid]:
+def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> list[Candidate | SineGrid]:
     """Forms of one covariate that stand for no effect: a line, a parabola, a smooth curve, a step, a wave.
 
     highest: frequency from which on a wave is an effect of the catalogue.
@@ -177,7 +177,7 @@ def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> l
     columns = [x, x**2, x**3, *(np.maximum(x - knot, 0) ** 3 for knot in knots)]
     smooth = np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
     steps = np.unique(np.quantile(x, np.linspace(0, 1, _STEPS + 2)[1:-1]))
-    found: list[Candidate | Grid] = [
+    found: list[Candidate | SineGrid] = [
         _free(covariate, "line", smooth[:, :1]),
         _free(covariate, "parabola", smooth[:, :2]),
         _free(covariate, "smooth", smooth),
@@ -188,13 +188,15 @@ def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> l
         tried = frequencies(0.8 / reach, _MOST_CYCLES / reach, 0.5 / reach)
         tried = tried[tried < highest * float(values.std())]
         if len(tried) > 1:
-            found.append(Grid(covariate, "amplitude", Wave("period", np.ones_like(x), x), tried, {}, True))
+            found.append(SineGrid(covariate, "amplitude", Wave("period", np.ones_like(x), x), tried, {}, True))
     return found
 
 
 def moved_to(candidate: Candidate, period: float) -> Candidate:
     """The same sine with another period."""
-    return Grid(candidate.name, candidate.names[0], candidate.sine, np.empty(0), candidate.fixed, candidate.empirical).at(period)
+    return SineGrid(candidate.name, candidate.names[0], candidate.sine, np.empty(0), candidate.fixed, candidate.empirical).at(
+        period
+    )
 
 
 def precision_of(candidate: Candidate, width: int) -> FloatArray:
@@ -216,7 +218,7 @@ def surface_form(first: str, second: str, x: FloatArray, y: FloatArray) -> Candi
     return _free(f"{first} and {second}", SURFACE, columns / columns.std(axis=0))
 
 
-def places(at: FloatArray) -> list[Candidate | Grid]:
+def places(at: FloatArray) -> list[Candidate | SineGrid]:
     """Free forms of places (n, 2) on the wall in slanting directions, which no sensor knows of.
 
     What they gain is the reference's doing, in all likelihood, and so may as much be that a covariate gains which changes along

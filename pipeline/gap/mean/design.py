@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.mean.candidates import Candidate, Grid, moved_to, precision_of
-from pipeline.gap.mean.mean_model import Covariance, Fit, MeanModel, Projected, fitted
+from pipeline.gap.mean.candidates import Candidate, SineGrid, moved_to, precision_of
+from pipeline.gap.mean.mean_model import Covariance, MeanFit, MeanModel, Projected, fitted
 from pipeline.gap.mean.normal_equations import Equations, Waves, assembled, extended, wave_products
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.residuals import Residuals
@@ -27,13 +27,13 @@ class Families:
     """Explanations with fixed columns, and sines of which a grid of periods is searched."""
 
     plain: list[Candidate]
-    grids: list[Grid]
+    grids: list[SineGrid]
 
     @classmethod
-    def of(cls, families: list[Candidate | Grid]) -> Families:
+    def of(cls, families: list[Candidate | SineGrid]) -> Families:
         """Of either kind, in any order."""
         plain = [family for family in families if isinstance(family, Candidate)]
-        return cls(plain, [family for family in families if isinstance(family, Grid)])
+        return cls(plain, [family for family in families if isinstance(family, SineGrid)])
 
     @cached_property
     def members(self) -> dict[str, tuple[list[int], list[int]]]:
@@ -74,7 +74,7 @@ class Design:
     pose: FloatArray
     turn: FloatArray
     pose_precision: FloatArray
-    grids: list[Grid]
+    grids: list[SineGrid]
     value: Projected
     fixed: Projected
     place: Mapping[Candidate, list[int]]
@@ -86,7 +86,7 @@ class Design:
     def of(
         cls,
         residuals: Residuals,
-        families: list[Candidate | Grid],
+        families: list[Candidate | SineGrid],
         random: KeyedRandom,
         pose_precision: FloatArray | None = None,
     ) -> Design:
@@ -158,7 +158,7 @@ class Design:
         projected = self.model.project(value[self.model.rows, None] * self.model.root[:, None])
         return fitted(self.model.fine, columns, projected).log_likelihood
 
-    def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> Fit:
+    def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> MeanFit:
         """Pose (the columns of `Residuals.pose`) and some candidates, at their most likely covariance."""
         turned = np.linalg.inv(self.turn)
         if not candidates:
@@ -177,7 +177,7 @@ class Design:
         found = fitted(self.model.fine, columns, self.value, back.T @ (precision[:, None] * back))
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
-    def refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], Fit]:
+    def refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], MeanFit]:
         """Candidates with their periods at the top of the likelihood (Gauss-Newton), and the fit of pose and all of them.
 
         Each sine has three columns in that fit: sine, cosine and the change by its frequency.

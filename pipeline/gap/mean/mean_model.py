@@ -49,7 +49,7 @@ class Covariance:
 
 
 @dataclass(frozen=True)
-class Fit:
+class MeanFit:
     """Coefficients (k,) and covariance (k, k) of the design's columns; log_likelihood and the covariance it was reached with."""
 
     coefficients: FloatArray
@@ -192,7 +192,7 @@ class _Normal:
         y = value.within[:, 0]
         return cls(columns, value, columns.within.T @ columns.within, columns.within.T @ y, float(y @ y))
 
-    def at(self, at: Covariance, precision: FloatArray | None = None) -> Fit:
+    def at(self, at: Covariance, precision: FloatArray | None = None) -> MeanFit:
         """All columns fitted. precision: (k, k) inverse covariance of the coefficients, around 0, before there are data."""
         basis, y = self.columns.between[at.length], self.value.between[at.length][:, 0]
         weighted = basis * at.weight[:, None]
@@ -202,7 +202,7 @@ class _Normal:
         return _solve(matrix, self.right + weighted.T @ y, float(constant), at)
 
 
-def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> Fit:
+def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> MeanFit:
     """All columns fitted to one value, at the most likely of the covariances. precision: (k, k) as in `_Normal.at`.
 
     The likelihood is that of what the columns leave (REML, Patterson & Thompson 1971), and the coefficients' covariance is a mean
@@ -219,9 +219,9 @@ def fitted(covariances: list[Covariance], columns: Projected, value: Projected, 
     return replace(best, covariance=covariance + np.einsum("f,fi,fj->ij", weights, moves, moves))
 
 
-def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> Fit:
+def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> MeanFit:
     size = np.sqrt(np.diag(matrix))
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max())
     inverse = np.linalg.inv(matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(right))) * np.outer(scale, scale)
     coefficients = inverse @ right
-    return Fit(coefficients, inverse, constant + 0.5 * float(right @ coefficients), at)
+    return MeanFit(coefficients, inverse, constant + 0.5 * float(right @ coefficients), at)

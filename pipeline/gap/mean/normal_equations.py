@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.gap.mean.candidates import Grid
+from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
 from scene.mesh import FloatArray
 
@@ -32,7 +32,7 @@ class Waves:
 
     @classmethod
     def of(
-        cls, model: MeanModel, grids: list[Grid], fixed: FloatArray, value: FloatArray, noise: FloatArray, rows: slice
+        cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: FloatArray, noise: FloatArray, rows: slice
     ) -> Waves:
         """fixed, value: (n, .) within cells; noise: (n', .) on some `rows` of the points."""
         parts: list[tuple[FloatArray, ...]] = []
@@ -51,7 +51,7 @@ class Waves:
         return cls(products[:, : fixed.shape[1]], own, products[:, fixed.shape[1] :], drawn, means.T)
 
 
-def wave_products(grids: list[Grid], within: FloatArray, root: FloatArray) -> FloatArray:
+def wave_products(grids: list[SineGrid], within: FloatArray, root: FloatArray) -> FloatArray:
     """(2 w, k) of all sines with further columns (n, k), which are within cells."""
     found = [columns.T @ within for grid in grids for _, columns in grid.chunks(root)]
     return np.concatenate(found) if found else np.zeros((0, within.shape[1]))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import Candidate, Explanation, Grid
+from pipeline.gap.mean.candidates import Candidate, Explanation, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
@@ -29,7 +29,7 @@ class MeanSearch:
     def __init__(
         self,
         residuals: Residuals,
-        families: list[Candidate | Grid],
+        families: list[Candidate | SineGrid],
         random: KeyedRandom,
         pose_precision: FloatArray | None = None,
         gains_alone: Mapping[Explanation, float] | None = None,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
-from pipeline.gap.mean.candidates import Candidate, Grid, Wave, amplitude_and_phase, frequencies, variants
+from pipeline.gap.mean.candidates import Candidate, SineGrid, Wave, amplitude_and_phase, frequencies, variants
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
 from pipeline.gap.residuals.residuals import Geometry, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -35,12 +35,12 @@ def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Cand
     return variants(mean_families(residuals, measurement))
 
 
-def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | Grid]:
+def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
     """The same with each searched sine as one grid."""
     geometry = residuals.geometry
     shown = [effect for effect in catalogue(residuals.sensor) if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
     cameras: list[type[CameraEffect]] = [effect for effect in shown if issubclass(effect, CameraEffect)]
-    found: list[Candidate | Grid] = []
+    found: list[Candidate | SineGrid] = []
     if isinstance(residuals, StereoResiduals) and isinstance(measurement, StereoMeasurement) and cameras:
         found += _of_cameras(cameras, residuals.geometry, measurement)
     for effect in shown:
@@ -50,7 +50,7 @@ def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candid
     return [*found, *_locking(residuals.geometry)] if isinstance(residuals, StereoResiduals) else found
 
 
-def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> Iterator[Candidate | Grid]:
+def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> Iterator[Candidate | SineGrid]:
     """What one effect allows, by its own equation at typical sizes."""
     if effect.searched is not None:
         yield from _searched(effect, effect.searched, geometry, fixed)
@@ -77,7 +77,7 @@ def _sine_and_cosine(effect: type[Effect], geometry: Geometry, fixed: dict[str, 
     return np.stack([*values], axis=1)
 
 
-def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: dict[str, Any]) -> Iterator[Grid]:
+def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: dict[str, Any]) -> Iterator[SineGrid]:
     """A grid of periods as fine as the reach of what the sine runs along can tell apart."""
     (amplitude,) = effect.typical_sizes()
     x = np.asarray(effect(**fixed).argument(geometry), dtype=np.float64)
@@ -88,12 +88,14 @@ def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: d
     angle = 2 * np.pi * x / search.shortest
     columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
     factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
-    yield Grid(effect.tag(), amplitude, Wave(search.period, factor, x), frequencies(low, 1 / search.shortest, 0.3 / reach), fixed)
+    yield SineGrid(
+        effect.tag(), amplitude, Wave(search.period, factor, x), frequencies(low, 1 / search.shortest, 0.3 / reach), fixed
+    )
 
 
 def _of_cameras(
     effects: list[type[CameraEffect]], geometry: PixelGeometry, measurement: StereoMeasurement
-) -> list[Candidate | Grid]:
+) -> list[Candidate | SineGrid]:
     """By finite differences: the changed pair sees other disparities."""
     nominal = NominalPair.of(measurement)
     sets = {effect: effect.sets or (tuple(effect.nulls()),) for effect in effects}
@@ -124,7 +126,7 @@ def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
     return dict(zip(names, map(float, values), strict=True))
 
 
-def _locking(geometry: PixelGeometry) -> list[Grid]:
+def _locking(geometry: PixelGeometry) -> list[SineGrid]:
     """A sine of the disparity with the pixels of the matched image, full or reduced, at any phase.
 
     The rectification in which the disparities were found is not part of a measurement: its principal distance (the period) is
@@ -133,7 +135,7 @@ def _locking(geometry: PixelGeometry) -> list[Grid]:
     reach = max(float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99]))), 1.0)
     one = np.ones_like(geometry.disparity)
     return [
-        Grid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity), tried)
+        SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity), tried)
         for reduction in _REDUCTIONS
         if (tried := frequencies((1 - _SCALE_UNKNOWN) / reduction, (1 + _SCALE_UNKNOWN) / reduction, 0.3 / reach, 80)).size
     ]

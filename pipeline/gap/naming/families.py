@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import Candidate, Grid, free_forms, places, surface_form
+from pipeline.gap.mean.candidates import Candidate, SineGrid, free_forms, places, surface_form
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.naming.entries import PLANES
 from pipeline.gap.residuals.residuals import Residuals
@@ -24,10 +24,10 @@ def believes(measurement: Measurement, name: str) -> bool:
     return any(effect.name == name for effect in measurement.model.effects)
 
 
-def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | Grid]:
+def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
     """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
     named = mean_families(part, measurement)
-    lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, Grid) and each.name in PERIODIC}
+    lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}
     free = [
         form
         for name, values in part.covariates.items()
@@ -39,9 +39,9 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | G
     return [*map(_with_precision, named), *free, both, *places(part.at)]
 
 
-def _with_precision(candidate: Candidate | Grid) -> Candidate | Grid:
+def _with_precision(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
     """With what is typical of its effect: two effects that nearly cancel each other must not do so at any size."""
-    if isinstance(candidate, Grid):
+    if isinstance(candidate, SineGrid):
         return candidate
     typical = effect_of(candidate.name).typical_sizes()
     units = np.eye(len(candidate.names))

@@ -12,7 +12,7 @@ from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.entries import Named, from_comb, from_locking, from_mean, from_spread, within_bounds
 from pipeline.gap.naming.families import believes, families_of
-from pipeline.gap.naming.relinearised import Points, beyond, followed_up, noisier, undone, weighed
+from pipeline.gap.naming.relinearised import SearchedPoints, beyond, followed_up, noisier, undone, weighed
 from pipeline.gap.other.locking import find_locking
 from pipeline.gap.other.quantization import find_comb
 from pipeline.gap.other.spread import SpreadFound, SpreadTried, find_spread, share_of_spread
@@ -92,7 +92,7 @@ def name_effects(
     spread, spread_tried, words = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
     if wrong := _too_wide(measurement, spread):
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
-    points = Points(measurement, part, families, spread, (scale, added), random)
+    points = SearchedPoints(measurement, part, families, spread, (scale, added), random)
     first = MeanSearch(weighed(part, spread, scale), families, random)
     found = followed_up(points, first)
     names, cosines, survival = first.design.identifiability()

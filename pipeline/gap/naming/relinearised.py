@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, Grid, harmonics, precision_of
+from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, SineGrid, harmonics, precision_of
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Chosen, Tried, class_margin
 from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, settled_with, typical_sizes
@@ -27,13 +27,13 @@ _MOST_CONVERGED, _ROUNDS, _CONVERGED = 3, 4, 1.0
 
 
 @dataclass(frozen=True)
-class Points:
+class SearchedPoints:
     """What the searches for effects on the mean share. spread: effects on it that are known; noise: how many predicted sigmas the
     residuals spread, and variance to add to the predicted one."""
 
     measurement: Measurement
     part: Residuals
-    families: list[Candidate | Grid]
+    families: list[Candidate | SineGrid]
     spread: list[SpreadFound]
     noise: tuple[float, float]
     random: KeyedRandom
@@ -75,7 +75,7 @@ class _Alone:
         return self.log_likelihood - (self.chosen.gain - self.chosen.score)
 
     @classmethod
-    def of(cls, points: Points, first: MeanSearch, chosen: Chosen, estimate: Estimate) -> _Alone | None:
+    def of(cls, points: SearchedPoints, first: MeanSearch, chosen: Chosen, estimate: Estimate) -> _Alone | None:
         """None where it is beyond what can be, or where the rays of many points would miss the reference with it."""
         if beyond(points.measurement, [estimate], points.part):
             return None
@@ -90,7 +90,7 @@ class _Alone:
             chosen, estimate, _at_points(found, points.part), there, first.design.log_likelihood(value, estimate.candidate)
         )
 
-    def better(self, points: Points, first: MeanSearch) -> _Alone | None:
+    def better(self, points: SearchedPoints, first: MeanSearch) -> _Alone | None:
         """With its values moved by the slopes here."""
         candidate = _renewed(self.estimate.candidate, families_of(self.there, self.at))
         columns = np.concatenate([self.at.pose, candidate.columns], axis=1) / self.at.sigma[:, None]
@@ -99,7 +99,7 @@ class _Alone:
         return _Alone.of(points, first, self.chosen, replace(self.estimate, values=self.estimate.values + step[6:]))
 
 
-def followed_up(points: Points, first: MeanSearch) -> Explained:
+def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     """What the first search chose, with what stands beside it when it is taken exactly.
 
     Slopes miss some of a large effect, and others then make up for it: where one alone, taken exactly, needs fewer beside it,
@@ -117,7 +117,7 @@ def followed_up(points: Points, first: MeanSearch) -> Explained:
     return min(found, key=lambda each: each.complexity, default=plain)
 
 
-def _largest_alone(points: Points, first: MeanSearch) -> _Alone | None:
+def _largest_alone(points: SearchedPoints, first: MeanSearch) -> _Alone | None:
     """The effect that explains most by itself, of those that explain much; None where slopes say all."""
     found: list[_Alone] = []
     for candidate in first.leading():
@@ -146,7 +146,7 @@ def _with_class(converged: list[_Alone]) -> _Alone:
     return replace(best, chosen=replace(best.chosen, alike=tuple(sorted(near | slopes))))
 
 
-def _converged(points: Points, first: MeanSearch, alone: _Alone) -> _Alone:
+def _converged(points: SearchedPoints, first: MeanSearch, alone: _Alone) -> _Alone:
     """At the values that explain most."""
     for _ in range(_ROUNDS):
         better = alone.better(points, first)
@@ -156,7 +156,7 @@ def _converged(points: Points, first: MeanSearch, alone: _Alone) -> _Alone:
     return alone
 
 
-def _beside(points: Points, chosen: Explained) -> Explained:
+def _beside(points: SearchedPoints, chosen: Explained) -> Explained:
     """With what a search finds beside the effects, unless they are beyond what can be."""
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or beyond(points.measurement, chosen.estimates, chosen.at):
@@ -203,7 +203,7 @@ def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
 
 
 def _again(
-    points: Points, had: list[Estimate], alone: Mapping[Explanation, float]
+    points: SearchedPoints, had: list[Estimate], alone: Mapping[Explanation, float]
 ) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]]:
     """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
 
@@ -238,7 +238,7 @@ def _again(
     return search, at, _without_sines([*kept, *_estimates(search, chosen)]), chosen, tried
 
 
-def _with(points: Points, effects: list[Estimate]) -> Settled:
+def _with(points: SearchedPoints, effects: list[Estimate]) -> Settled:
     """The measurement with some effects in its model, settled."""
     return settled_with(points.measurement, [from_mean(each, points.part) for each in effects], points.part.index)
 
@@ -271,13 +271,13 @@ def _kept(at: Residuals, part: Residuals) -> BoolArray:
     return np.isin(part.index, at.index)
 
 
-def _renewed(candidate: Candidate, families: list[Candidate | Grid]) -> Candidate:
+def _renewed(candidate: Candidate, families: list[Candidate | SineGrid]) -> Candidate:
     """The same candidate for other rays."""
     key = "" if candidate.wave is None else candidate.wave.key
     chosen = {name: value for name, value in candidate.fixed.items() if name != key}
     for family in families:
         if family.name == candidate.name and not family.empirical and dict(family.fixed) == chosen:
-            if isinstance(family, Grid):
+            if isinstance(family, SineGrid):
                 return family.at(candidate.period)
             if family.names == candidate.names:
                 return family

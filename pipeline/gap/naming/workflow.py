@@ -31,8 +31,8 @@ from pipeline.gap.naming.splitting import with_splits
 from pipeline.gap.naming.verdict import Evidence, lower_noise, too_noisy, verdict_of
 from pipeline.gap.naming.verification import Showing
 from pipeline.gap.naming.verify import Gap
-from pipeline.gap.other.footprint import find_footprint
 from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
+from pipeline.gap.other.mixed_pixels import find_footprint
 from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadTried, Tails, find_tails
 from pipeline.gap.other.stereo_shapes import find_shapes
@@ -62,7 +62,7 @@ _USUAL = Decisions()
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class GapDiagnosis:
     """What was found.
 
     held_out: (n,) points never used in naming; before, after: (n,) residuals with registration taken off, in the observable's
@@ -103,7 +103,7 @@ def diagnose(
     seed: int = 1,
     progress: Callable[[str], None] | None = None,
     decisions: Decisions = _USUAL,
-) -> Diagnosis:
+) -> GapDiagnosis:
     """Find what separates the measurement from its model, name it, add it and measure the gap again.
 
     progress: called with the name of each step of `STEPS` that is done; decisions: the thresholds to decide by.
@@ -113,7 +113,7 @@ def diagnose(
         return _diagnose(measurement, _Clock(progress), KeyedRandom(seed, ("gap",)))
 
 
-def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> Diagnosis:
+def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
     measurement = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
     check_near(measurement.fit)
     first = residuals_of(measurement)
@@ -153,7 +153,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> D
     evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far)
     value = plain.value - plain.pose @ showing.pose
     clock.lap("verification")
-    return Diagnosis(
+    return GapDiagnosis(
         verdict=verdict_of(shown.named, evidence),
         effects=tuple(shown.named),
         changes=tuple(state.changes),
@@ -401,11 +401,11 @@ def _remaining(evidence: Evidence, notes: list[str], lower_noise: dict[str, floa
     }
 
 
-def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> Diagnosis:
+def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> GapDiagnosis:
     count, least = int(residuals.smooth.sum()), decided().points.fewest
     note = f"{count} points on smooth parts of the reference and stable ground, {least} are needed"
     empty = np.zeros(len(residuals))
-    return Diagnosis(
+    return GapDiagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, np.zeros(6), measurement.model,
         None, (), (), _remaining(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
         clock.total, clock.laps, decided(),

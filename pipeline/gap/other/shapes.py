@@ -37,13 +37,13 @@ class ShapeFound:
 
 
 @dataclass(frozen=True)
-class Blocks:
+class WallBlocks:
     """number: (n,) of the block of the wall in which each point lies."""
 
     number: NDArray[np.int64]
 
     @classmethod
-    def over(cls, at: FloatArray) -> Blocks:
+    def over(cls, at: FloatArray) -> WallBlocks:
         """Of about a hundred points each; at: (n, 2)."""
         return cls(patches(at, _POINTS_PER_BLOCK))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import StereoMeasurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
+from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -46,7 +46,7 @@ class _Witnesses:
     disparity: FloatArray
     rough: FloatArray
     sigma: FloatArray
-    blocks: Blocks
+    blocks: WallBlocks
     held_out: BoolArray
 
     def gains(self, beside: list[Effect], effect: Effect) -> FloatArray:
@@ -87,7 +87,7 @@ def find_shapes(
         residuals.geometry.disparity,
         rough + raster.moved(believed, residuals.geometry.disparity),
         scale * residuals.sigma,
-        Blocks.over(residuals.at),
+        WallBlocks.over(residuals.at),
         held_out,
     )
     found: list[ShapeFound] = []

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.naming.workflow import Diagnosis
+from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.residuals.residuals import Residuals
 from scene.mesh import FloatArray
 
@@ -22,7 +22,7 @@ _MARGIN_M = 0.3
 """Points this near to the box of a scene change count as part of it."""
 
 
-def where(found: Diagnosis) -> list[dict[str, Any]]:
+def where(found: GapDiagnosis) -> list[dict[str, Any]]:
     """As gap.json holds it, the clearest first: each covariate's bin that departs most, by statistic.
 
     A mean's `size_m` is positive where the measured surface lies deeper than the predicted one.
@@ -34,7 +34,7 @@ def where(found: Diagnosis) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (row["p_value"], -abs(row["size_m"])))[:_MOST_ROWS]
 
 
-def standardised(found: Diagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
+def standardised(found: GapDiagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
     """Name and values of each covariate, and the residuals before over their predicted sigma, on smooth parts, no outliers."""
     residuals = found.residuals
     kept = steady(found)
@@ -42,7 +42,7 @@ def standardised(found: Diagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
     return [(name, values[kept], z) for name, values in residuals.covariates.items()] if kept.any() else []
 
 
-def steady(found: Diagnosis) -> Any:
+def steady(found: GapDiagnosis) -> Any:
     """(n,) points on smooth parts of the surface, outside of scene changes, whose residual before is no outlier."""
     residuals = found.residuals
     kept = residuals.smooth & (np.abs(found.before) < _INNER * residuals.sigma)

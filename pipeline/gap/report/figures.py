@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.gap.naming.verify import Gap
-from pipeline.gap.naming.workflow import Diagnosis
+from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.report.covariate_ranking import bins, standardised, steady
 from pipeline.gap.report.in_words import with_unit
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -39,7 +39,7 @@ _MANY = 300.0
 """Span of a logarithmic axis from which on it has a number per decade, else two."""
 
 
-def maps_figure(found: Diagnosis) -> bytes:
+def maps_figure(found: GapDiagnosis) -> bytes:
     """Residuals before and after on one scale: means of small pixels, and their spread over what each model predicts."""
     unit, pixels = 1e3 * found.residuals.depth_m, _Pixels(found)
     left, right, low, high = pixels.extent
@@ -80,7 +80,7 @@ def _bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: s
     figure.colorbar(image, ax=panels, label=label, extend="both", location="bottom", shrink=0.6, aspect=45)
 
 
-def sigma_after(found: Diagnosis) -> FloatArray:
+def sigma_after(found: GapDiagnosis) -> FloatArray:
     """(n,) spread that the model with the named effects predicts, in the observable's unit."""
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays):
@@ -90,7 +90,7 @@ def sigma_after(found: Diagnosis) -> FloatArray:
     raise TypeError("model and residuals are of different sensors")
 
 
-def profiles_figure(found: Diagnosis) -> bytes:
+def profiles_figure(found: GapDiagnosis) -> bytes:
     """Means and spreads against each covariate, with two standard errors, and what the named effects explain on top."""
     names = [name for name, _, _ in standardised(found)]
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
@@ -192,7 +192,7 @@ def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -
 class _Pixels:
     """Square pixels over the smooth points, with some points in each."""
 
-    def __init__(self, found: Diagnosis) -> None:
+    def __init__(self, found: GapDiagnosis) -> None:
         residuals = found.residuals
         self._kept = residuals.smooth if residuals.smooth.any() else ~residuals.smooth
         at = residuals.at[self._kept]

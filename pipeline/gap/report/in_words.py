@@ -9,7 +9,7 @@ from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verdict import closing, in_a_sentence, left_over
 from pipeline.gap.naming.verify import Gap
-from pipeline.gap.naming.workflow import Diagnosis
+from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.other.spread import SpreadTried
 from pipeline.gap.report.quantities import with_std
 from pipeline.report.page import true_minus
@@ -25,7 +25,7 @@ _UNITS = {
 }  # fmt: skip
 
 
-def title(found: Diagnosis) -> str:
+def title(found: GapDiagnosis) -> str:
     """The outcome in a few words."""
     names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
     match found.verdict:
@@ -43,7 +43,7 @@ def title(found: Diagnosis) -> str:
             return f"Missing: {listed(names)}"
 
 
-def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
+def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     """What was compared, what was found, how far the gap closes. rows: as `where` gives them."""
     parts = [f"{len(found.residuals):,} {_INSTRUMENTS[found.residuals.sensor]} were compared with what the model predicts."]
     parts.append(in_a_sentence(found.verdict, found.effects, found.evidence))
@@ -60,7 +60,7 @@ def paragraph(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
     return " ".join(parts)
 
 
-def _shown_most(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
+def _shown_most(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     """Where the disagreement is; where nothing describes it, also how large it is there."""
     if found.verdict in ("no_gap", "insufficient_data") or not rows:
         return ""
@@ -79,7 +79,7 @@ def _shown_most(found: Diagnosis, rows: list[dict[str, Any]]) -> str:
     return f"Before anything was named it showed most in the {statistic} against {listed(seen)}."
 
 
-def outcome(found: Diagnosis, tried: Sequence[Tried], item: Tried) -> str:
+def outcome(found: GapDiagnosis, tried: Sequence[Tried], item: Tried) -> str:
     """What became of one of the explanations `tried`, best first: named, in the class of a named one, or rejected."""
     if item.empirical:
         added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
@@ -88,7 +88,7 @@ def outcome(found: Diagnosis, tried: Sequence[Tried], item: Tried) -> str:
     return _outcome_of(found, item.name)
 
 
-def spread_outcome(found: Diagnosis, item: SpreadTried) -> str:
+def spread_outcome(found: GapDiagnosis, item: SpreadTried) -> str:
     """What became of one of the explanations of the spread."""
     if item.empirical:
         added = any(effect.kind == "empirical" and effect.spreads for effect in found.effects)
@@ -96,7 +96,7 @@ def spread_outcome(found: Diagnosis, item: SpreadTried) -> str:
     return _outcome_of(found, item.name)
 
 
-def _outcome_of(found: Diagnosis, effect: str) -> str:
+def _outcome_of(found: GapDiagnosis, effect: str) -> str:
     """What became of an effect of the catalogue."""
     name = f"{found.residuals.sensor}.{effect}"
     physical = [each for each in found.effects if each.kind == "physical"]

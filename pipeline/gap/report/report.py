@@ -13,7 +13,7 @@ from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import deciding
 from pipeline.gap.naming.verdict import closing, in_a_sentence
-from pipeline.gap.naming.workflow import Diagnosis
+from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.report.covariate_ranking import steady, where
 from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
 from pipeline.gap.report.in_words import (
@@ -33,7 +33,7 @@ from pipeline.report.page import p_value_in_words, template
 _MOST_TRIED = 25
 
 
-def to_dict(found: Diagnosis, measurement: Measurement) -> dict[str, Any]:
+def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
     """gap.json."""
     shift, turn = found.pose[:3], found.pose[3:]
     axes = measurement.frame.rotation
@@ -53,7 +53,7 @@ def to_dict(found: Diagnosis, measurement: Measurement) -> dict[str, Any]:
     }
 
 
-def write(out: Path, found: Diagnosis, measurement: Measurement) -> Path:
+def write(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
     """Write all files of a diagnosis into `out`, once all pictures are drawn; returns report.html.
 
     before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one.
@@ -74,13 +74,13 @@ def write(out: Path, found: Diagnosis, measurement: Measurement) -> Path:
     return out / "report.html"
 
 
-def summary(found: Diagnosis) -> str:
+def summary(found: GapDiagnosis) -> str:
     """The verdict in some lines of text."""
     with deciding(found.decisions):
         return _summary(found)
 
 
-def _summary(found: Diagnosis) -> str:
+def _summary(found: GapDiagnosis) -> str:
     lines = [f"{found.verdict}: {in_a_sentence(found.verdict, found.effects, found.evidence)}"]
     if found.verdict == "insufficient_data":
         lines += [f"  {found.remaining['note']}", f"  to measure: {_request(found)}"]
@@ -97,7 +97,7 @@ def _summary(found: Diagnosis) -> str:
     return "\n".join(lines)
 
 
-def _request(found: Diagnosis) -> str:
+def _request(found: GapDiagnosis) -> str:
     """What insufficient_data asks for."""
     return (
         f"at least {found.decisions.points.fewest} points on smooth rock of stable ground, spread over the wall: scan or match "
@@ -105,7 +105,7 @@ def _request(found: Diagnosis) -> str:
     )
 
 
-def _pictures(found: Diagnosis) -> dict[str, bytes]:
+def _pictures(found: GapDiagnosis) -> dict[str, bytes]:
     pictures = {"maps.png": maps_figure(found)} if len(found.residuals) else {}
     if steady(found).any():
         pictures["profiles.png"] = profiles_figure(found)
@@ -118,7 +118,7 @@ def _pictures(found: Diagnosis) -> dict[str, bytes]:
     return pictures
 
 
-def _page(found: Diagnosis, pictures: dict[str, bytes]) -> str:
+def _page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
     rows = where(found)
     tried = sorted(found.tried, key=lambda item: -item.score)
     best = tried[0].score if tried else 0.0

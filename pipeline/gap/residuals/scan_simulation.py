@@ -11,8 +11,8 @@ from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.upload import on_device
+from sensors.beam import Echo
 from sensors.effects.base import ShowsIn
-from sensors.footprint import Echo
 from sensors.model import TlsModel, TlsNoise
 from sensors.pulses import PulseGeometry, Pulses
 from sensors.tls import LaserScanner, Pattern, ScannerConfig

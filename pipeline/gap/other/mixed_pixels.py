@@ -8,14 +8,14 @@ import numpy as np
 
 from pipeline.formats.measurement import TlsMeasurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.other.shapes import Blocks, ShapeFound, log_density, refined
+from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.scan_simulation import mean_model, simulate_ranges
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from sensors.beam import Mode
 from sensors.effects.beam_divergence import BeamDivergence
-from sensors.footprint import Mode
 
 _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
@@ -37,7 +37,7 @@ def find_footprint(
     some = some[np.abs(wide) > sigma[some]]
     if len(some) < decided().shapes.footprint_fewest:
         return []
-    blocks = Blocks(Blocks.over(residuals.at).number[some])
+    blocks = WallBlocks(WallBlocks.over(residuals.at).number[some])
 
     def gains(mode: Mode, divergence_rad: float) -> FloatArray:
         moved = _moved(measurement, residuals, some, mode, divergence_rad)
