@@ -64,12 +64,11 @@ def read_with_laspy(path: Path) -> None:
 
 def main() -> None:
     cloud = scan()
-    channels = {"intensity": cloud.intensity, "gps_time": cloud.gps_time, "extra": cloud.extra}
     million = len(cloud.points) / 1e6
     with tempfile.TemporaryDirectory() as folder:
         ours, peers, text = (Path(folder) / name for name in ("ours.laz", "laspy.laz", "a.xyz"))
         writing, writing_laspy, writing_text = medians(
-            lambda: write_laz(ours, cloud.points, **channels),
+            lambda: write_laz(ours, cloud),
             lambda: write_with_laspy(peers, cloud),
             lambda: write_xyz(text, PointCloud(cloud.points, cloud.intensity)),
             rounds=ROUNDS,

@@ -74,7 +74,8 @@ def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     """One process: mesh file to LAS; or, in another, the rate of the observation and the bias of the beam, as JSON."""
     marks = [("start", psutil.Process().create_time()), ("import", 0.0)]
     from pipeline.config.simulation import SimulationConfig
-    from pipeline.formats.laz import write_laz
+    from pipeline.formats.laz import PulseChannels, write_laz
+    from pipeline.formats.point_cloud import PointCloud
     from pipeline.run.recorded_points import recorded_points
     from pipeline.run.site import prepare_site
     from scene.backend import dr
@@ -109,8 +110,8 @@ def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     marks.append(("scan", time.time()))
     cloud = recorded_points([seen])
     extra = dict(cloud.extra)
-    channels = {"gps_time": cloud.gps_time, "scan_angle_rad": extra.pop("scan_angle_rad"), "extra": extra}
-    write_laz(wall.with_suffix(".las"), cloud.points, intensity=cloud.intensity, **channels)
+    pulses = PulseChannels(scan_angle_rad=extra.pop("scan_angle_rad"))
+    write_laz(wall.with_suffix(".las"), PointCloud(cloud.points, cloud.intensity, cloud.gps_time, extra), pulses)
     marks.append(("write", time.time()))
     took = {name: after - before for (_, before), (name, after) in pairwise(marks)}
     sizes = {

@@ -16,6 +16,7 @@ import yaml
 from pipeline.formats.laz import write_laz
 from pipeline.formats.metashape import write_metashape
 from pipeline.formats.ply import write_ply
+from pipeline.formats.point_cloud import PointCloud
 from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.procedural import ProceduralWall
@@ -56,7 +57,7 @@ def measurement(folder: Path, step_rad: float = 0.004, effects: tuple[Effect, ..
     assert seen.intensity is not None and seen.gps_time is not None  # noqa: PT018 (a scanner records both)
     folder.mkdir(parents=True, exist_ok=True)
     points = frame.to_world(seen.points[seen.valid])
-    write_laz(folder / "scan.laz", points, intensity=seen.intensity[seen.valid], gps_time=seen.gps_time[seen.valid])
+    write_laz(folder / "scan.laz", PointCloud(points, seen.intensity[seen.valid], seen.gps_time[seen.valid]))
     write_ply(folder / "wall.ply", wall)
     _write_yaml(folder / "model.yaml", {"sensor": "tls", "noise": known.noise.model_dump(), "effects": []})
     _write_yaml(folder / "measurement.yaml", {

@@ -89,39 +89,43 @@ class Scan:
     rng: np.random.Generator
 
 
-def write_scan(
-    folder: Path,
-    seed: int,
-    angles: Callable[[Array, Array, Array], tuple[Array, Array]] | None = None,
-    ranges: Callable[[Scan], Array] | None = None,
-    lost: Callable[[Scan], Array] | None = None,
-    fall: tuple[float, float, float] | None = None,
-    blocks: Sequence[tuple[int, int, float]] = (),
-    step_rad: float = 0.0045,
-    intensity: bool = True,
-    epochs: int = 1,
-    stable_areas: list[list[float]] | None = None,
-) -> None:
-    """A laser scan, or epochs of it whose poses are off each for itself. angles: (azimuth, zenith, line) to recorded minus true
-    angles; ranges: recorded ranges; lost: returns lost; fall: x, z and depth of a niche of 1.2 m that the reference does not
-    have; blocks: column, row and depth of nodes that lie deeper than in the reference: pyramids of volume depth x STEP^2."""
+@dataclass(frozen=True)
+class ScanCase:
+    """What a scan is like. angles: (azimuth, zenith, line) to recorded minus true angles; ranges: recorded ranges; lost: returns
+    lost; fall: x, z and depth of a niche of 1.2 m that the reference does not have; blocks: column, row and depth of nodes that
+    lie deeper than in the reference: pyramids of volume depth x STEP^2."""
+
+    angles: Callable[[Array, Array, Array], tuple[Array, Array]] | None = None
+    ranges: Callable[[Scan], Array] | None = None
+    lost: Callable[[Scan], Array] | None = None
+    fall: tuple[float, float, float] | None = None
+    blocks: Sequence[tuple[int, int, float]] = ()
+    step_rad: float = 0.0045
+    intensity: bool = True
+    epochs: int = 1
+    stable_areas: list[list[float]] | None = None
+
+
+def write_scan(folder: Path, seed: int, **how: Any) -> None:
+    """A laser scan, or epochs of it whose poses are off each for itself. how: fields of a `ScanCase`."""
+    case = ScanCase(**how)
     rng = np.random.default_rng(seed)
     shape = int(WIDTH / STEP) + 1, int(HEIGHT / STEP) + 1
     nodes = 0.5 * smooth_noise(shape, 9.0, rng) + 0.08 * smooth_noise(shape, 2.5, rng)
     x, z = np.meshgrid(*(STEP * np.arange(size) for size in shape), indexing="ij")
     real = nodes.copy()
-    if fall is not None:
-        real += fall[2] * ((np.abs(x - fall[0]) < 0.6) & (np.abs(z - fall[1]) < 0.6))
-    for column, row, depth in blocks:
+    if case.fall is not None:
+        real += case.fall[2] * ((np.abs(x - case.fall[0]) < 0.6) & (np.abs(z - case.fall[1]) < 0.6))
+    for column, row, depth in case.blocks:
         real[column, row] += depth
     wall = Field(real)
     position, turn = np.array([WIDTH * 0.42, -34.0, 2.5]), 0.01
-    azimuth = np.arange(0.5 * np.pi - 0.62, 0.5 * np.pi + 0.68, step_rad)
-    zenith = np.arange(0.85, 1.63, step_rad)
+    azimuth = np.arange(0.5 * np.pi - 0.62, 0.5 * np.pi + 0.68, case.step_rad)
+    zenith = np.arange(0.85, 1.63, case.step_rad)
     az, ze = (grid.ravel() for grid in np.meshgrid(azimuth, zenith, indexing="ij"))
     line = np.repeat(np.arange(len(azimuth)), len(zenith)).astype(float)
-    for epoch in range(epochs):
-        daz, dz = (np.zeros_like(az),) * 2 if angles is None else angles(az, ze, line)
+    for epoch in range(case.epochs):
+        daz, dz = (np.zeros_like(az),) * 2 if case.angles is None else case.angles(az, ze, line)
         true_az, true_z = (
             nominal - error - ANGLE_SIGMA * rng.standard_normal(len(az)) for nominal, error in ((az, daz), (ze, dz))
         )
@@ -136,15 +140,15 @@ def write_scan(
         scan = Scan(
             true_range + SIGMA * rng.standard_normal(len(az)), az, ze, cosine, power, line, np.arange(len(az)) / len(az), rng
         )
-        recorded = scan.R if ranges is None else ranges(scan)
+        recorded = scan.R if case.ranges is None else case.ranges(scan)
         keep = hit & (rng.uniform(size=len(az)) > 0.01)
-        keep &= True if lost is None else ~lost(scan)
+        keep &= True if case.lost is None else ~case.lost(scan)
         columns = [*(unit(az, ze) * recorded[:, None]).T, power, 5e-5 * np.arange(len(az))]
         _points(
             folder / f"scan_{epoch}.ply",
             [column[keep] for column in columns],
             ["x", "y", "z", "intensity", "gps_time"],
-            intensity,
+            case.intensity,
         )
     Field(nodes + 0.0004 * smooth_noise(shape, 3.0, rng)).write(folder / "wall.ply")
     _yaml(
@@ -155,13 +159,13 @@ def write_scan(
         {
             "sensor": "tls",
             "reference": "wall.ply",
-            "points": [f"scan_{epoch}.ply" for epoch in range(epochs)] if epochs > 1 else "scan_0.ply",
-            "stable_areas": stable_areas or [],
+            "points": [f"scan_{epoch}.ply" for epoch in range(case.epochs)] if case.epochs > 1 else "scan_0.ply",
+            "stable_areas": case.stable_areas or [],
             "frame": "scanner",
             "scanner": {"position_m": position.tolist(), "rotation": rotation.tolist()},
             "pattern": {
-                "azimuth_rad": [float(azimuth[0]), float(azimuth[-1]) + 1e-9, step_rad],
-                "zenith_rad": [float(zenith[0]), float(zenith[-1]) + 1e-9, step_rad],
+                "azimuth_rad": [float(azimuth[0]), float(azimuth[-1]) + 1e-9, case.step_rad],
+                "zenith_rad": [float(zenith[0]), float(zenith[-1]) + 1e-9, case.step_rad],
             },
             "model": "model.yaml",
         },

@@ -167,8 +167,8 @@ PAIR = CameraPair(CAMERA, CAMERA)
 MAP = np.random.default_rng(2).normal(0, 0.01, (20, 30)).astype(np.float32)
 
 FILES: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
-    "a.laz": (lambda path: write_laz(path, CLOUD.points, intensity=CLOUD.intensity, extra=CLOUD.extra), read_laz),
-    "a.las": (lambda path: write_laz(path, CLOUD.points, intensity=CLOUD.intensity, extra=CLOUD.extra), read_laz),
+    "a.laz": (lambda path: write_laz(path, PointCloud(CLOUD.points, CLOUD.intensity, extra=CLOUD.extra)), read_laz),
+    "a.las": (lambda path: write_laz(path, PointCloud(CLOUD.points, CLOUD.intensity, extra=CLOUD.extra)), read_laz),
     "a.e57": (lambda path: write_e57(path, [E57Scan("scan", CLOUD, np.zeros(3), np.eye(3))]), read_e57),
     "a.xyz": (lambda path: write_xyz(path, CLOUD), read_xyz),
     "points.ply": (lambda path: write_ply_points(path, CLOUD), read_ply_points),

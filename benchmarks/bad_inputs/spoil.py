@@ -17,6 +17,7 @@ import yaml
 
 from pipeline.formats.laz import write_laz
 from pipeline.formats.ply import read_ply
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 
 Change = Callable[[Path], object]
@@ -134,7 +135,7 @@ def as_laz(*changes: Change) -> Change:
 
     def change(folder: Path) -> None:
         cloud = read_points(folder / "measurement/scan.ply")
-        write_laz(folder / "measurement/scan.laz", cloud.points, intensity=cloud.intensity, gps_time=cloud.gps_time)
+        write_laz(folder / "measurement/scan.laz", PointCloud(cloud.points, cloud.intensity, cloud.gps_time))
         put("measurement/measurement.yaml", points="scan.laz")(folder)
         both(*changes)(folder)
 

@@ -7,6 +7,7 @@ import math
 import os
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -37,44 +38,55 @@ _CHUNK_SIZE_AT, _LARGEST_CHUNK, _VARIABLE_CHUNKS = 12, 10_000_000, 2**32 - 1
 """Of a LAZ file: place of the chunks' size in LASzip's record, the largest that is believed, points, and what stands for any."""
 
 
-def write_laz(
-    path: Path,
-    points: FloatArray,
-    *,
-    intensity: NDArray[np.floating] | None = None,
-    gps_time: FloatArray | None = None,
-    return_number: NDArray[np.integer] | None = None,
-    number_of_returns: NDArray[np.integer] | None = None,
-    scan_angle_rad: FloatArray | None = None,
-    extra: Mapping[str, NDArray[Any]] | None = None,
-    scale_m: float = 1e-6,
-    date: datetime.date = datetime.date(2000, 1, 1),
-    wkt: str = "",
-) -> None:
+@dataclass(frozen=True)
+class PulseChannels:
+    """What LAS has places of its own for, beside intensity and time.
+
+    return_number, number_of_returns: (n,), 1 to 15, none: 1 of 1; scan_angle_rad: (n,) angle of the emitted direction from
+    straight down, as LAS has it (for a scanner pi - zenith).
+    """
+
+    return_number: NDArray[np.integer] | None = None
+    number_of_returns: NDArray[np.integer] | None = None
+    scan_angle_rad: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class LazHeader:
+    """scale_m: coordinates are stored as int32 multiples of it; date: of the file; wkt: of the coordinate system, where it is
+    known."""
+
+    scale_m: float = 1e-6
+    date: datetime.date = datetime.date(2000, 1, 1)
+    wkt: str = ""
+
+
+_PLAIN, _USUAL = PulseChannels(), LazHeader()
+
+
+def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
     """Write a point cloud as LAZ, or as LAS where `path` ends in .las; equal arguments give equal bytes.
 
-    points: (n, 3), m, finite; intensity: (n,) relative received power, at least 0, stored in 16 bits (see `_full_scale`);
-    gps_time: (n,), s; return_number, number_of_returns: (n,), 1 to 15, none: 1 of 1; scan_angle_rad: (n,) angle of the emitted
-    direction from straight down, as LAS has it (for a scanner pi - zenith), stored in steps of 0.006 degrees; extra: named (n,)
-    channels, stored as extra dimensions in the type they have; wkt: of the coordinate system, where it is known.
-    Coordinates are stored as int32 multiples of `scale_m` from an offset in whole metres at the middle of the cloud; a cloud
-    wider than 4295 m takes the next power of ten. Raises InputError where the file cannot be written.
+    cloud: finite points; its intensity, at least 0, is stored in 16 bits (see `_full_scale`), its extra channels as extra
+    dimensions in the type they have; scan angles are stored in steps of 0.006 degrees. Coordinates count from an offset in whole
+    metres at the middle of the cloud; a cloud wider than 4295 m takes the next power of ten of the scale. Raises InputError where
+    the file cannot be written.
     """
-    extra = dict(extra or {})
-    bits = _return_bits(return_number, number_of_returns)
-    channels = extra if gps_time is None else {"gps_time": gps_time, **extra}
-    channels = channels if scan_angle_rad is None else {"scan_angle": np.rint(scan_angle_rad / _SCAN_ANGLE_STEP), **channels}
-    header = _header(points, extra, scale_m, date)
-    full_scale = _full_scale(intensity)
-    if wkt:
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    points, intensity = cloud.points, cloud.intensity
+    bits = _return_bits(pulses.return_number, pulses.number_of_returns)
+    channels = cloud.extra if cloud.gps_time is None else {"gps_time": cloud.gps_time, **cloud.extra}
+    if pulses.scan_angle_rad is not None:
+        channels = {"scan_angle": np.rint(pulses.scan_angle_rad / _SCAN_ANGLE_STEP), **channels}
+    las, full_scale = _header(points, cloud.extra, header.scale_m, header.date), _full_scale(intensity)
+    if header.wkt:
+        las.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(header.wkt))
     if intensity is not None:
-        header.vlrs.append(laspy.VLR(_USER, _FULL_SCALE_RECORD, "intensity of 65535 counts", struct.pack("<d", full_scale)))
-    with writing(path) as temporary, temporary.open("wb") as file, _writer(file, header, path.suffix != ".las") as writer:
+        las.vlrs.append(laspy.VLR(_USER, _FULL_SCALE_RECORD, "intensity of 65535 counts", struct.pack("<d", full_scale)))
+    with writing(path) as temporary, temporary.open("wb") as file, _writer(file, las, path.suffix != ".las") as writer:
         for start in range(0, len(points), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            record = laspy.ScaleAwarePointRecord.zeros(len(points[rows]), header=header)
-            _fill(record.array, header, points[rows])
+            record = laspy.ScaleAwarePointRecord.zeros(len(points[rows]), header=las)
+            _fill(record.array, las, points[rows])
             record.array["bit_fields"] = bits if bits.ndim == 0 else bits[rows]
             for name, channel in channels.items():
                 record.array[name] = channel[rows]

@@ -93,7 +93,7 @@ def _write_points(path: Path, cloud: PointCloud) -> None:
     extra = dict(cloud.extra)
     if cloud.intensity is not None:
         extra[EXACT_INTENSITY] = np.asarray(cloud.intensity, dtype=np.float32)
-    write_laz(path, cloud.points, gps_time=cloud.gps_time, extra=extra)
+    write_laz(path, PointCloud(cloud.points, gps_time=cloud.gps_time, extra=extra))
 
 
 def _write_yaml(path: Path, values: Mapping[str, Any], comments: Sequence[str] = ()) -> None:

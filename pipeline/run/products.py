@@ -27,7 +27,7 @@ from pipeline.formats.crs import wkt_of
 from pipeline.formats.e57 import E57Scan, write_e57
 from pipeline.formats.geotiff import write_geotiff, write_tiff
 from pipeline.formats.inside import inside
-from pipeline.formats.laz import write_laz
+from pipeline.formats.laz import LazHeader, PulseChannels, write_laz
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import write_xyz
@@ -145,7 +145,7 @@ def _write_m3c2(out: Path, number: int, found: M3c2Map) -> None:
     maps: dict[str, NDArray[Any]] = {"distance_m": found.distance, "lod_m": found.level, "block": found.block}
     maps["significant"] = found.significant.astype(np.uint8)
     extra = {name: values.ravel()[found.place] for name, values in maps.items()}
-    write_laz(out / f"m3c2_{number:03d}.laz", found.points, extra=extra)
+    write_laz(out / f"m3c2_{number:03d}.laz", PointCloud(found.points, extra=extra))
 
 
 def _seen_record(seen: Look) -> dict[str, Any]:
@@ -214,17 +214,8 @@ def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans:
 def write_cloud(path: Path, cloud: PointCloud, wkt: str = "") -> None:
     """Write points.laz, with the channels that the format has a place of its own for in theirs; wkt: of the coordinates."""
     extra = dict(cloud.extra)
-    write_laz(
-        path,
-        cloud.points,
-        intensity=cloud.intensity,
-        gps_time=cloud.gps_time,
-        return_number=extra.pop("return_number", None),
-        number_of_returns=extra.pop("number_of_returns", None),
-        scan_angle_rad=extra.pop("scan_angle_rad", None),
-        extra=extra,
-        wkt=wkt,
-    )
+    pulses = PulseChannels(*(extra.pop(name, None) for name in ("return_number", "number_of_returns", "scan_angle_rad")))
+    write_laz(path, replace(cloud, extra=extra), pulses, LazHeader(wkt=wkt))
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:

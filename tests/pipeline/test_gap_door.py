@@ -16,6 +16,7 @@ from pipeline.cli.main import main
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import read_measurement
 from pipeline.formats.measurement_checks import PointFit
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
@@ -77,7 +78,7 @@ def header(place: int, value: float) -> Callable[[Path], None]:
 
     def change(folder: Path) -> None:
         path = folder / "scan.laz"
-        write_laz(path, scanned(folder))
+        write_laz(path, PointCloud(scanned(folder)))
         data = bytearray(path.read_bytes())
         struct.pack_into("<d", data, place, value)
         path.write_bytes(data)

@@ -21,7 +21,7 @@ from pipeline.formats.cameras import write_cameras_yaml
 from pipeline.formats.colmap import write_colmap
 from pipeline.formats.e57 import E57Scan, write_e57
 from pipeline.formats.geotiff import write_geotiff
-from pipeline.formats.laz import write_laz
+from pipeline.formats.laz import PulseChannels, write_laz
 from pipeline.formats.measurement import StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.metashape import write_metashape
 from pipeline.formats.ply import read_ply
@@ -95,7 +95,8 @@ def as_ptx(case: Case, folder: Path) -> Path:
 def as_laz(case: Case, folder: Path) -> Path:
     """In the order of a tile's index, not in that of the scan; its times tell it."""
     mixed = np.random.default_rng(1).permutation(len(case[1].points))
-    write_laz(folder / "a.laz", in_world(case)[mixed], intensity=case[1].intensity[mixed], gps_time=case[1].gps_time[mixed])
+    cloud = case[1]
+    write_laz(folder / "a.laz", PointCloud(in_world(case)[mixed], cloud.intensity[mixed], cloud.gps_time[mixed]))
     return folder / "a.laz"
 
 
@@ -443,7 +444,7 @@ def test_a_real_scan_in_its_own_frame(tmp_path: Path) -> None:
         "return_number": data["Target_index"][rows].astype(np.uint8),
         "number_of_returns": data["Target_count"][rows].astype(np.uint8),
     }
-    write_laz(tmp_path / "forest.laz", points[rows], **echo)
+    write_laz(tmp_path / "forest.laz", PointCloud(points[rows]), PulseChannels(**echo))
     found = build(Request([tmp_path / "forest.laz"], "half", "riegl_vz400i"), tmp_path / "out")
     stated = yaml.safe_load((tmp_path / "out" / "measurement.yaml").read_text())
     assert stated["scanner"]["position_m"] == [0.0, 0.0, 0.0]

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.formats.e57 import E57Scan, read_e57, write_e57
-from pipeline.formats.laz import read_laz, write_laz
+from pipeline.formats.laz import PulseChannels, read_laz, write_laz
 from pipeline.formats.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import SUFFIXES, read_points
@@ -134,7 +134,7 @@ def test_returns_and_scan_angles_are_standard_las_fields(tmp_path: Path, cloud: 
     number = rng.integers(1, count + 1)
     zenith = rng.uniform(0, np.pi, COUNT)
     path = tmp_path / f"a{suffix}"
-    write_laz(path, cloud.points, return_number=number, number_of_returns=count, scan_angle_rad=np.pi - zenith)
+    write_laz(path, PointCloud(cloud.points), PulseChannels(number, count, np.pi - zenith))
     las = laspy.read(path)
     np.testing.assert_array_equal(las.return_number, number)
     np.testing.assert_array_equal(las.number_of_returns, count)
@@ -146,7 +146,7 @@ def test_returns_and_scan_angles_are_standard_las_fields(tmp_path: Path, cloud: 
 
 
 def test_single_returns_are_one_of_one_and_no_channel(tmp_path: Path, cloud: PointCloud) -> None:
-    write_laz(tmp_path / "a.laz", cloud.points)
+    write_laz(tmp_path / "a.laz", PointCloud(cloud.points))
     las = laspy.read(tmp_path / "a.laz")
     assert set(np.unique(las.return_number)) == set(np.unique(las.number_of_returns)) == {1}
     assert read_laz(tmp_path / "a.laz").extra == {}
@@ -163,7 +163,7 @@ def test_scan_angles_of_old_point_formats_are_degrees(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("number", "count"), [(0, 1), (2, 1), (16, 16)])
 def test_impossible_returns_are_refused(tmp_path: Path, number: int, count: int) -> None:
     with pytest.raises(ValueError, match="return numbers"):
-        write_laz(tmp_path / "a.laz", np.zeros((1, 3)), return_number=np.array([number]), number_of_returns=np.array([count]))
+        write_laz(tmp_path / "a.laz", PointCloud(np.zeros((1, 3))), PulseChannels(np.array([number]), np.array([count])))
     assert not list(tmp_path.iterdir())
 
 
@@ -231,8 +231,8 @@ def test_xyz_that_is_none_is_named(tmp_path: Path, text: str, message: str) -> N
 
 def test_a_cloud_is_read_by_its_suffix(tmp_path: Path, cloud: PointCloud) -> None:
     """In scanner coordinates everywhere but in E57, whose pose is applied."""
-    write_laz(tmp_path / "a.laz", cloud.points)
-    write_laz(tmp_path / "a.LAS", cloud.points)
+    write_laz(tmp_path / "a.laz", PointCloud(cloud.points))
+    write_laz(tmp_path / "a.LAS", PointCloud(cloud.points))
     write_ply_points(tmp_path / "a.ply", cloud)
     write_xyz(tmp_path / "a.xyz", cloud)
     write_e57(tmp_path / "a.e57", [scan(cloud)])

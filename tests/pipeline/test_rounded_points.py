@@ -13,6 +13,7 @@ from gap_cases import SIGMA, write_scan
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import Measurement, read_measurement
 from pipeline.formats.ply import read_ply_points, write_ply_points
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.rounded_points import check_rounded_points
 from pipeline.gap.residuals.registration import residuals_of
 from scene.errors import InputError
@@ -56,7 +57,7 @@ def test_rounding_that_outweighs_the_noise_is_refused(tmp_path: Path) -> None:
 def test_las_in_steps_of_a_centimetre_is_read(tmp_path: Path) -> None:
     write_scan(tmp_path, 1, step_rad=0.02)
     cloud = read_ply_points(tmp_path / "scan_0.ply")
-    write_laz(tmp_path / "scan.laz", np.rint(cloud.points * 100) / 100)
+    write_laz(tmp_path / "scan.laz", PointCloud(np.rint(cloud.points * 100) / 100))
     settings = yaml.safe_load((tmp_path / "measurement.yaml").read_text())
     (tmp_path / "measurement.yaml").write_text(yaml.safe_dump({**settings, "points": "scan.laz"}))
     assert "x in steps of 0.01 m" in read_measurement(tmp_path).notes[0]

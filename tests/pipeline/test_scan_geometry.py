@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from surfaces import heightfield
 
 from pipeline.formats.laz import read_laz, write_laz
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.scan_geometry import ScanGeometry, polar, recover_pattern
 from scene.errors import InputError
@@ -92,7 +93,7 @@ def test_the_pattern_is_found_in_shuffled_half_empty_points_with_second_echoes()
 def test_the_pattern_survives_a_laz_file(tmp_path: Path) -> None:
     """Coordinates in whole micrometres at 50 m: 1e-8 rad each, 1e-9 in the start over 30,000 points."""
     seen, pattern = scan(0.003)
-    write_laz(tmp_path / "a.laz", seen.points[seen.valid])
+    write_laz(tmp_path / "a.laz", PointCloud(seen.points[seen.valid]))
     found = recover_pattern(read_laz(tmp_path / "a.laz").points, POSITION, LEVEL)
     assert_pattern(found, seen, pattern, np.arange(seen.valid.sum()), atol=1e-9)
     assert found.azimuth_rms < 1e-8

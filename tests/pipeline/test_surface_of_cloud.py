@@ -13,6 +13,7 @@ from surfaces import heightfield
 from pipeline.cli import main as cli
 from pipeline.formats.laz import write_laz
 from pipeline.formats.ply import read_ply
+from pipeline.formats.point_cloud import PointCloud
 from scene.imported import ImportedWall
 
 STATION = np.array([345203.0, 6389435.0, 122.0])
@@ -26,7 +27,7 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Points every 8 cm on a rough wall of 6 x 4 m in survey coordinates, in no order."""
     points = heightfield(6.0, 4.0, 0.08, roughness=0.05).vertices
     path = tmp_path_factory.mktemp("cloud") / "scan.laz"
-    write_laz(path, np.random.default_rng(1).permutation(points) @ TURN.T + ORIGIN)
+    write_laz(path, PointCloud(np.random.default_rng(1).permutation(points) @ TURN.T + ORIGIN))
     return path
 
 

@@ -26,6 +26,7 @@ from pipeline.formats.atomic import write_json, write_text
 from pipeline.formats.geotiff import read_geotiff, write_geotiff
 from pipeline.formats.laz import read_laz, write_laz
 from pipeline.formats.ply import read_ply
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.run.simulation import simulate
 from pipeline.view.figures import map_figure, wall_figure
 from pipeline.view.page import clicked, zoom
@@ -67,7 +68,7 @@ def gap(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = np.stack([x.ravel() + 5e5, 4e6 + up.ravel() * np.cos(lean), 300 + up.ravel() * np.sin(lean)], axis=1)
     for name, factor in (("before", 1e-3), ("after", 1e-4)):
         extra = {"residual_m": factor * x.ravel(), "held_out": (x.ravel() > 10).astype(np.uint8)}
-        write_laz(out / f"{name}.laz", points, extra=extra)
+        write_laz(out / f"{name}.laz", PointCloud(points, extra=extra))
     change = {"bbox_m": [*points[0], *(points[0] + 1)], "volume_m3": 0.12}
     write_json(out / "gap.json", {"schema": 1, "sensor": "tls", "verdict": "named", "scene_changes": [change]})
     return out

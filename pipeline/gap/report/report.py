@@ -11,6 +11,7 @@ import yaml
 from pipeline.formats.atomic import write_json, write_text, writing
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import Measurement
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.decisions import deciding
 from pipeline.gap.naming.verdict import closing, in_a_sentence
 from pipeline.gap.naming.workflow import GapDiagnosis
@@ -66,7 +67,7 @@ def write(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
     points = measurement.frame.to_world(measurement.cloud.points[found.residuals.index])
     for name, residual in (("before", found.before), ("after", found.after)):
         extra: dict[str, Any] = {"residual_m": residual * found.residuals.depth_m, "held_out": found.held_out.astype(np.uint8)}
-        write_laz(out / f"{name}.laz", points, extra=extra)
+        write_laz(out / f"{name}.laz", PointCloud(points, extra=extra))
     for file, png in pictures.items():
         with writing(out / file) as temporary:
             temporary.write_bytes(png)
