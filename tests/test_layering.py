@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -210,3 +211,32 @@ def test_no_two_classes_have_one_name() -> None:
                 if isinstance(node, ast.ClassDef):
                     places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
     assert {name: files for name, files in places.items() if len(files) > 1} == {}
+
+
+PAGE = (ROOT / "docs" / "architecture.md").read_text()
+
+
+def test_the_page_on_the_architecture_names_every_room_and_only_files_that_there_are() -> None:
+    known = {file.name for folder in ("scene", "sensors", "pipeline", "tests") for file in sources(folder)}
+    for name in re.findall(r"`([\w/]+\.py)`", PAGE):
+        assert (ROOT / name).is_file() or (ROOT / "pipeline" / name).is_file() or ("/" not in name and name in known), name
+    rooms = {path.name for path in (ROOT / "pipeline").iterdir() if (path / "__init__.py").is_file()}
+    assert rooms <= {name.removesuffix("/") for name in re.findall(r"`([\w/]+/)`", PAGE)}
+
+
+def test_the_architecture_fits_on_a_page() -> None:
+    assert len(PAGE.splitlines()) <= 80
+
+
+def test_the_page_lists_the_rooms_in_the_order_of_their_needs() -> None:
+    rows = [line for line in PAGE.splitlines() if re.match(r"\| `\w+/`", line)]
+    listed = [re.findall(r"`(\w+)/`", row.split("|")[1]) for row in rows]
+    place = {f"pipeline.{room}": number for number, names in enumerate(listed) for room in names}
+    later = {
+        (room, needed)
+        for room, others in room_edges(modules()).items()
+        for needed in others
+        if room.startswith("pipeline.") and needed.startswith("pipeline.")
+        if place[".".join(needed.split(".")[:2])] > place[".".join(room.split(".")[:2])]
+    }
+    assert later == set()

@@ -153,8 +153,7 @@ class Reobserver:
         known = ~np.isnan(lattice[:, 0])
         first = _best_rigid(lattice[known], self._lattice_points[known])
         config = icp.model_copy(update={"subsample_points": False, "outlier_threshold_decay_iteration": 1})
-        then = register_to(self.target, first.apply(lattice[known]), config, random, threads=1).transform
-        return RigidTransform(then.rotation @ first.rotation, then.rotation @ first.translation + then.translation)
+        return register_to(self.target, first.apply(lattice[known]), config, random, threads=1).transform.after(first)
 
     def _surface(self, points: FloatArray) -> TriangleMesh:
         """The patches as one mesh."""

@@ -14,6 +14,7 @@ from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
+from sensors.polar import polar
 
 Sweep = tuple[float, float, float]
 _SAMPLE = 20_000
@@ -124,11 +125,10 @@ def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where:
 
 def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) -> None:
     """Raise InputError where a pattern does not hold the points (n, 3), scanner frame."""
-    x, y, z = points.T
-    angle = np.arccos(np.clip(z / np.maximum(np.linalg.norm(points, axis=1), _ONE_PLACE_M), -1, 1))
-    turned = np.mod(np.arctan2(y, x) - azimuth[0] + azimuth[2], 2 * np.pi)
+    _, around, down = polar(points)
+    turned = np.mod(around - azimuth[0] + azimuth[2], 2 * np.pi)
     inside = turned <= azimuth[1] - azimuth[0] + 2 * azimuth[2]
-    inside &= (angle >= zenith[0] - zenith[2]) & (angle <= zenith[1] + zenith[2])
+    inside &= (down >= zenith[0] - zenith[2]) & (down <= zenith[1] + zenith[2])
     if inside.mean() < _FEWEST_INSIDE:
         raise InputError(
             f"'pattern' holds {100 * inside.mean():.2g} % of the points", where=where,

@@ -248,11 +248,6 @@ def true_pose(surface: Surfaces, random: KeyedRandom) -> RigidTransform:
     return register_to(target, surface.measured.vertices, _TO_TRUTH, random.child("truth", surface.number)).transform
 
 
-def composed(second: RigidTransform, first: RigidTransform) -> RigidTransform:
-    """First one, then the other."""
-    return RigidTransform(second.rotation @ first.rotation, second.rotation @ first.translation + second.translation)
-
-
 def recommended(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
     """The setting to take, by the largest error over epochs and repeats; None where registrations failed at every value.
 
@@ -288,7 +283,7 @@ class _Judge:
         self.points, self.normals, self.middle = points[::step], normals[::step], points.mean(axis=0)
 
     def error(self, found: RigidTransform, true: RigidTransform) -> PoseError:
-        wrong = composed(found, true.inverse())
+        wrong = found.after(true.inverse())
         moved = wrong.apply(self.points) - self.points
         along = np.einsum("ni,ni->n", moved, self.normals)
         shift = wrong.apply(self.middle) - self.middle
@@ -351,13 +346,13 @@ def _threshold_row(judge: _Judge, threshold: float, epoch: StudyEpoch, gradual: 
 def _put_off(surface: Surfaces, reference_to_truth: RigidTransform, offset_m: float, random: KeyedRandom) -> StudyEpoch:
     """The epoch moved by a random rigid motion: a shift of `offset_m`, and a turn that moves the cloud's edge by as much."""
     points = surface.measured.vertices
-    true = composed(reference_to_truth.inverse(), true_pose(surface, random))
+    true = reference_to_truth.inverse().after(true_pose(surface, random))
     shift, axis = (direction / np.linalg.norm(direction) for direction in random.generator().standard_normal((2, 3)))
     centre = points.mean(axis=0)
     radius = float(np.linalg.norm(points - centre, axis=1).max())
     put_off = RigidTransform.about(centre, axis * offset_m / radius, shift * offset_m)
     moved = put_off.apply(points) if offset_m else points
-    return StudyEpoch(surface.number, moved, composed(true, put_off.inverse()) if offset_m else true, surface.applied, true)
+    return StudyEpoch(surface.number, moved, true.after(put_off.inverse()) if offset_m else true, surface.applied, true)
 
 
 def _residual_nmad(target: ReferenceSurface, epoch: StudyEpoch) -> float:

@@ -33,6 +33,10 @@ class RigidTransform:
         rows = zip(self.rotation, self.translation, strict=True)
         return np.stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows], axis=-1)
 
+    def after(self, first: RigidTransform) -> RigidTransform:
+        """Both in one: `first`, then this."""
+        return RigidTransform(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
+
     def inverse(self) -> RigidTransform:
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 

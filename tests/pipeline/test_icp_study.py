@@ -11,7 +11,7 @@ from surfaces import heightfield
 
 from pipeline.cli.main import main
 from pipeline.icp_study.report import write_icp_study
-from pipeline.icp_study.study import Recommendation, StudyRow, Surfaces, composed, recommended, study, true_pose
+from pipeline.icp_study.study import Recommendation, StudyRow, Surfaces, recommended, study, true_pose
 from pipeline.registration.register import IcpConfig
 from pipeline.registration.rigid import RigidTransform
 from scene.keyed_random import KeyedRandom
@@ -37,7 +37,7 @@ def wall() -> TriangleMesh:
 
 def test_the_true_pose_is_the_planted_one(wall: TriangleMesh) -> None:
     """8,000 points with 3 mm of noise tell a shift to some 0.02 mm across the wall, and along it to 0.1 mm by its roughness."""
-    found = composed(true_pose(Surfaces(1, measured(wall, 1, PLANTED), wall), KeyedRandom(1)), PLANTED)
+    found = true_pose(Surfaces(1, measured(wall, 1, PLANTED), wall), KeyedRandom(1)).after(PLANTED)
     assert found.translation == pytest.approx(np.zeros(3), abs=5e-4)
     moved = found.apply(wall.vertices) - wall.vertices
     assert np.sqrt(np.mean(moved[:, 2] ** 2)) < 1e-4
@@ -46,7 +46,7 @@ def test_the_true_pose_is_the_planted_one(wall: TriangleMesh) -> None:
 def test_composition_is_in_order() -> None:
     first = RigidTransform.about(np.zeros(3), np.array([0.0, 0.0, np.pi / 2]), np.zeros(3))
     second = RigidTransform(np.eye(3), np.array([1.0, 0.0, 0.0]))
-    assert composed(second, first).apply(np.array([1.0, 0.0, 0.0])) == pytest.approx([1.0, 1.0, 0.0])
+    assert second.after(first).apply(np.array([1.0, 0.0, 0.0])) == pytest.approx([1.0, 1.0, 0.0])
 
 
 def test_a_study_of_a_planted_displacement(wall: TriangleMesh, tmp_path: Path) -> None:

@@ -67,8 +67,7 @@ def on_their_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray
         nudges = [RigidTransform.about(centre, unit[3:], unit[:3]) for unit in units]
         slopes = np.stack([(_miss(left, nudge.apply(moved), u[some], v[some]) - miss) / _NUDGE for nudge in nudges], axis=1)
         change = np.asarray(np.linalg.lstsq(slopes, -miss, rcond=None)[0], dtype=np.float64)
-        step = RigidTransform.about(centre, change[3:], change[:3])
-        found = RigidTransform(step.rotation @ found.rotation, step.rotation @ found.translation + step.translation)
+        found = RigidTransform.about(centre, change[3:], change[:3]).after(found)
     before, after = (np.sqrt(np.mean(_miss(left, each, u, v) ** 2)) for each in (points, found.apply(points)))
     return found.apply(points) if after < _ON_RAY * before else points
 
