@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from pipeline.gap.report import figures, report
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.figures import gap_figure, maps_figure
 from pipeline.gap.report.quantities import with_std
+from pipeline.gap.residuals.nominal_pair import PixelGeometry
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from sensors.model import StereoModel
 
 FILES = {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}
 GAP = Gap(before=0.004, after=0.0011, floor=0.001, error=0.0002, floor_error=0.0002, points=900)
@@ -112,8 +115,12 @@ def test_missing_rock_is_positive_of_both_sensors(few: tuple[GapDiagnosis, Measu
     unit = 1.0 if sensor == "tls" else 0.25
     deeper = np.full(len(found.residuals), 0.02 / unit if sensor == "tls" else -0.02 / unit)
     sigma = np.full(len(deeper), 0.01 / unit)
-    residuals = replace(found.residuals, sensor=sensor, unit_m=np.full(len(deeper), unit), sigma=sigma, value=deeper)
+    residuals = replace(found.residuals, unit_m=np.full(len(deeper), unit), sigma=sigma, value=deeper)
     case = replace(found, residuals=residuals, before=deeper, after=deeper)
+    if sensor == "stereo":
+        own = {field.name: getattr(residuals, field.name) for field in fields(residuals)}
+        geometry = PixelGeometry(**dict.fromkeys((field.name for field in fields(PixelGeometry)), deeper))
+        case = replace(case, residuals=StereoResiduals(**own | {"geometry": geometry}), model_after=StereoModel())
     report.write(tmp_path, case, measurement)
     for name in ("before", "after"):
         np.testing.assert_allclose(read_laz(tmp_path / f"{name}.laz").extra["residual_m"], 0.02, rtol=1e-12)
