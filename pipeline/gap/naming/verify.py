@@ -98,13 +98,16 @@ class Version:
     pose: FloatArray
 
 
-def simulated(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
-    """(n,) simulated minus geometric observable of the residuals' points, registered, NaN without a return."""
-    match measurement.moved(version.pose), version.model, residuals:
-        case TlsMeasurement() as scan, TlsModel() as model, TlsResiduals(geometry=rays):
-            return simulate_ranges(scan, model, rays, random) - np.asarray(rays.range_m)
-        case StereoMeasurement() as pair, StereoModel() as model, StereoResiduals():
-            return _simulated_disparities(pair, model, residuals, random)
+def simulated(measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+    """(n,) simulated minus geometric observable of the residuals' points, NaN without a return.
+
+    measurement: with its sensor where it stood, against which `residuals` may be those of another place.
+    """
+    match measurement, model, residuals:
+        case TlsMeasurement(), TlsModel(), TlsResiduals(geometry=rays):
+            return simulate_ranges(measurement, model, rays, random) - np.asarray(rays.range_m)
+        case StereoMeasurement(), StereoModel(), StereoResiduals():
+            return _simulated_disparities(measurement, model, residuals, random)
     raise TypeError("measurement, model and residuals are of different sensors")
 
 
@@ -205,7 +208,8 @@ def _near(draws: FloatArray, reach: FloatArray) -> FloatArray:
 
 
 def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
-    return np.stack([simulated(measurement, version, residuals, random.child(number)) for number in range(_DRAWS)])
+    stood = measurement.moved(version.pose)
+    return np.stack([simulated(stood, version.model, residuals, random.child(number)) for number in range(_DRAWS)])
 
 
 def _summaries(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
