@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from pipeline.measurement.build import Request
     from pipeline.measurement.folder import Understood
 
+FARTHEST_M = 1e8
+"""No coordinate system of a survey reaches farther."""
 SUMMARY = "build the folder that gap takes out of raw scans and a reference; say what was understood"
 EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner riegl_vz400i --out my_measurement
   scarpsim measurement cloud.laz --cameras cameras.xml --reference scan.laz --out my_measurement
@@ -64,8 +66,10 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Understood:
     """Build the folder that the arguments ask for."""
+    from pipeline.formats.atomic import empty_folder
     from pipeline.measurement.build import build, build_stereo
 
+    empty_folder(out)
     request = _request(arguments, scans)
     return build_stereo(request, arguments.cameras, arguments.pair, out) if arguments.cameras else build(request, out)
 
@@ -104,17 +108,15 @@ def pair(text: str) -> tuple[str, str]:
 
 
 def numbers(count: int) -> Callable[[str], Any]:
-    """An argument's type: so many finite numbers between commas."""
+    """An argument's type: so many coordinates between commas."""
 
     def check(text: str) -> tuple[float, ...]:
-        import math
-
         try:
             found = tuple(float(word) for word in text.split(","))
         except ValueError:
             found = ()
-        if len(found) != count or not all(map(math.isfinite, found)):
-            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: {count} numbers between commas")
+        if len(found) != count or not all(abs(value) <= FARTHEST_M for value in found):
+            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: {count} numbers up to {FARTHEST_M:g} between commas")
         return found
 
     return check

@@ -34,6 +34,8 @@ _NAMES = {
     "colorRed": "red", "colorGreen": "green", "colorBlue": "blue",
 }  # fmt: skip
 """E57's fields that become extra channels, and the channels' names."""
+_PIECE = 1_000_000
+"""Points in memory at a time while reading, beside those that are read."""
 _GUIDS = uuid.UUID("7f5c9a52-9f0e-4f3c-9c2b-2f1f5e6f7c11")
 
 
@@ -97,7 +99,7 @@ def read_e57(path: Path) -> list[E57Scan]:
 
 def _read_scan(image: Any, node: Any, number: int) -> E57Scan:
     columns = _read_columns(image, node["points"])
-    valid = np.ones(node["points"].childCount(), dtype=bool)
+    valid = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
     for name in _INVALID:
         valid &= columns.pop(name) == 0 if name in columns else True
     if not valid.all():
@@ -114,14 +116,24 @@ def _read_scan(image: Any, node: Any, number: int) -> E57Scan:
 
 
 def _read_columns(image: Any, points: Any) -> dict[str, NDArray[Any]]:
+    """The fields of a scan's points, read in pieces: memory is taken for what is there, not for what is said to be."""
     count = points.childCount()
     prototype = libe57.StructureNode(points.prototype())
     fields = {prototype[number].elementName() for number in range(prototype.childCount())}
     types = dict.fromkeys(_CARTESIAN + _SPHERICAL, "d") | dict.fromkeys(_INVALID, "b") | _TYPES
-    columns = {name: np.empty(count, dtype=kind) for name, kind in types.items() if name in fields}
-    if count:
-        points.reader(_buffers(image, columns, count)).read()
-    return columns
+    piece = min(count, _PIECE)
+    columns = {name: np.empty(piece, dtype=kind) for name, kind in types.items() if name in fields}
+    if count <= 0:
+        return columns
+    pieces: list[dict[str, NDArray[Any]]] = []
+    reader = points.reader(_buffers(image, columns, piece))
+    while read := reader.read():
+        pieces.append({name: column[:read].copy() for name, column in columns.items()})
+    reader.close()
+    found = sum(len(next(iter(each.values()), ())) for each in pieces)
+    if found != count:
+        raise ValueError(f"{found:,} points, where it says {count:,}")
+    return {name: np.concatenate([each[name] for each in pieces]) for name in columns}
 
 
 def _points(columns: dict[str, NDArray[Any]]) -> FloatArray:

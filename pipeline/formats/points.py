@@ -12,6 +12,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.ptx import PtxScan, read_ptx
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
+from scene.mesh import FloatArray
 from scene.plug_ins import plugged
 from scene.regular_file import check_file
 
@@ -35,14 +36,19 @@ def read_points(path: Path) -> PointCloud:
     cloud = _read(check_file(path))
     if not len(cloud.points):
         raise InputError("holds no points", where=str(path), remedy="export it again")
-    known = np.where(np.isfinite(cloud.points), np.abs(cloud.points), 0.0)
+    check_reach(cloud.points, str(path))
+    return cloud
+
+
+def check_reach(points: FloatArray, where: str) -> None:
+    """Raise InputError where coordinates (n, 3) are no coordinates of a survey; NaN and infinity are let through."""
+    known = np.where(np.isfinite(points), np.abs(points), 0.0)
     far = np.flatnonzero((known > _LARGEST_M).any(axis=1))
     if len(far):
         raise InputError(
-            f"{len(far):,} of {len(known):,} points have coordinates up to {known.max():.3g} m", where=str(path),
+            f"{len(far):,} of {len(known):,} points have coordinates up to {known.max():.3g} m", where=where,
             allowed=f"at most {_LARGEST_M:g} m", remedy="check the unit (m), and the scale and offset of the file",
         )  # fmt: skip
-    return cloud
 
 
 def _read(path: Path) -> PointCloud:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from scene.regular_file import check_file
 
 _LINES_BEFORE_POINTS = 10
 _LONGEST_LINE = 4096
@@ -35,6 +36,7 @@ class PtxScan:
 
 def read_ptx(path: Path) -> list[PtxScan]:
     """Read all scans without their missing returns. Raises InputError for a missing, truncated or foreign file."""
+    check_file(path)
     try:
         with path.open(encoding="ascii") as file:
             scans = list(_scans(file))

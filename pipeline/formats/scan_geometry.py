@@ -36,6 +36,8 @@ _FEWEST = 16
 _BINS, _LINE_BINS = 1 << 19, 1 << 17
 """Bins of a histogram of azimuths, and of one line's zenith angles: three or more for a step."""
 _PADDING = 2
+_NARROWEST_RAD = 1e-6
+"""Of a window of angles in which a step is looked for."""
 _FEW, _SAMPLE = 10_000, 100_000
 """Points with which the axis is found roughly, and with which it is refined."""
 _TURNS = 60
@@ -143,12 +145,12 @@ def _level(local: FloatArray) -> ScanGeometry | None:
     azimuth = _unrolled(azimuth)
     try:
         step = _period([azimuth[far]])
+        if abs(_phasor(azimuth[far], step)) < _ON_GRID:
+            return None
+        lines, line = _grid(azimuth, step, far)
+        geometry = _with_pulses(distance, azimuth, azimuth, zenith, lines, line, far, np.eye(3), np.zeros(3))
     except InputError:
         return None
-    if abs(_phasor(azimuth[far], step)) < _ON_GRID:
-        return None
-    lines, line = _grid(azimuth, step, far)
-    geometry = _with_pulses(distance, azimuth, azimuth, zenith, lines, line, far, np.eye(3), np.zeros(3))
     return geometry if geometry is not None and geometry.synchronous else None
 
 
@@ -231,7 +233,9 @@ def _period(groups: list[FloatArray]) -> float:
     The lowest of the strong peaks of the groups' mean amplitude spectrum. Raises InputError where none stands out.
     """
     low, high = min(group.min() for group in groups), max(group.max() for group in groups)
-    width = max(high - low, 1e-9) * (1 + 1e-9)
+    if high - low < _NARROWEST_RAD:
+        raise _no_pattern("angle")
+    width = (high - low) * (1 + 1e-9)
     bins = _BINS if len(groups) == 1 else _LINE_BINS
     spectrum = np.zeros(bins * _PADDING // 2 + 1)
     for group in groups:
@@ -256,10 +260,15 @@ def _phasor(values: FloatArray, step: float) -> complex:
 
 
 def _grid(values: FloatArray, step: float, far: NDArray[np.bool_]) -> tuple[AngularGrid, IntArray]:
-    """The grid on which the values lie, by least squares over the far ones, and each value's index on it."""
+    """The grid on which the values lie, by least squares over the far ones, and each value's index on it.
+
+    Raises InputError where all far ones lie at one place of it.
+    """
     start = float(np.angle(_phasor(values[far], step))) / (2 * np.pi) * step
     for _ in range(3):
         index = np.rint((values - start) / step)
+        if np.ptp(index[far]) == 0:
+            raise _no_pattern("angle")
         centred = index[far] - index[far].mean()
         residual = (values - start - step * index)[far]
         step += float(np.sum(centred * residual) / np.sum(centred**2))

@@ -122,6 +122,8 @@ def _for_file(scan: RawScan, station: Station) -> PointCloud:
 
 def _scans(request: Request) -> list[RawScan]:
     found = []
+    if len(set(request.scans)) < len(request.scans):
+        raise InputError("names a file twice", where="SCAN", remedy="give each epoch a file of its own")
     for path in request.scans:
         each = read_scans(path, request.unit, request.columns)
         if request.number is not None:

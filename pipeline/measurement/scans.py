@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurement_checks import finite
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import TEXT, placed, read_points
+from pipeline.formats.points import TEXT, check_reach, placed, read_points
 from pipeline.formats.ptx import read_ptx
 from pipeline.formats.xyz import read_table, read_xyz
 from scene.errors import InputError
@@ -99,7 +99,7 @@ def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str
 
     Raises InputError where it is off by more than a hundredth, or turns left into right.
     """
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.isfinite(rotation).all() else np.inf
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
     if off > 0.02 or np.linalg.det(rotation) < 0:
         remedy = "rows must be orthonormal, determinant +1; give more digits"
         raise InputError("the rotation is no rotation matrix", where=where, remedy=remedy)
@@ -117,6 +117,7 @@ def _in_metres(scan: RawScan, metres: float) -> RawScan:
 
 def _checked(scan: RawScan, where: str) -> RawScan:
     """The scan without points that are no numbers, and with an intensity that is a power."""
+    check_reach(scan.cloud.points, where)
     cloud = finite(scan.cloud, where)
     words = list(scan.words)
     if (lost := len(scan.cloud.points) - len(cloud.points)) > 0:

@@ -35,6 +35,9 @@ def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: s
     another unit, or lie in two coordinate systems."""
     ends = [np.stack([np.min(each, axis=0), np.max(each, axis=0)]) for each in (points, surface)]
     sizes = [float(np.linalg.norm(each[1] - each[0])) for each in ends]
+    if min(sizes) == 0:
+        which = "points" if sizes[0] == 0 else "vertices of the reference"
+        raise InputError(f"all {which} are the same place", where=where, remedy="export it again")
     apart = bool((np.minimum(ends[0][1], ends[1][1]) < np.maximum(ends[0][0], ends[1][0])).any())
     for flag, other, ratio, named in (
         ("--unit", unit, sizes[1] / sizes[0], "points"),

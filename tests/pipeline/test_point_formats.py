@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,14 @@ import pye57
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.bad_inputs.raw_cases import in_e57
 from pipeline.formats.e57 import E57Scan, read_e57, write_e57
 from pipeline.formats.laz import PulseChannels, read_laz, write_laz
 from pipeline.formats.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import SUFFIXES, read_points
 from pipeline.formats.xyz import read_xyz, write_xyz
+from pipeline.measurement.scans import read_scans
 from scene.errors import InputError
 
 UTM = np.array([331_245.0, 6_270_118.0, 412.0])
@@ -122,6 +125,27 @@ def test_a_damaged_e57_is_named(tmp_path: Path, cloud: PointCloud, keep: float) 
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
     with pytest.raises(InputError, match=r"a\.e57: is not a whole E57 file"):
         read_e57(path)
+
+
+def test_an_e57_takes_memory_for_the_points_that_are_there(tmp_path: Path, cloud: PointCloud) -> None:
+    """A billion points in its header; read in pieces of a thousand, the same points as at once."""
+    path, claim = tmp_path / "a.e57", 'recordCount="5000">\n        '
+    write_e57(path, [scan(cloud)])
+    (at_once,) = read_e57(path)
+    monkeypatch = pytest.MonkeyPatch()
+    with monkeypatch.context() as patched:
+        patched.setattr("pipeline.formats.e57._PIECE", 1000)
+        assert_same(read_e57(path)[0].cloud, at_once.cloud)
+    in_e57(path, claim, 'recordCount="999999999">')
+    with pytest.raises(InputError, match="5,000 points, where it says 999,999,999"):
+        read_e57(path)
+
+
+@pytest.mark.parametrize("suffix", [".ptx", ".e57", ".laz", ".ply", ".xyz"])
+def test_a_pipe_in_the_place_of_a_scan_is_not_opened(tmp_path: Path, suffix: str) -> None:
+    os.mkfifo(tmp_path / f"a{suffix}")
+    with pytest.raises(InputError, match="is a pipe"):
+        read_scans(tmp_path / f"a{suffix}")
 
 
 # --- LAS 1.4: returns and scan angle
