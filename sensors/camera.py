@@ -27,6 +27,7 @@ from scene.mesh import FloatArray
 _FARTHEST_M = 1e8
 """No coordinate system of a survey reaches farther."""
 Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+Pixels = Annotated[float, Field(ge=-100_000, le=100_000)]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Side = Literal["left", "right", "both"]
@@ -43,11 +44,11 @@ class CameraConfig(Config):
 
     width: int = Field(gt=0, le=100_000, description="frame width [px]")
     height: int = Field(gt=0, le=100_000, description="frame height [px]")
-    f_px: float = Field(gt=0, description="principal distance [px]")
-    cx_px: float = Field(0.0, description="principal point, from the frame's centre [px]")
-    cy_px: float = Field(0.0, description="principal point, from the frame's centre [px]")
-    b1: float = Field(0.0, description="affinity [px]")
-    b2: float = Field(0.0, description="skew [px]")
+    f_px: float = Field(gt=0, le=1e7, description="principal distance [px]")
+    cx_px: Pixels = Field(0.0, description="principal point, from the frame's centre [px]")
+    cy_px: Pixels = Field(0.0, description="principal point, from the frame's centre [px]")
+    b1: Pixels = Field(0.0, description="affinity [px]")
+    b2: Pixels = Field(0.0, description="skew [px]")
     k1: float = Field(0.0, description="radial distortion, r^2")
     k2: float = Field(0.0, description="radial distortion, r^4")
     k3: float = Field(0.0, description="radial distortion, r^6")
@@ -173,7 +174,7 @@ class Camera:
             folded = self._jacobian(x, y)
             back_u, back_v = self.pixel(x, y)
             error = np.hypot(back_u - u, back_v - v)
-        if not (np.nanmax(error) < 1e-6 and np.isfinite(error).all() and (folded[0] * folded[2] > folded[1] ** 2).all()):
+        if not (np.isfinite(error).all() and error.max() < 1e-6 and (folded[0] * folded[2] > folded[1] ** 2).all()):
             raise InputError(
                 "the lens distortion folds the image and has no inverse over the frame",
                 where="camera calibration",

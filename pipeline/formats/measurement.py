@@ -16,7 +16,16 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 from pipeline.change.areas import Area, in_areas
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import read_cameras_yaml
-from pipeline.formats.measurement_checks import PointFit, Sweep, check_frame, check_inside, check_pulses, finite
+from pipeline.formats.measurement_checks import (
+    PointFit,
+    Sweep,
+    check_frame,
+    check_inside,
+    check_power,
+    check_pulses,
+    check_seen,
+    finite,
+)
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
@@ -319,7 +328,10 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     frame = WallFrame.fit(mesh.vertices, np.mean([*viewpoints.values()], axis=0))
     local = mesh.with_vertices(frame.to_wall(mesh.vertices))
     local, words = facing(local, [frame.to_wall(position) for position in viewpoints.values()], reference)
-    clouds = [finite(cloud, name) for name, cloud in material.points.items()]
+    clouds = [check_power(finite(cloud, name), name) for name, cloud in material.points.items()]
+    if cameras is not None:
+        for name, each in zip(material.points, clouds, strict=True):
+            check_seen(cameras, each.points, name)
     said = [(reference, (*material.notes, words))]
     for name, each in zip(material.points, clouds, strict=True):
         said.append((name, _rounding(each.points, config, model, cameras, name)))

@@ -14,6 +14,7 @@ from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
+from sensors.camera import CameraPair
 from sensors.polar import polar
 
 Sweep = tuple[float, float, float]
@@ -29,6 +30,12 @@ _PULSES_PER_POINT, _FEW_PULSES = 100.0, 1e6
 _POINTS_PER_PULSE = 4.0
 """On average; more echoes than that come from no scene."""
 _ONE_PLACE_M = 1e-6
+_LINE_POINTS = 10
+"""So many points on one line are no chance."""
+_SHORTEST_BASE_M = 1e-3
+_FEWEST_SEEN = 0.05
+"""Share of the points that both cameras must see."""
+_LARGEST_POWER = 1e12
 _LEAST_SIGMA = {"tls": (1e-6, "m", "range_sigma_m"), "stereo": (2e-4, "px", "parallax_sigma_px")}
 """By sensor: a smaller predicted spread is none; its unit; the key that says more."""
 
@@ -63,7 +70,10 @@ class PointFit:
 
 
 def finite(cloud: PointCloud, where: str) -> PointCloud:
-    """The points whose coordinates and recorded values are numbers. Raises InputError where there are none, or all are one."""
+    """The points whose coordinates and recorded values are numbers.
+
+    Raises InputError where there are none, or all are one, or on one line.
+    """
     channels = [cloud.intensity, cloud.gps_time, *(cloud.extra.get(name) for name in ("pixel_x", "pixel_y"))]
     keep: NDArray[np.bool_] = np.all(np.isfinite(cloud.points), axis=1)
     for channel in channels:
@@ -74,7 +84,18 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
         raise InputError(problem, where=where, remedy="export the points again")
     if keep.sum() > 1 and np.ptp(cloud.points[keep], axis=0).max() < _ONE_PLACE_M:
         raise InputError(f"all {keep.sum():,} points are the same one", where=where, remedy="export the points again")
+    if keep.sum() >= _LINE_POINTS and _on_a_line(cloud.points[keep]):
+        raise InputError(f"all {keep.sum():,} points lie on one line", where=where, remedy="give a scan of a surface")
     return cloud if keep.all() else cloud.part(keep)
+
+
+def _on_a_line(points: FloatArray) -> bool:
+    """Whether a sample of points (n, 3) departs from a line by no more than rounding does."""
+    away = points[:: max(len(points) // _SAMPLE, 1)]
+    away = away - away[len(away) // 2]
+    axis = away[np.argmax(np.einsum("ni,ni->n", away, away))]
+    beside = away - np.outer(away @ axis / (axis @ axis), axis)
+    return bool(np.linalg.norm(beside, axis=1).max() < max(_ONE_PLACE_M, 1e-9 * np.abs(points).max()))
 
 
 def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) -> None:
@@ -92,6 +113,48 @@ def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) 
         problem = f"{100 * here.hits:.2g} % of the points lie in a direction in which the sensor sees the reference"
         remedy = "check `frame`, the sensor's position and rotation, and the coordinate system of points and reference (m)"
         raise InputError(problem, where=where, allowed=f"{100 * _FEWEST_HITS:g} % and more", remedy=remedy)
+
+
+def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
+    """The share of the points (n, 3) that both cameras see, all in one frame. Raises InputError where that is next to nothing,
+    or the pair has no base."""
+    if pair.base_m < _SHORTEST_BASE_M:
+        raise InputError(
+            f"the two cameras stand {pair.base_m:.3g} m apart", where=where, allowed=f"{_SHORTEST_BASE_M:g} m and more",
+            remedy="check `position_m` of left and right",
+        )  # fmt: skip
+    both, front = np.ones(len(points), dtype=bool), np.ones(len(points), dtype=bool)
+    for camera in (pair.left, pair.right):
+        x, y, z = np.einsum("ji,nj->in", camera.rotation, points - camera.position)
+        ahead = z > 0
+        depth = np.where(ahead, z, 1.0)
+        with np.errstate(all="ignore"):  # the distortion's polynomial, far outside the frame
+            u, v = camera.pixel(x / depth, y / depth)
+        front &= ahead
+        both &= ahead & (u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)
+    if front.mean() < _FEWEST_SEEN:
+        raise InputError(
+            f"{100 * (1 - front.mean()):.3g} % of the points lie behind a camera", where=where,
+            remedy="check the coordinate system, and that rotations map camera (x right, y down, z forward) to world",
+        )  # fmt: skip
+    if both.mean() < _FEWEST_SEEN:
+        raise InputError(
+            f"both cameras see {100 * both.mean():.2g} % of the points", where=where,
+            allowed=f"{100 * _FEWEST_SEEN:g} % and more", remedy="check that cameras and points are of one project",
+        )  # fmt: skip
+    return float(both.mean())
+
+
+def check_power(cloud: PointCloud, where: str) -> PointCloud:
+    """The cloud, if its intensity can be a received power; InputError for values below 0 or beyond any."""
+    power = cloud.intensity
+    if power is None or (power.min(initial=0.0) >= 0 and power.max(initial=0.0) <= _LARGEST_POWER):
+        return cloud
+    raise InputError(
+        f"has intensities from {power.min():.3g} to {power.max():.3g}", where=where,
+        allowed=f"0 to {_LARGEST_POWER:g}, relative received power",
+        remedy="convert decibels, as 10^(dB / 10), or leave the intensity out; `scarpsim measurement` does so of raw files",
+    )  # fmt: skip
 
 
 def check_near(here: PointFit) -> None:

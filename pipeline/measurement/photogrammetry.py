@@ -8,11 +8,10 @@ import numpy as np
 
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import read_cameras_yaml
+from pipeline.formats.measurement_checks import check_seen
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from sensors.camera import Camera, CameraPair
-
-_FEWEST_SEEN = 0.05
 
 
 def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
@@ -42,31 +41,12 @@ def looking(camera: Camera) -> FloatArray:
 
 def seen_by(pair: CameraPair, points: FloatArray, where: str) -> tuple[str, ...]:
     """Words on how much of a cloud (n, 3), m, the pair sees. Raises InputError where that is next to nothing."""
-    both = np.ones(len(points), dtype=bool)
-    front = np.ones(len(points), dtype=bool)
-    for camera in (pair.left, pair.right):
-        x, y, z = np.einsum("ji,nj->in", camera.rotation, points - camera.position)
-        ahead = z > 0
-        depth = np.where(ahead, z, 1.0)
-        u, v = camera.pixel(x / depth, y / depth)
-        front &= ahead
-        both &= ahead & (u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)
-    if front.mean() < _FEWEST_SEEN:
-        raise InputError(
-            f"{100 * (1 - front.mean()):.3g} % of the points lie behind a camera", where=where,
-            remedy="check the coordinate system, and that rotations map camera (x right, y down, z forward) to world",
-        )  # fmt: skip
-    if both.mean() < _FEWEST_SEEN:
-        raise InputError(
-            f"both cameras see {100 * both.mean():.2g} % of the points", where=where,
-            allowed=f"{100 * _FEWEST_SEEN:g} % and more", remedy="check that cameras and points are of one project",
-        )  # fmt: skip
-    left, right = pair.left, pair.right
+    both = check_seen(pair, points, where)
+    left = pair.left
     middle = float(np.median((points - left.position) @ left.rotation[:, 2]))
-    base = float(np.linalg.norm(right.position - left.position))
-    tenth = 1e3 * middle**2 / (left.f_px * base) * 0.1
+    tenth = 1e3 * middle**2 / (left.f_px * pair.base_m) * 0.1
     return (
-        f"cameras {left.width} x {left.height} px, f {left.f_px:.1f} px, base {base:.4g} m, depth {middle:.4g} m (median)",
+        f"cameras {left.width} x {left.height} px, f {left.f_px:.1f} px, base {pair.base_m:.4g} m, depth {middle:.4g} m (median)",
         f"0.1 px of disparity are {tenth:.3g} mm of depth",
-        f"both see {100 * both.mean():.3g} % of the points; pixels and disparities are found by projection",
+        f"both see {100 * both:.3g} % of the points; pixels and disparities are found by projection",
     )
