@@ -50,4 +50,4 @@ class RangeIntensityBias(RangeEffect):
 
     def _about(self, power: FloatArray) -> RangeIntensityBias:
         """The same effect with the median of some powers as I_0."""
-        return self.model_copy(update={"reference_power": float(np.median(power)) if power.size else 1.0})
+        return self.model_copy(update={"reference_power": (float(np.median(power)) if power.size else 0.0) or 1.0})

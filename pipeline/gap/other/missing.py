@@ -27,6 +27,8 @@ _DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
 _BINS = 16
 _MOST_PULSES = 20_000
 """That decide where the search for a limit starts."""
+_LARGEST_LOG = 500.0
+"""Of a limit's power: where losses depend on nothing the search runs away."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def _limit(losses: Losses, log_power: FloatArray) -> MissingFound:
         for base in (0.003, 0.02, 0.08)
     ]
     found = losses.best(chance, log_power, starts)
-    value = float(np.exp(found.values[0]) * 0.5)
+    value = float(np.exp(np.clip(found.values[0], -_LARGEST_LOG, _LARGEST_LOG)) * 0.5)
     std = {"minimum_power": value * float(np.exp(found.values[1]))}
     return MissingFound(DetectionLimit.tag(), found.gain, found.gain - 3.0, {"minimum_power": value}, std, found.chance)
 

@@ -81,8 +81,11 @@ def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None, 
         pose = registered(_only(found, trusted))[1]
         if not _is_far(pose, found):
             break
-        measurement, total = measurement.moved(pose), total + pose
-        found = residuals_of(measurement)
+        there = measurement.moved(pose)
+        beyond = residuals_of(there)
+        if not len(beyond.value):  # the pose leads off the wall
+            break
+        measurement, total, found = there, total + pose, beyond
     return Settled(measurement, found, total)
 
 

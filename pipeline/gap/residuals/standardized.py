@@ -48,7 +48,7 @@ def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]
     padded = np.pad(middle, _WINDOW // 2, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_WINDOW, _WINDOW)).reshape(-1, _WINDOW**2)
     empty = np.isnan(windows).all(axis=1)
-    smooth = np.full(len(windows), np.nanmedian(middle))
+    smooth = np.full(len(windows), np.nanmedian(middle) if np.isfinite(middle).any() else np.nan)
     smooth[~empty] = np.nanmedian(windows[~empty], axis=1)
     smooth = smooth.reshape(shape)
     return np.asarray(ndimage.map_coordinates(smooth, (place - 0.5).T, order=1, mode="nearest"))

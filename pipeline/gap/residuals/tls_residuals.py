@@ -22,6 +22,8 @@ _EDGE_SIGMAS = 3.0
 _LARGEST_SLOPE = 4.0
 """Metres of range per metre across the ray beyond which a point counts as grazing."""
 _SHORTEST_STEP_RAD = 1e-6
+_LEAST_POWER = 1e-9
+"""That is received, relative: files round small ones to 0, of which there is no logarithm."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         cos_incidence=np.abs(np.einsum("ni,ni->n", axes[0], normal)),
         line=line,
         share=share,
-        power=intensity,
+        power=None if intensity is None else np.maximum(intensity, _LEAST_POWER),
     )
     predicted = simulated_ranges(measurement, geometry) if model.effects else distance
     sigma = np.sqrt(model.variance(geometry))
