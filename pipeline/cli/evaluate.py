@@ -44,8 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.detection.run import CONFIDENCES, checked_confidences
     from pipeline.detection.score_files import as_text, assess, write
+    from pipeline.formats.atomic import check_place
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
+    if arguments.out:
+        check_place(arguments.out)
     kinds: tuple[Overlap, ...] = ("segm", "bbox") if arguments.iou == "both" else (arguments.iou,)
     assessment = assess(arguments.truth, arguments.predictions, arguments.by, kinds, confidences)
     if arguments.out:

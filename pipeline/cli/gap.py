@@ -54,9 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.formats.atomic import new_folder
+    from pipeline.formats.atomic import check_place, new_folder
 
     out = arguments.out or new_folder(Path("runs"), "gap")
+    check_place(out)
     return _identifiability(arguments, out) if arguments.identifiability else _diagnosis(arguments, out)
 
 

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the mesh, .ply, in the points' coordinates")
     parser.add_argument(
         "--seen-from",
-        type=float,
+        type=between(-1e8, 1e8),
         nargs=3,
         required=True,
         metavar=("X", "Y", "Z"),

@@ -36,8 +36,10 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detection.config import load_train_config
     from pipeline.detection.data import CocoFolder
+    from pipeline.formats.atomic import check_place
     from pipeline.report.progress import shown_progress
 
+    check_place(arguments.out)
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
     path = config_path("detectors", arguments.config) if arguments.config else bundled_config("detectors", "light")
     config = load_train_config(path, overrides)

@@ -40,14 +40,37 @@ def writing(path: Path) -> Iterator[Path]:
     Raises InputError for a full disk, a folder without permission to write and a path that cannot be a file.
     """
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+    with _made_for(path.parent):
+        try:
+            with explained(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                yield temporary
+                give_name(temporary, path)
+            note(path)
+        finally:
+            _remove(temporary)
+
+
+@contextmanager
+def _made_for(folder: Path) -> Iterator[None]:
+    """A block that may make `folder` and those above it: where it fails, those that it made go again, if they are empty."""
+    made = _missing(folder)
     try:
-        with explained(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            yield temporary
-            give_name(temporary, path)
-        note(path)
-    finally:
-        _remove(temporary)
+        yield
+    except BaseException:
+        _remove_empty(made)
+        raise
+
+
+def _missing(folder: Path) -> list[Path]:
+    """`folder` and those above it that are not there, the inner ones first."""
+    return [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    for each in folders:
+        with suppress(OSError, ValueError):  # is not there, holds something, or cannot be a name
+            each.rmdir()
 
 
 @contextmanager
@@ -120,10 +143,25 @@ def new_folder(parent: Path, name: str) -> Path:
 
 
 def empty_folder(out: Path) -> Path:
-    """`out` itself, if it is new or empty; InputError, naming --out, where it is in use."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    """`out` itself, if it is new or empty; InputError, naming --out, where it is in use or cannot be made."""
+    check_place(out)
+    if out.exists() and any(out.iterdir()):
         raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
     return out
+
+
+def check_place(out: Path) -> None:
+    """Raise InputError, naming --out, where `out` cannot be a folder that is written into; it is tried, and nothing stays."""
+    made = _missing(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except (OSError, ValueError) as error:  # ValueError: a null character
+        reason = getattr(error, "strerror", None) or "a null character in its name"
+        raise InputError(f"cannot be a folder to write into ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
+    finally:
+        _remove_empty(made)
 
 
 @contextmanager
@@ -134,17 +172,18 @@ def filling(out: Path) -> Iterator[Path]:
     """
     empty_folder(out)
     temporary = out / ".part" if out.exists() else out.absolute().with_name(f".{out.absolute().name}.part")
-    try:
-        _remove_folder(temporary)
-        temporary.mkdir(parents=True)
-        yield temporary
-        out.mkdir(exist_ok=True)
-        for made in sorted(temporary.iterdir()):
-            made.rename(out / made.name)
-    except OSError as error:
-        raise _as_input_error(error, out) from None
-    finally:
-        _remove_folder(temporary)
+    with _made_for(out.absolute()):
+        try:
+            _remove_folder(temporary)
+            temporary.mkdir(parents=True)
+            yield temporary
+            out.mkdir(exist_ok=True)
+            for made in sorted(temporary.iterdir()):
+                made.rename(out / made.name)
+        except OSError as error:
+            raise _as_input_error(error, out) from None
+        finally:
+            _remove_folder(temporary)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
