@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -15,6 +16,8 @@ from scene.mesh import FloatArray, TriangleMesh, area_normals
 from scene.raycast import RayCaster
 from sensors.camera import Camera, CameraPair, Matrix3, Vector3, axis_rotation, check_rotation
 
+_FARTHEST_M = 1e5
+Height = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 VERTICAL = np.array([0.0, 0.0, 1.0])
 
 
@@ -52,9 +55,9 @@ class Target:
 class RigConfig(Config):
     """A stereo pair of equal cameras in front of the wall, both looking at its centre (Glendale's geometry by default)."""
 
-    distance_m: float = Field(105.0, gt=0, description="horizontal distance from the wall's centre [m]")
+    distance_m: float = Field(105.0, gt=0, le=_FARTHEST_M, description="horizontal distance from the wall's centre [m]")
     base_m: float = Field(28.0, gt=0, description="distance between the cameras [m]")
-    height_m: float | None = Field(None, description="height above the wall's toe, none: level with the wall's centre [m]")
+    height_m: Height | None = Field(None, description="height above the wall's toe, none: level with the wall's centre [m]")
     width: int = Field(7360, gt=0, le=100_000, description="frame width [px]")
     height: int = Field(4912, gt=0, le=100_000, description="frame height [px]")
     sensor_width_m: float = Field(0.0359, gt=0, le=0.5, description="width of the image sensor [m]")
@@ -109,9 +112,9 @@ class StationConfig(Config):
 
     position_m: Vector3 | None = Field(None, description="scanner's centre, world frame; none: from distance_m and height_m [m]")
     distance_m: float = Field(
-        105.0, gt=0, description="horizontal distance from the wall's centre, where no position_m is given [m]"
+        105.0, gt=0, le=_FARTHEST_M, description="horizontal distance from the wall's centre, where no position_m is given [m]"
     )
-    height_m: float = Field(1.6, description="height above the wall's toe, where no position_m is given [m]")
+    height_m: Height = Field(1.6, description="height above the wall's toe, where no position_m is given [m]")
     rotation: Matrix3 | None = Field(None, description="scanner to world; none: levelled, azimuth 0 towards the wall's centre")
     pose_sigma: PoseSigma = EXACT_POSE
 

@@ -189,8 +189,13 @@ class SimulationConfig(Config):
     @field_validator("station")
     @classmethod
     def _apart(cls, stations: StationConfig | tuple[StationConfig, ...]) -> StationConfig | tuple[StationConfig, ...]:
+        """All stations scan with the config's one scanner, and its maps gain nothing from the same scan again (NMAD of 1, 2, 8
+        and 32 scans from one place: 3.20, 3.24, 3.22, 3.20 mm), so that a station given twice is a slip."""
         if isinstance(stations, tuple) and len(set(stations)) < len(stations):
-            raise ValueError("holds two stations at the same place")
+            raise ValueError(
+                "holds the same station twice, which changes no map; a set-up that is repeated with its errors stands a "
+                "millimetre away, and another scanner in a config of its own (scarpsim compare)"
+            )
         return stations
 
     def sensor_names(self) -> tuple[SensorName, ...]:

@@ -87,4 +87,5 @@ def _dress(axes: Axes, x_label: str, y_label: str) -> None:
     axes.set_ylabel(y_label, fontsize=9)
     axes.tick_params(labelsize=8)
     axes.set_ylim(bottom=0)
-    axes.legend(fontsize=8, frameon=False)
+    if axes.get_legend_handles_labels()[0]:  # an empty set has none
+        axes.legend(fontsize=8, frameon=False)

@@ -19,11 +19,10 @@ def keras_ready() -> None:
     """Import Keras, on TensorFlow unless KERAS_BACKEND says otherwise; raises InputError where one of them is not installed.
 
     TensorFlow writes some lines to stderr while it is imported, whatever the level of its log. They are dropped, and the level
-    is set to errors alone, unless TF_CPP_MIN_LOG_LEVEL is set: with 0 there TensorFlow says everything.
+    is set to errors alone, unless TF_CPP_MIN_LOG_LEVEL is set to another: with 0 there TensorFlow says everything.
     """
     check_installed()
-    if "TF_CPP_MIN_LOG_LEVEL" not in os.environ:
-        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    if os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3") != "0":
         with stderr_dropped():
             importlib.import_module("keras")
 

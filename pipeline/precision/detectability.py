@@ -205,10 +205,11 @@ def _exceeds(
     z, registration, number = config.critical_value, config.registration_sigma_m, np.maximum(points, 2.0)
     squared = spread / number
     error = np.maximum(squared.sum(axis=0), 1e-24)  # without noise a step function
-    freedom = error**2 / np.maximum((squared**2 / (number - 1)).sum(axis=0), 1e-48)
-    tau = np.maximum(np.sqrt((white / number).sum(axis=0) + 2 * kept + registration**2), 1e-12)
-    q, delta = z * np.sqrt(error) / tau, (change - z * registration) / tau
-    return ndtr((delta - q * (1 - 1 / (4 * freedom))) / np.sqrt(1 + q**2 / (2 * freedom)))
+    with np.errstate(over="ignore", invalid="ignore"):  # a ray along the surface has a spread without bound
+        freedom = error**2 / np.maximum((squared**2 / (number - 1)).sum(axis=0), 1e-48)
+        tau = np.maximum(np.sqrt((white / number).sum(axis=0) + 2 * kept + registration**2), 1e-12)
+        q, delta = z * np.sqrt(error) / tau, (change - z * registration) / tau
+        return ndtr((delta - q * (1 - 1 / (4 * freedom))) / np.sqrt(1 + q**2 / (2 * freedom)))
 
 
 def _kept(width: FloatArray) -> FloatArray:

@@ -27,6 +27,8 @@ BoolArray = NDArray[np.bool_]
 
 _POISSON_DEPTH_LIMIT = 12
 """The deepest octree chosen by itself: 4,096 cells along the cloud's longest side."""
+_FINER = 4
+"""Levels of the octree below the one whose cells are as large as the spacing: finer cells hold nothing and take hours."""
 _NORMAL_NEIGHBOURS = 30
 _VOTES = 4096
 """Triangles asked for the winding of an organised grid; all but folded ones agree."""
@@ -83,7 +85,13 @@ def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, confi
     """
     if len(points) <= _NORMAL_NEIGHBOURS:
         raise InputError(f"{len(points)} points are too few", where="Poisson surface", allowed="more than 16")
-    depth = config.poisson_depth or octree_depth(points)
+    usual = octree_depth(points)
+    depth = config.poisson_depth or usual
+    if depth > usual + _FINER:
+        raise InputError(
+            f"got {depth}: cells of 1/{2 ** (depth - usual)} of the points' spacing", where="the octree's depth",
+            allowed=f"up to {usual + _FINER} for these points", remedy="leave it out for cells as large as their spacing",
+        )  # fmt: skip
     vertices, faces = _poisson(points, viewpoint, depth)
     return labelled_surface(vertices, faces, points, (points, block), config)
 
