@@ -43,7 +43,7 @@ def test_what_is_refused_at_the_door(prefix: str, materials: Path, tmp_path: Pat
     bad = []
     for number, case in enumerate(chosen(prefix)):
         if set(case.needs) <= {path.name for path in materials.iterdir()}:
-            outcome = tried(case, materials, tmp_path / str(number), here=True)
+            outcome = tried(case, materials, tmp_path / str(number))
             bad += [said(outcome)] if outcome.problems else []
     assert bad == []
 
@@ -64,7 +64,7 @@ def test_a_bad_answer_is_told_from_a_good_one(tmp_path: Path, monkeypatch: pytes
 
         monkeypatch.setattr("pipeline.cli.main.main", main)
         folder = tmp_path / f"{code}{len(error)}{left}"
-        return tried(Case("case", ("doctor",)), tmp_path, folder, here=True).problems
+        return tried(Case("case", ("doctor",)), tmp_path, folder).problems
 
     assert answering(2, "error: a.yaml: is wrong; mend it\n") == ()
     assert answering(0, "") == ()

@@ -10,17 +10,16 @@ import io
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from benchmarks.bad_inputs.preloaded import MOST_S, Order, Preloaded
+
 MOST_SECONDS, MOST_GB = 20.0, 2.0
-_KILL_S, _KILL_GB = 75.0, 4.0
 _LONGEST_LINE = 1500
 
 
@@ -52,10 +51,10 @@ class Outcome:
     problems: tuple[str, ...]
 
 
-def tried(case: Case, materials: Path, folder: Path, *, here: bool = False) -> Outcome:
+def tried(case: Case, materials: Path, folder: Path, forked_from: Preloaded | None = None) -> Outcome:
     """Spoil copies of the materials in `folder`, which is made, and run the command there as a process of its own.
 
-    here: in this process, which is faster; its memory is not looked at, and it is stopped by an alarm.
+    forked_from: without it in this process, which is faster; its memory is not looked at, and it is stopped by an alarm.
     """
     folder.mkdir(parents=True)
     for name in case.needs:
@@ -63,7 +62,8 @@ def tried(case: Case, materials: Path, folder: Path, *, here: bool = False) -> O
         shutil.copytree(source, folder / name, symlinks=True) if source.is_dir() else shutil.copy(source, folder / name)
     case.spoil(folder)
     before = _files(folder)
-    code, seconds, gigabytes, out, error = (_run_here if here else _run)(case.words, folder)
+    run = partial(_run, forked_from=forked_from) if forked_from else _run_here
+    code, seconds, gigabytes, out, error = run(case.words, folder)
     lines = [line for line in error.splitlines() if line.strip()]
     last = (lines or out.splitlines() or [""])[-1]
     problems = _problems(case, code, seconds, gigabytes, out, lines)
@@ -102,37 +102,13 @@ def _files(folder: Path) -> dict[str, tuple[int, int, int]]:
     return found
 
 
-def _run(words: tuple[str, ...], folder: Path) -> tuple[int, float, float, str, str]:
+def _run(words: tuple[str, ...], folder: Path, forked_from: Preloaded) -> tuple[int, float, float, str, str]:
     """Exit status, seconds, peak memory of the largest process (GB), stdout and stderr."""
-    program = "from pipeline.cli.main import main; raise SystemExit(main())"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TF_CPP_MIN_LOG_LEVEL": "3", "TMPDIR": str(folder.parent)}
     out, error = folder.with_suffix(".out"), folder.with_suffix(".err")
-    began = time.monotonic()
-    with out.open("wb") as to_out, error.open("wb") as to_error:
-        process = subprocess.Popen(
-            [sys.executable, "-c", program, *words],
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=to_out,
-            stderr=to_error,
-            start_new_session=True,
-        )
-        while True:
-            ended, status, usage = os.wait4(process.pid, os.WNOHANG)
-            if ended:
-                break
-            if time.monotonic() - began > _KILL_S or _resident_gb(process.pid) > _KILL_GB:
-                os.killpg(process.pid, signal.SIGKILL)
-                _, status, usage = os.wait4(process.pid, 0)
-                break
-            time.sleep(0.02)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    wall = time.monotonic() - began
-    own = usage.ru_utime + usage.ru_stime
-    seconds = wall if process.returncode == -signal.SIGKILL else min(wall, own)
+    ended = forked_from.run(Order(words, str(folder), str(out), str(error)))
+    seconds = ended.wall_s if ended.code == -signal.SIGKILL else min(ended.wall_s, ended.own_s)
     texts = [path.read_text(encoding="utf-8", errors="replace") for path in (out, error)]
-    return process.returncode, seconds, usage.ru_maxrss / 1e6, texts[0], texts[1]
+    return ended.code, seconds, ended.gigabytes, texts[0], texts[1]
 
 
 def _run_here(words: tuple[str, ...], folder: Path) -> tuple[int, float, float, str, str]:
@@ -140,11 +116,11 @@ def _run_here(words: tuple[str, ...], folder: Path) -> tuple[int, float, float, 
     from pipeline.cli.main import main
 
     def too_long(*_: object) -> None:
-        raise TimeoutError(f"no end within {_KILL_S:g} s")
+        raise TimeoutError(f"no end within {MOST_S:g} s")
 
     began = time.monotonic(), time.process_time()
     before = signal.signal(signal.SIGALRM, too_long)
-    signal.alarm(int(_KILL_S))
+    signal.alarm(int(MOST_S))
     try:
         with chdir(folder), redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as error:
             code = main(list(words))
@@ -153,11 +129,3 @@ def _run_here(words: tuple[str, ...], folder: Path) -> tuple[int, float, float, 
         signal.signal(signal.SIGALRM, before)
     seconds = min(time.monotonic() - began[0], time.process_time() - began[1])
     return code, seconds, 0.0, out.getvalue(), error.getvalue()
-
-
-def _resident_gb(process: int) -> float:
-    try:
-        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    except (OSError, IndexError):
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e9

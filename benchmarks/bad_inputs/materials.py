@@ -13,6 +13,8 @@ from benchmarks.gap_challenge.cases import Case, make
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
 from pipeline.config.bundled import configs_folder
+from pipeline.formats.ply import read_ply, write_ply
+from scene.mesh import TriangleMesh
 
 SITE: dict[str, Any] = {
     "seed": 3,
@@ -46,7 +48,7 @@ WIDTH, HEIGHT = 48, 32
 
 
 def make_materials(folder: Path, *, diagnosed: bool = True) -> None:
-    """site.yaml, set.yaml; run/, set/, measurement/, pair/, detector/, diagnosis/; truth.json, found.json. diagnosed:
+    """site.yaml, set.yaml; run/, set/, measurement/, raw/, pair/, detector/, diagnosis/; truth.json, found.json. diagnosed:
     whether diagnosis/, which takes longest, is among them. Raises RuntimeError where a command fails on them."""
     folder.mkdir(parents=True)
     (folder / "site.yaml").write_text(yaml.safe_dump(SITE))
@@ -55,6 +57,7 @@ def make_materials(folder: Path, *, diagnosed: bool = True) -> None:
     shutil.copytree(configs_folder() / "detectors/default", folder / "detector")
     for name, sensor in (("measurement", "tls"), ("pair", "stereo")):
         make(Case(0, (7, 1), "one", sensor, (), 4_000, 4_000), folder / name, folder / f"{name}_truth.json")
+    _raw(folder)
     _called("simulate", "--sensor", "tls", "--config", str(folder / "site.yaml"), "--out", str(folder / "run"))
     _called("dataset", str(folder / "set.yaml"), "--out", str(folder / "set"))
     if diagnosed:
@@ -64,6 +67,19 @@ def make_materials(folder: Path, *, diagnosed: bool = True) -> None:
 def _called(*words: str) -> None:
     if main([*words, "--quiet"]):
         raise RuntimeError(f"a good input fails: scarpsim {' '.join(words)}")
+
+
+def _raw(folder: Path) -> None:
+    """raw/: the points of measurement/ and its wall, both in the scanner's frame."""
+    import numpy as np
+
+    given = yaml.safe_load((folder / "measurement/measurement.yaml").read_text())["scanner"]
+    position, rotation = np.array(given["position_m"]), np.array(given["rotation"])
+    (folder / "raw").mkdir()
+    shutil.copy(folder / "measurement/scan.ply", folder / "raw/scan.ply")
+    wall = read_ply(folder / "measurement/wall.ply")
+    local = np.einsum("ji,nj->ni", rotation, wall.vertices - position)
+    write_ply(folder / "raw/wall.ply", TriangleMesh(local, wall.faces))
 
 
 def _coco(folder: Path) -> None:

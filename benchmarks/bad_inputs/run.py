@@ -17,18 +17,28 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import Queue
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks.bad_inputs import coco_cases, dataset_cases, gap_cases, site_cases
+from benchmarks.bad_inputs import coco_cases, dataset_cases, further_cases, gap_cases, measurement_cases, raw_cases, site_cases
 from benchmarks.bad_inputs.case import Case, Outcome, tried
 from benchmarks.bad_inputs.materials import make_materials
+from benchmarks.bad_inputs.preloaded import Preloaded
 
 BEGIN, END = "<!-- bad inputs: begin -->", "<!-- bad inputs: end -->"
 
 
 def all_cases() -> list[Case]:
-    return [*gap_cases.cases(), *coco_cases.cases(), *dataset_cases.cases(), *site_cases.cases()]
+    return [
+        *gap_cases.cases(),
+        *coco_cases.cases(),
+        *dataset_cases.cases(),
+        *site_cases.cases(),
+        *raw_cases.cases(),
+        *measurement_cases.cases(),
+        *further_cases.cases(),
+    ]
 
 
 def listed_cases() -> list[Case]:
@@ -39,23 +49,26 @@ def listed_cases() -> list[Case]:
 
 
 def run(
-    cases: Sequence[Case], jobs: int, materials: Path | None = None, *, here: bool = False, show: bool = False
+    cases: Sequence[Case], jobs: int, materials: Path | None = None, *, here: bool = False, fresh: bool = True, show: bool = False
 ) -> list[Outcome]:
-    """Try each case, in the order given; prints the bad answers, with show all, as they come."""
+    """Try each case, in the order given; prints the bad answers, with show all, as they come. fresh: see `Preloaded`."""
     with tempfile.TemporaryDirectory(prefix="bad_inputs_") as name:
         folder = Path(name)
-        if materials is None:
-            materials = folder / "materials"
-            make_materials(materials)
-        elif not materials.exists():
-            make_materials(materials)
+        good = materials or folder / "materials"
+        if not good.exists():
+            make_materials(good)
+        idle: Queue[Preloaded | None] = Queue()
+        for _ in range(1 if here else jobs):
+            idle.put(None if here else Preloaded(rooms=not fresh))
 
         def one(numbered: tuple[int, Case]) -> Outcome:
             number, case = numbered
-            place = folder / str(number)
-            found = tried(case, materials, place, here=here)
-            shutil.rmtree(place, ignore_errors=True)
-            return found
+            place, taken = folder / str(number), idle.get()
+            try:
+                return tried(case, good, place, taken)
+            finally:
+                idle.put(taken)
+                shutil.rmtree(place, ignore_errors=True)
 
         found = []
         with ThreadPoolExecutor(jobs) as pool:
@@ -63,6 +76,9 @@ def run(
                 found.append(outcome)
                 if outcome.problems or show:
                     print(said(outcome), flush=True)
+        while not idle.empty():
+            if started := idle.get():
+                started.close()
         return found
 
 
@@ -88,10 +104,12 @@ def main() -> int:
     parser.add_argument("--table", type=Path, help="a page with the two marks between which the table goes")
     parser.add_argument("--show", action="store_true", help="print the good answers too")
     parser.add_argument("--here", action="store_true", help="in this process: faster, and memory is not looked at")
+    parser.add_argument("--fresh", action="store_true", help="each process imports the program and ends by itself: slower")
     arguments = parser.parse_args()
     chosen = listed_cases() if arguments.listed else all_cases()
     cases = [case for case in chosen if not arguments.only or any(word in case.name for word in arguments.only)]
-    outcomes = run(cases, arguments.jobs, arguments.materials, here=arguments.here, show=arguments.show)
+    kind = {"here": arguments.here, "fresh": arguments.fresh}
+    outcomes = run(cases, arguments.jobs, arguments.materials, **kind, show=arguments.show)
     print(table(outcomes))
     if arguments.table:
         page = arguments.table.read_text(encoding="utf-8")
