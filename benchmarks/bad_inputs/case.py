@@ -10,9 +10,10 @@ import io
 import os
 import shutil
 import signal
+import socket
 import time
-from collections.abc import Callable
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,8 @@ from benchmarks.bad_inputs.preloaded import MOST_S, Order, Preloaded
 
 MOST_SECONDS, MOST_GB = 20.0, 2.0
 _LONGEST_LINE = 1500
+PORT_IN_USE = 18_937
+"""`view` reads what it is given and then finds its port taken: with another it would stay."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,8 @@ def tried(case: Case, materials: Path, folder: Path, forked_from: Preloaded | No
     case.spoil(folder)
     before = _files(folder)
     run = partial(_run, forked_from=forked_from) if forked_from else _run_here
-    code, seconds, gigabytes, out, error = run(case.words, folder)
+    with _port_in_use():
+        code, seconds, gigabytes, out, error = run(case.words, folder)
     lines = [line for line in error.splitlines() if line.strip()]
     last = (lines or out.splitlines() or [""])[-1]
     problems = _problems(case, code, seconds, gigabytes, out, lines)
@@ -71,6 +75,15 @@ def tried(case: Case, materials: Path, folder: Path, forked_from: Preloaded | No
         changed = sorted(set(_files(folder).items()) ^ set(before.items()))
         problems.append(f"files were left or changed: {', '.join(dict.fromkeys(name for name, _ in changed))[:200]}")
     return Outcome(case, code, seconds, gigabytes, last[:400], tuple(problems))
+
+
+@contextmanager
+def _port_in_use() -> Iterator[None]:
+    with socket.socket() as held:
+        with suppress(OSError):  # is held already, by another case
+            held.bind(("127.0.0.1", PORT_IN_USE))
+            held.listen()
+        yield
 
 
 def _problems(case: Case, code: int, seconds: float, gigabytes: float, out: str, lines: list[str]) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 import tifffile
 import yaml
 
-from benchmarks.bad_inputs.case import Case
+from benchmarks.bad_inputs.case import PORT_IN_USE, Case
 from benchmarks.bad_inputs.spoil import (
     GONE,
     NAN,
@@ -117,6 +117,11 @@ _MAPS: dict[str, Callable[[Path], object]] = {
     "in millimetres": map_of(_GRID * 1000),
     "of -9999": map_of(np.where(np.eye(100, 160) > 0, -9999.0, _GRID)),
     "of -9999 alone": map_of(np.full((100, 160), -9999.0)),
+    "of a word for no data": _tiff(_GRID.astype(np.float32), extratags=[(42113, 2, 0, "none", False)]),
+    "of -1e400 for no data": _tiff(_GRID.astype(np.float32), extratags=[(42113, 2, 0, "-1e400", False)]),
+    "of doubles of 1e300": _tiff(_GRID * 1e300),
+    "of half precision": _tiff(_GRID.astype(np.float16)),
+    "of truth values": _tiff(_GRID > 0),
     "of no size": _tiff(np.zeros((0, 0), np.float32)),
     "of one column": map_of(np.zeros((100, 1))),
     "of 4 pixels": map_of([[0.001, 0.002], [0.003, NAN]]),
@@ -264,7 +269,7 @@ _WORDS: dict[str, tuple[str, ...]] = {
     "view: port text": ("view", "run", "--port", "web", "--no-browser"),
     "view: port 1e9": ("view", "run", "--port", "1000000000", "--no-browser"),
     "view: port empty": ("view", "run", "--port", "", "--no-browser"),
-    "view: a loop": ("view", "loop", "--port", "99999", "--no-browser"),
+    "view: a loop": ("view", "loop", "--port", str(PORT_IN_USE), "--no-browser"),
     "view: port of others": ("view", "run", "--port", "1", "--no-browser", "--detections", "nowhere"),
     "train: a run": ("train", "run"),
     "train: a loop": ("train", "loop"),
@@ -339,7 +344,7 @@ def cases() -> list[Case]:
         words = ("calibrate", MAP, "run/difference_002.tif", "--sensor", "tls", "--config", SITE)
         found.append(Case(f"cal: map {name}", (*words, *out), ("run", SITE), spoil))
         found.append(Case(f"det: map {name}", ("detect", "baseline", MAP, *out), ("run",), spoil))
-        found.append(Case(f"view: map {name}", ("view", "run", "--no-browser", "--port", "99999"), ("run",), spoil))
+        found.append(Case(f"view: map {name}", ("view", "run", "--no-browser", "--port", str(PORT_IN_USE)), ("run",), spoil))
     needs = (SITE, CONFIG, "run", "set", "measurement", TRUTH, FOUND)
     loop = instead("loop", link("loop"))
     for name, words in _WORDS.items():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bad_inputs.case import Case
+from benchmarks.bad_inputs.case import PORT_IN_USE, Case
 from benchmarks.bad_inputs.spoil import (
     GONE,
     INFINITE,
@@ -302,14 +302,16 @@ def cases() -> list[Case]:
     for name, spoil in _RUNS.items():
         if name != "run.json products outside":
             found.append(Case(f"icp: {name}", ("icp-study", "run", *out), ("run",), spoil))
-            found.append(Case(f"view: {name}", ("view", "run", "--no-browser", "--port", "99999"), ("run",), spoil))
+            found.append(Case(f"view: {name}", ("view", "run", "--no-browser", "--port", str(PORT_IN_USE)), ("run",), spoil))
         found.append(Case(f"cal: {name}", ("calibrate", "run", *out), ("run",), spoil))
         found.append(Case(f"cmp: {name}", ("compare", "run", "--epochs", "2", *out), ("run",), spoil))
         resumed = ("simulate", "--sensor", "tls", "--config", SITE, "--resume", "--out", "run", "--quiet")
         found.append(Case(f"sim: {name}", resumed, (SITE, "run"), spoil))
     for name, given in _VIEW.items():
-        port = () if "--port" in given else ("--port", "99999")
+        port = () if "--port" in given else ("--port", str(PORT_IN_USE))
         found.append(Case(f"view: {name}", ("view", *given, *port, "--no-browser"), needs))
     for name, spoil in _DIAGNOSES.items():
-        found.append(Case(f"view: {name}", ("view", "diagnosis", "--no-browser", "--port", "99999"), ("diagnosis",), spoil))
+        found.append(
+            Case(f"view: {name}", ("view", "diagnosis", "--no-browser", "--port", str(PORT_IN_USE)), ("diagnosis",), spoil)
+        )
     return found

@@ -36,10 +36,13 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detection.config import load_train_config
     from pipeline.detection.data import CocoFolder
-    from pipeline.formats.atomic import check_place
+    from pipeline.formats.atomic import check_place, empty_folder
     from pipeline.report.progress import shown_progress
 
-    check_place(arguments.out)
+    if arguments.resume:
+        check_place(arguments.out)
+    else:
+        empty_folder(arguments.out, "add --resume to go on with a training in it, or choose another --out")
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
     path = config_path("detectors", arguments.config) if arguments.config else bundled_config("detectors", "light")
     config = load_train_config(path, overrides)

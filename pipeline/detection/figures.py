@@ -26,6 +26,8 @@ _PANELS = {"Total": ("loss",), "Class": ("class", "proposal_class"), "Box": ("bo
 _TRAINING, _VALIDATION = "#0072B2", "#D55E00"
 _SCALE_SIGMAS = 6.0
 _WIDEST_PX = 2400
+_HIGHEST = 4.0
+"""A map that is higher than so many times its width is drawn smaller."""
 _LOW_IN = 4.5
 """Below this height of the figure the label of a colour bar has no room beside the map."""
 _MOST_NUMBERED = 200
@@ -58,7 +60,7 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
     limit = 1e3 * max(_SCALE_SIGMAS * nmad(difference), 1e-4)
     extent = (grid.x_min, grid.x_min + grid.width * grid.gsd, grid.y_max - grid.height * grid.gsd, grid.y_max)
     width = 10.0
-    height = 0.9 + width * grid.height / grid.width * 0.85
+    height = 0.9 + width * min(grid.height / grid.width, _HIGHEST) * 0.85
     low = height < _LOW_IN
     figure = Figure(figsize=(width, height + 0.6 * low), dpi=140, layout="constrained")
     axes = figure.subplots()

@@ -142,11 +142,11 @@ def new_folder(parent: Path, name: str) -> Path:
     return next(parent / free for free in names if not (parent / free).exists())
 
 
-def empty_folder(out: Path) -> Path:
+def empty_folder(out: Path, remedy: str = "choose another --out") -> Path:
     """`out` itself, if it is new or empty; InputError, naming --out, where it is in use or cannot be made."""
     check_place(out)
     if out.exists() and any(out.iterdir()):
-        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
+        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy=remedy)
     return out
 
 

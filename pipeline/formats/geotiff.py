@@ -5,6 +5,7 @@ Uncompressed: on a noisy difference map deflate saves a fifth and takes forty ti
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 from pathlib import Path
@@ -19,6 +20,7 @@ from scene.errors import InputError
 from scene.grid import Grid
 from scene.regular_file import check_file
 
+logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # its complaints come as exceptions too
 _PIXEL_SCALE, _TIEPOINT, _GEO_KEYS, _GEO_ASCII, _NODATA = 33550, 33922, 34735, 34737, 42113
 _ASCII, _SHORT, _DOUBLE = 2, 3, 12
 _MASK_PAGE = 4
@@ -128,14 +130,26 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
     except (tifffile.TiffFileError, ValueError, IndexError, KeyError, struct.error, MemoryError, TypeError) as error:
         problem = " ".join(str(error).split())
         raise InputError(f"is not a whole TIFF file ({problem})", where=str(path), remedy="export it again") from None
-    if raster.ndim != 2:
-        raise InputError(f"has the shape {raster.shape}", where=str(path), allowed="one band")
-    raster = raster.astype(np.float32, copy=False)
-    nodata = str(tags.get(_NODATA, "nan")).strip("\0 ")
-    if nodata.lower() not in ("nan", ""):
-        raster = np.where(raster == np.float32(nodata), np.float32(np.nan), raster)
+    if raster.ndim != 2 or raster.dtype.kind not in "fiub":
+        problem = f"has the shape {raster.shape} and values of type {raster.dtype}"
+        raise InputError(problem, where=str(path), allowed="one band of numbers", remedy="export it as float32")
+    with np.errstate(over="ignore"):  # becomes infinite, which is looked for below
+        raster = raster.astype(np.float32, copy=False)
+        nodata = _nodata(tags, path)
+    raster = raster if np.isnan(nodata) else np.where(raster == nodata, np.float32(np.nan), raster)
     _check_values(raster, path)
     return raster, tags
+
+
+def _nodata(tags: dict[int, Any], path: Path) -> np.float32:
+    """The value that stands for no data, NaN where none is stated."""
+    text = str(tags.get(_NODATA, "nan")).strip("\0 ") or "nan"
+    try:
+        return np.float32(text)
+    except ValueError:
+        raise InputError(
+            f"states '{text[:40]}' for no data", where=str(path), allowed="a number", remedy="export it again"
+        ) from None
 
 
 def _check_values(raster: NDArray[np.float32], path: Path) -> None:

@@ -21,6 +21,7 @@ from pipeline.formats.measurement_checks import (
     Sweep,
     check_frame,
     check_inside,
+    check_pixels,
     check_power,
     check_pulses,
     check_seen,
@@ -332,6 +333,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     if cameras is not None:
         for name, each in zip(material.points, clouds, strict=True):
             check_seen(cameras, each.points, name)
+            check_pixels(cameras.left, each, name)
     said = [(reference, (*material.notes, words))]
     for name, each in zip(material.points, clouds, strict=True):
         said.append((name, _rounding(each.points, config, model, cameras, name)))

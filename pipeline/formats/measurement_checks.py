@@ -14,7 +14,7 @@ from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
-from sensors.camera import CameraPair
+from sensors.camera import Camera, CameraPair
 from sensors.polar import polar
 
 Sweep = tuple[float, float, float]
@@ -36,6 +36,8 @@ _SHORTEST_BASE_M = 1e-3
 _FEWEST_SEEN = 0.05
 """Share of the points that both cameras must see."""
 _LARGEST_POWER = 1e12
+_MOST_OFF = 0.05
+"""Share of the frame's width that given pixels may lie off on the median: a registration moves points by some centimetres."""
 _LEAST_SIGMA = {"tls": (1e-6, "m", "range_sigma_m"), "stereo": (2e-4, "px", "parallax_sigma_px")}
 """By sensor: a smaller predicted spread is none; its unit; the key that says more."""
 
@@ -143,6 +145,21 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
             allowed=f"{100 * _FEWEST_SEEN:g} % and more", remedy="check that cameras and points are of one project",
         )  # fmt: skip
     return float(both.mean())
+
+
+def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
+    """Raise InputError where the pixels of a cloud's points, if it has them, are not those that the left camera sees them in."""
+    if not {"pixel_x", "pixel_y"} <= set(cloud.extra):
+        return
+    x, y, z = np.einsum("ji,nj->in", left.rotation, cloud.points - left.position)
+    ahead = z > 0
+    u, v = left.pixel(x[ahead] / z[ahead], y[ahead] / z[ahead])
+    off = float(np.median(np.hypot(cloud.extra["pixel_x"][ahead] - u, cloud.extra["pixel_y"][ahead] - v)))
+    if not off <= _MOST_OFF * left.width:
+        raise InputError(
+            f"pixel_x and pixel_y lie {off:,.0f} px from where the left camera sees the points (median)", where=where,
+            allowed=f"up to {_MOST_OFF:.0%} of its width", remedy="check that they are of the left picture, or leave them out",
+        )  # fmt: skip
 
 
 def check_power(cloud: PointCloud, where: str) -> PointCloud:

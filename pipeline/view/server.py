@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hmac
 import html
+import io
 import secrets
 import threading
 import webbrowser
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +78,8 @@ def make_app(results: Results, token: str) -> dash.Dash:
 def make_page_server(results: Results, port: int, token: str) -> BaseWSGIServer:
     """The page's server at `port` (0: any that is free); raises InputError where the port is taken."""
     try:
-        return make_server(HOST, port, make_app(results, token).server, threaded=True, request_handler=_Silent)
+        with redirect_stderr(io.StringIO()):  # where werkzeug says the same at length
+            return make_server(HOST, port, make_app(results, token).server, threaded=True, request_handler=_Silent)
     except (OSError, SystemExit, OverflowError):
         remedy = "choose another, or 0 for any that is free"
         raise InputError(f"port {port} cannot be used", where="--port", remedy=remedy) from None
