@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least
+from scene.errors import InputError
 
 SUMMARY = "train a rockfall detector on a data set"
 EXAMPLE = """  scarpsim train my_dataset --out my_detector
@@ -41,6 +42,8 @@ def run(arguments: argparse.Namespace) -> Answer:
 
     if arguments.resume:
         check_place(arguments.out)
+        if not arguments.out.is_dir() or not any(arguments.out.iterdir()):
+            raise InputError("there is no training", where=f"--resume, --out {arguments.out}", remedy="begin it without --resume")
     else:
         empty_folder(arguments.out, "add --resume to go on with a training in it, or choose another --out")
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,6 +74,9 @@ def find_inputs(places: Sequence[Path]) -> list[Input]:
             allowed = "a TIFF, a run folder, or a folder with annotations.json"
             raise InputError("holds no difference map", where=str(place), allowed=allowed)
         result += [Input(file, file.name, {"file_name": file.name}) for file in files]
+    for path, count in Counter(item.path for item in result).items():
+        if count > 1:
+            raise InputError(f"is given {count} times", where=str(path), remedy="name each map once")
     own = [item.image.get("id") for item in result]
     if len(set(own)) < len(own) or None in own:
         result = [Input(item.path, item.name, {**item.image, "id": number}) for number, item in enumerate(result, start=1)]

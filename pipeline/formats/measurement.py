@@ -434,9 +434,9 @@ def _rounding(
 
 
 def _joined(clouds: list[PointCloud]) -> PointCloud:
-    """One cloud of all epochs, with the channels that all have."""
+    """One cloud of all epochs, with the channels that all have; `epoch` counts the files, whatever a file calls so."""
     if len(clouds) == 1:
-        return clouds[0]
+        return replace(clouds[0], extra={name: values for name, values in clouds[0].extra.items() if name != "epoch"})
     shared = set.intersection(*(set(cloud.extra) for cloud in clouds))
     columns: dict[str, Any] = {}
     for name in ("intensity", "gps_time"):
