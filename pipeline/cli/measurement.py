@@ -116,7 +116,7 @@ def numbers(count: int) -> Callable[[str], Any]:
         except ValueError:
             found = ()
         if len(found) != count or not all(abs(value) <= FARTHEST_M for value in found):
-            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: {count} numbers up to {FARTHEST_M:g} between commas")
+            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: {count} numbers between commas, up to {FARTHEST_M:g}")
         return found
 
     return check
