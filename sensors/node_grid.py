@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
@@ -33,7 +34,7 @@ def smooth_field(state: Matches, step_px: float, random: KeyedRandom, *, even: b
     return field * dr.rsqrt(next(squares) * next(squares))
 
 
-_BILINEAR = 4 / 9
+MEAN_VARIANCE = 4 / 9
 """Mean variance of a field whose nodes have variance 1."""
 _PHASES = (np.arange(24) + 0.5) / 24
 """Places within a cell of nodes over which a mean is taken."""
@@ -45,7 +46,26 @@ def node_semivariogram(lag: FloatArray) -> FloatArray:
     4/9 - B(x) B(y), B the cubic B-spline (2/3 at 0, 0 from 2 on): two hat functions convolved.
     """
     across, down = (_spline(np.abs(lag[:, axis])) for axis in (0, 1))
-    return np.asarray(_BILINEAR - across * down)
+    return np.asarray(MEAN_VARIANCE - across * down)
+
+
+def node_weights(pixels: FloatArray, step_px: float) -> tuple[csr_array, FloatArray]:
+    """Bilinear weights (n, q) of pixels (n, 2) on the nodes of a grid at multiples of `step_px`, and where the nodes are (q, 2), px.
+
+    Only nodes are given that have some weight.
+    """
+    corner = np.floor(pixels / step_px).astype(np.int64)
+    share = pixels / step_px - corner
+    width = int(np.ptp(corner[:, 0])) + 2
+    start = (corner - corner.min(axis=0)) @ np.array([1, width])
+    places, weights = [], []
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        places.append(start + right + width * down)
+        weights.append(np.abs(1 - right - share[:, 0]) * np.abs(1 - down - share[:, 1]))
+    nodes, number = np.unique(np.stack(places, axis=1), return_inverse=True)
+    rows = np.repeat(np.arange(len(pixels)), 4)
+    found = csr_array((np.stack(weights, axis=1).ravel(), (rows, number.ravel())), shape=(len(pixels), len(nodes)))
+    return found, step_px * (np.stack([nodes % width, nodes // width], axis=1) + corner.min(axis=0))
 
 
 def _spline(x: FloatArray) -> FloatArray:

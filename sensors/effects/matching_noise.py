@@ -29,6 +29,10 @@ class MatchingNoise(Effect):
         far = np.array([[1e9, 1e9]])
         return float(self.semivariogram(far)[0])
 
+    def covariance(self, lag: FloatArray) -> FloatArray:
+        """(k,) of two pixels `lag` ((k, 2), px) apart, px2."""
+        return self.total_variance - self.semivariogram(lag)
+
     def variance(self, at: Any) -> FloatArray:
         return np.full(len(at), self.total_variance)
 

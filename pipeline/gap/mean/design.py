@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import Candidate, SineGrid, moved_to, precision_of
 from pipeline.gap.mean.mean_model import Covariance, MeanFit, MeanModel, Projected, fitted
-from pipeline.gap.mean.normal_equations import Equations, Waves, assembled, extended, wave_products
+from pipeline.gap.mean.normal_equations import Equations, NoiseDraws, Waves, assembled, extended, wave_products
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.residuals import Residuals
 from scene.keyed_random import KeyedRandom
@@ -64,7 +64,7 @@ class Design:
     pose: (n, p) orthonormal columns of the pose over sigma, in the model's rows; turn: (p, p) from them to those of the
     residuals; pose_precision: (p,) inverse variance of its coefficients before there are data; value, fixed: the residuals and
     all fixed columns, pose first; place: columns of each candidate; waves: products of the searched sines; drawn: (k,
-    DRAWS) products of the fixed columns with draws of white noise within cells; equations: at every likely covariance.
+    DRAWS) products of the fixed columns with draws of the noise within cells; equations: at every likely covariance.
     """
 
     residuals: Residuals
@@ -103,15 +103,13 @@ class Design:
         value = model.project(residuals.value[rows, None] * root)
         model, covariances, bases = model.narrowed([fixed.some(list(range(count))), fixed], value)
         fixed, value = fixed.kept(bases), value.kept(bases)
-        thin = slice(None, None, max(len(model) // _NULL_ROWS, 1))
-        few = len(fixed.within[thin])
-        noise = random.child("within").generator().standard_normal((few, DRAWS)) * np.sqrt(len(model) / few)
+        noise = NoiseDraws.of(model, DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]
-        waves = Waves.of(model, grids, fixed.within, value.within, noise, thin)
+        waves = Waves.of(model, grids, fixed, value, noise)
         known = [np.zeros(count), *(precision_of(each, each.columns.shape[1]) for each in chosen.plain)]
         equations = assembled(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
         place = _places(chosen.plain, count)
-        drawn = fixed.within[thin].T @ noise
+        drawn = noise.products(fixed.within[noise.rows], model.noise.on_nodes(fixed.within))
         return cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, place, waves, drawn, equations
         )  # fmt: skip
@@ -143,7 +141,7 @@ class Design:
         (found,) = self.refined([candidate])[0]
         added = self.model.project(_without(self.pose, self._matrix([found], None)))
         start = self.fixed.within.shape[1]
-        products = wave_products(self.grids, added.within, self.model.root)
+        products = wave_products(self.grids, added.weighed, self.model.root)
         equations = extended(self.model, self.equations, self.fixed, self.value, added, products, self.waves.means)
         place = {**self.place, candidate: list(range(start, start + added.within.shape[1]))}
         return replace(self, fixed=self.fixed.beside(added), equations=equations, place=place)
@@ -232,11 +230,11 @@ class Design:
         for columns in (whole, left := _without(self.pose, whole)):
             projected = self.model.project(columns)
             between = projected.between[self.null.length]
-            grams.append(projected.within.T @ projected.within + (between * weight).T @ between)
+            grams.append(projected.within.T @ projected.weighed + (between * weight).T @ between)
         count = len(self.base)
         matrix, pose = grams[1], self.equations.fixed[row][:count, :count]
         found, base = self.model.project(left), self.fixed
-        cross = base.within[:, :count].T @ found.within
+        cross = base.within[:, :count].T @ found.weighed
         cross += base.between[self.null.length][:, :count].T @ (weight * found.between[self.null.length])
         matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
         size, full = (

@@ -15,12 +15,14 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import eigh
+from scipy import sparse
+from scipy.linalg import cholesky, eigh, solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import j0
 
+from pipeline.gap.mean.within_noise import WithinNoise
 from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.residuals import NOT_SHARED, SharedNoise
+from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
@@ -68,14 +70,17 @@ class MeanModel:
         self._starts = np.flatnonzero(np.diff(self._cell, prepend=-1))
         self.root = 1 / sigma[self.rows]
         self._total = np.add.reduceat(self.root**2, self._starts)
-        variance = 1 / self._total + shared_noise.of_means(cells.side_m)
-        scale = np.sqrt(variance)
-        self._share = 1 / np.sqrt(self._total * variance)
-        self.typical_sigma = typical = float(np.median(scale))
+        self._gathered = sparse.csr_array((self.root / np.sqrt(self._total)[self._cell], (self._cell, np.arange(len(self.rows)))))
+        self.noise = WithinNoise.of(shared_noise.part(self.rows).field(len(self.rows)), self.root, self._gathered)
+        variance = self.noise.of_means()
+        self._root = cholesky(variance, lower=True)
+        self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))
+        scale = typical * np.sqrt(self._total)
         distance = cdist(cells.centre, cells.centre) / cells.side_m
         self._bases: list[tuple[FloatArray, FloatArray]] = []
         for kernel in _correlations(distance):
-            values, vectors = eigh(kernel * (typical**2 / np.outer(scale, scale)), driver="evd", overwrite_a=True)
+            half = self._whitened(kernel * np.outer(scale, scale))
+            values, vectors = eigh(self._whitened(half.T), driver="evd", overwrite_a=True)
             self._bases.append((np.maximum(values, 0.0), vectors))
         self._white = Covariance(0, 0.0, np.ones(len(self._total)))
 
@@ -122,6 +127,10 @@ class MeanModel:
         """(m, k) cell means over their standard deviations, of columns (n, k) that are already over sigma."""
         return self.sums(weighted * self.root[:, None]) / np.sqrt(self._total)[:, None]
 
+    def sums_of(self, rows: slice, weighted: FloatArray) -> FloatArray:
+        """(m, k) what columns (n', k) on some of the rows add to the cell means."""
+        return np.asarray(self._gathered[:, rows] @ weighted)
+
     def within(self, weighted: FloatArray, means: FloatArray, rows: slice = slice(None)) -> FloatArray:
         """Deviations from the cells' means, of `rows`; columns over sigma."""
         cell = self._cell[rows]
@@ -130,12 +139,25 @@ class MeanModel:
 
     def between(self, means: FloatArray) -> list[FloatArray]:
         """Cell means (m, k) in each basis."""
-        return [vectors.T @ (means * self._share[:, None]) for _, vectors in self._bases]
+        white = self._whitened(means)
+        return [vectors.T @ white for _, vectors in self._bases]
+
+    def _whitened(self, means: FloatArray) -> FloatArray:
+        """Cell means (m, k) whose noise is independent and of variance 1."""
+        return means if self.noise.is_white else np.asarray(solve_triangular(self._root, means, lower=True))
 
     def project(self, weighted: FloatArray) -> Projected:
         """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
         means = self.means(weighted)
-        return Projected(self.within(weighted, means), self.between(means))
+        within = self.within(weighted, means)
+        return Projected(within, self._weighed(within), self.between(means))
+
+    def _weighed(self, within: FloatArray) -> FloatArray:
+        """Deviations within cells (n, k), multiplied with the inverse covariance of their noise."""
+        if self.noise.is_white:
+            return within
+        shared = self.noise.nodes @ self.noise.solved(self.noise.on_nodes(within))
+        return np.asarray((within - self.within(shared, self.means(shared))) / self.noise.white)
 
     def null_draws(self, at: Covariance, count: int, random: KeyedRandom) -> list[FloatArray]:
         """Draws of the cell means under the covariance `at`, (m, count) in each basis."""
@@ -158,23 +180,29 @@ def _correlations(distance: FloatArray) -> Iterator[FloatArray]:
 
 @dataclass(frozen=True)
 class Projected:
-    """Columns on both parts of the data. within: (n, k); between: (m, k) per basis."""
+    """Columns on both parts of the data. within: (n, k); weighed: (n, k) times the inverse covariance of the noise there, so that
+    a.within.T @ b.weighed is a product of two; between: (m, k) per basis."""
 
     within: FloatArray
+    weighed: FloatArray
     between: list[FloatArray]
 
     def some(self, columns: list[int]) -> Projected:
         """Some of the columns."""
-        return Projected(self.within[:, columns], [part[:, columns] for part in self.between])
+        within = self.within[:, columns]
+        weighed = within if self.weighed is self.within else self.weighed[:, columns]
+        return Projected(within, weighed, [part[:, columns] for part in self.between])
 
     def kept(self, bases: list[int]) -> Projected:
         """In some of the bases."""
-        return Projected(self.within, [self.between[basis] for basis in bases])
+        return Projected(self.within, self.weighed, [self.between[basis] for basis in bases])
 
     def beside(self, other: Projected) -> Projected:
         """These columns and then those of another."""
-        both = zip(self.between, other.between, strict=True)
-        return Projected(np.concatenate([self.within, other.within], axis=1), [np.concatenate(pair, axis=1) for pair in both])
+        between = [np.concatenate(pair, axis=1) for pair in zip(self.between, other.between, strict=True)]
+        within = np.concatenate([self.within, other.within], axis=1)
+        white = self.weighed is self.within and other.weighed is other.within
+        return Projected(within, within if white else np.concatenate([self.weighed, other.weighed], axis=1), between)
 
 
 @dataclass(frozen=True)
@@ -189,8 +217,8 @@ class _Normal:
 
     @classmethod
     def of(cls, columns: Projected, value: Projected) -> _Normal:
-        y = value.within[:, 0]
-        return cls(columns, value, columns.within.T @ columns.within, columns.within.T @ y, float(y @ y))
+        y = value.weighed[:, 0]
+        return cls(columns, value, columns.within.T @ columns.weighed, columns.within.T @ y, float(value.within[:, 0] @ y))
 
     def at(self, at: Covariance, precision: FloatArray | None = None) -> MeanFit:
         """All columns fitted. precision: (k, k) inverse covariance of the coefficients, around 0, before there are data."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
+from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
 _SMALLEST = 1e-9
@@ -21,8 +22,9 @@ _RIDGE = 1e-12
 
 @dataclass(frozen=True)
 class Waves:
-    """Products of w sines (2 w columns) on the deviations within cells. fixed: (2 w, k) with fixed columns; own: (w, 2, 2);
-    right: (2 w, v) with the values; noise: (2 w, d) with draws of white noise; means: (m, 2 w) of the cells."""
+    """Products of w sines (2 w columns) on the deviations within cells, by the inverse covariance of their noise. fixed: (2 w, k)
+    with fixed columns; own: (w, 2, 2); right: (2 w, v) with the values; noise: (2 w, d) with draws of noise; means: (m, 2 w) of
+    the cells."""
 
     fixed: FloatArray
     own: FloatArray
@@ -31,30 +33,57 @@ class Waves:
     means: FloatArray
 
     @classmethod
-    def of(
-        cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: FloatArray, noise: FloatArray, rows: slice
-    ) -> Waves:
-        """fixed, value: (n, .) within cells; noise: (n', .) on some `rows` of the points."""
+    def of(cls, model: MeanModel, grids: list[SineGrid], fixed: Projected, value: Projected, noise: NoiseDraws) -> Waves:
+        """Of all sines of some grids."""
         parts: list[tuple[FloatArray, ...]] = []
-        beside = np.concatenate([fixed, value], axis=1)
+        beside = np.concatenate([fixed.weighed, value.weighed], axis=1)
         for grid in grids:
             for _, columns in grid.chunks(model.root):
                 means = model.means(columns)
                 products = columns.T @ beside
-                pairs, spread = columns.T.reshape(-1, 2, len(columns)), means.T.reshape(-1, 2, len(means))
-                own = pairs @ pairs.transpose(0, 2, 1) - spread @ spread.transpose(0, 2, 1)
-                parts.append((products, own, model.within(columns, means, rows).T @ noise, means.T))
+                on_nodes = model.noise.on_nodes(columns, means)
+                own = (_squares(columns) - _squares(means) - _squares(model.noise.halved(on_nodes))) / model.noise.white
+                parts.append((products, own, noise.products(model.within(columns, means, noise.rows), on_nodes), means.T))
+        count = fixed.within.shape[1]
         if not parts:
-            empty = np.zeros((0, fixed.shape[1])), np.zeros((0, 2, 2)), np.zeros((0, value.shape[1]))
-            return cls(*empty, np.zeros((0, noise.shape[1])), np.zeros((len(model.means(fixed[:, :1])), 0)))
+            empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
+            return cls(*empty, np.zeros((0, noise.white.shape[1])), np.zeros((len(model.means(fixed.within[:, :1])), 0)))
         products, own, drawn, means = (np.concatenate([part[k] for part in parts]) for k in range(4))
-        return cls(products[:, : fixed.shape[1]], own, products[:, fixed.shape[1] :], drawn, means.T)
+        return cls(products[:, :count], own, products[:, count:], drawn, means.T)
 
 
-def wave_products(grids: list[SineGrid], within: FloatArray, root: FloatArray) -> FloatArray:
-    """(2 w, k) of all sines with further columns (n, k), which are within cells."""
-    found = [columns.T @ within for grid in grids for _, columns in grid.chunks(root)]
-    return np.concatenate(found) if found else np.zeros((0, within.shape[1]))
+@dataclass(frozen=True, eq=False)
+class NoiseDraws:
+    """Draws of the noise within cells. rows: some n' of the points; white: (n', d) on them; on_nodes: (q, d) by `WithinNoise`."""
+
+    rows: slice
+    white: FloatArray
+    on_nodes: FloatArray
+
+    @classmethod
+    def of(cls, model: MeanModel, count: int, most_rows: int, random: KeyedRandom) -> NoiseDraws:
+        """`count` draws; white noise on some of the rows stands for that on all."""
+        rows = slice(None, None, max(len(model) // most_rows, 1))
+        few = len(model.root[rows])
+        white = random.generator().standard_normal((few, count)) * np.sqrt(len(model) / few)
+        on_nodes = model.noise.drawn(white, rows, model.sums_of(rows, white), random.child("nodes"))
+        return cls(rows, white / np.sqrt(model.noise.white), on_nodes)
+
+    def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
+        """(k, d) of columns with the draws, by the inverse covariance. within: (n', k); on_nodes: (q, k)."""
+        return np.asarray(within.T @ self.white + on_nodes.T @ self.on_nodes)
+
+
+def _squares(columns: FloatArray) -> FloatArray:
+    """(w, 2, 2) products of each pair of columns (n, 2 w) with itself."""
+    pairs = columns.T.reshape(columns.shape[1] // 2, 2, len(columns))
+    return np.asarray(pairs @ pairs.transpose(0, 2, 1))
+
+
+def wave_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
+    """(2 w, k) of all sines with further columns (n, k), which are within cells and weighed."""
+    found = [columns.T @ weighed for grid in grids for _, columns in grid.chunks(root)]
+    return np.concatenate(found) if found else np.zeros((0, weighed.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -142,8 +171,8 @@ def _gain(rest: FloatArray, own: FloatArray, left: FloatArray, columns: list[int
 def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: Projected, waves: Waves) -> Equations:
     """The equations at the covariances `at`."""
     between = model.between(waves.means)
-    gram, right = fixed.within.T @ fixed.within, fixed.within.T @ value.within
-    square = np.einsum("nv,nv->v", value.within, value.within)
+    gram, right = fixed.within.T @ fixed.weighed, fixed.within.T @ value.weighed
+    square = np.einsum("nv,nv->v", value.within, value.weighed)
     columns: list[tuple[FloatArray, ...]] = []
     for each in at:
         basis, y, sines = fixed.between[each.length], value.between[each.length], between[each.length]
@@ -175,8 +204,8 @@ def extended(
 ) -> Equations:
     """With further fixed columns. had: the fixed columns so far; waves: (2 w, a) products with the sines; means: theirs."""
     between = model.between(means)
-    cross, own = had.within.T @ added.within, added.within.T @ added.within
-    right = added.within.T @ value.within
+    cross, own = had.within.T @ added.weighed, added.within.T @ added.weighed
+    right = added.within.T @ value.weighed
     fixed, sides, sines = [], [], []
     for row, each in enumerate(equations.at):
         weighted = added.between[each.length] * each.weight[:, None]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import Candidate, Explanation, SineGrid
+from pipeline.gap.mean.candidates import Candidate, Explanation, SineGrid, harmonics
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
@@ -92,14 +92,31 @@ class MeanSearch:
         alike = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
         return {name for name, row in zip(covariates, alike, strict=False) if row.max() > decided().mean.kin}
 
+    def folded(self, members: Members, form: Tried) -> Tried:
+        """A wave with its overtones where the data ask for those beside some effects: what is periodic need not be a sine."""
+        if form.candidate.form != "wave":
+            return form
+        (sine, *others), fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
+        overtones = harmonics(form.name, sine)
+        both = replace(overtones, matrix=np.concatenate([sine.columns, overtones.columns], axis=1))
+        gain = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
+        score = gain - overtones.columns.shape[1]
+        if score < decided().mean.free_margin:
+            return form
+        return replace(form, candidate=both, gain=form.gain + gain, score=form.score + score)
+
     def may_be_the_reference(self, members: Members, form: Tried) -> bool:
-        """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave."""
+        """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave.
+
+        More than a reference may be wrong by is not its error: it is what the wave leaves of whatever is not quite a wave.
+        """
         if form.candidate.form != "wave":
             return False
         design = self.design
         candidates, fit = design.refined([form.candidate, *(member.candidate for member in members)])
         values = design.split(fit.coefficients, candidates)[0][:2]
-        error = float(np.sqrt(fit.at.ratio)) * design.model.typical_sigma
+        most = decided().nodes.reference_error / float(np.median(design.residuals.unit_m))
+        error = min(float(np.sqrt(fit.at.ratio)) * design.model.typical_sigma, most)
         return float(np.std(candidates[0].columns @ values)) < decided().mean.wave_sigmas * error
 
     def leading(self) -> list[Candidate]:

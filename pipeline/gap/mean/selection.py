@@ -119,6 +119,9 @@ class Searched(Protocol):
     def kin(self, form: Tried) -> set[str]:
         """Covariates that change as that of a free form does."""
 
+    def folded(self, members: Members, form: Tried) -> Tried:
+        """A wave with its overtones where the data ask for those."""
+
     def may_be_the_reference(self, members: Members, form: Tried) -> bool:
         """Whether a form beside some effects is no larger than the reference's error, which may hold just such a form."""
 
@@ -139,9 +142,9 @@ class Choice:
                 break
             levels.append(grown)
         best = levels[-1][0]
-        free = self._free(levels)
-        if free is not None and not self.search.may_be_the_reference(*free):
-            members, form = free
+        members, form = self._free(levels) or ((), None)
+        form = None if form is None else self.search.folded(members, form)
+        if form is not None and not self.search.may_be_the_reference(members, form):
             chosen = [self.chosen(members, item) for item in members]
             chosen.append(Chosen(form.candidate, (), self.search.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.search.tried(members)

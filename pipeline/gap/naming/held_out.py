@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.sparse import csr_array
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement
@@ -14,9 +16,12 @@ from pipeline.gap.naming.entries import Named, settled_with
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.shared_noise import SharedNoise
 from scene.mesh import FloatArray
 
 _POINTS_PER_PATCH = 30.0
+_LEAST_OWN = 0.02
+"""Share of a point's variance that counts as its own where a model says there is none."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ def score_effects(
     def gains(out: list[Named]) -> tuple[float, float]:
         """Of some effects on the points that are scored, and what those that were trained let expect of them."""
         without = _value(measurement, [each for each in named if each not in out], residuals, trained)
-        known = np.isfinite(whole[0]) & np.isfinite(without[0])
+        known = np.isfinite(whole.value) & np.isfinite(without.value)
         tested, learned = (_gain(whole, without, known & rows, residuals.at, reference_sigma) for rows in (~trained, trained))
         return tested, learned * float(np.sum(known & ~trained)) / max(float(np.sum(known & trained)), 1.0)
 
@@ -64,22 +69,55 @@ def _least_of(item: Named, expected: float) -> float:
     return item.effect.held_out_gain or _least(expected)
 
 
-def _gain(
-    whole: tuple[FloatArray, FloatArray], without: tuple[FloatArray, FloatArray], rows: BoolArray, at: FloatArray, sigma: float
-) -> float:
-    """Of the log score, by residuals and their standard deviations (n,) with and without an effect, over some rows.
+@dataclass(frozen=True)
+class _Registered:
+    """Residuals (n,) against some model, registered, their predicted standard deviations, and what neighbours share of those."""
+
+    value: FloatArray
+    sigma: FloatArray
+    shared: SharedNoise
+
+    def log_score(self, rows: NDArray[np.int64], patch: NDArray[np.int64], reference_sigma: float) -> float:
+        """Of some rows, in patches, in each of which the reference is off by one error of standard deviation `reference_sigma`.
+
+        By Woodbury's identity and the determinant lemma, first for the patches' errors and then for what neighbours share.
+        """
+        value, sigma = self.value[rows], self.sigma[rows]
+        field = self.shared.part(rows).field(len(rows))
+        nodes, own = field.weights, np.maximum(sigma**2 - field.variance, _LEAST_OWN * sigma**2)
+        total = np.bincount(patch, 1 / own)
+        mean = np.bincount(patch, value / own) / total
+        limit = decided().held_out.clip * sigma
+        left = np.clip(value - mean[patch], -limit, limit)
+        held = 1 / (1 / reference_sigma**2 + total) if reference_sigma else np.zeros(len(total))
+        gathered = csr_array((1 / own, (patch, np.arange(len(rows)))))
+        weighed = (left + mean[patch]) / own
+        sums, node_sums = total * mean, gathered @ nodes
+        square = np.sum((left + mean[patch]) * weighed) - np.sum(held * sums**2)
+        size = np.sum(np.log(own)) - np.sum(np.log1p(-held * total))
+        if nodes.shape[1]:
+            matrix = (nodes.T @ nodes.multiply(1 / own[:, None]) - node_sums.T @ node_sums.multiply(held[:, None])).toarray()
+            prior = cholesky(field.covariance, lower=True)
+            root = cholesky(matrix + cho_solve((prior, True), np.eye(len(prior))), lower=True)
+            right = nodes.T @ weighed - node_sums.T @ (held * sums)
+            square -= np.sum(solve_triangular(root, right, lower=True) ** 2)
+            size += 2 * np.sum(np.log(np.diag(root)) + np.log(np.diag(prior)))
+        return float(-0.5 * (square + size))
+
+
+def _gain(whole: _Registered, without: _Registered, rows: BoolArray, at: FloatArray, sigma: float) -> float:
+    """Of the log score, with and without an effect, over some rows (n,).
 
     at: (n, 2) places on the wall; sigma: of the reference's error. What is an outlier with the effect and without has no say.
     """
-    rows = rows & (_usual(*whole) | _usual(*without))
-    patch = patches(at[rows], _POINTS_PER_PATCH)
-    scores = [_log_score(value[rows], spread[rows], patch, sigma) for value, spread in (whole, without)]
-    return scores[0] - scores[1]
+    chosen = np.flatnonzero(rows & (_usual(whole) | _usual(without)))
+    patch = patches(at[chosen], _POINTS_PER_PATCH)
+    return whole.log_score(chosen, patch, sigma) - without.log_score(chosen, patch, sigma)
 
 
-def _usual(value: FloatArray, sigma: FloatArray) -> BoolArray:
+def _usual(found: _Registered) -> BoolArray:
     """(n,) which residuals are no outliers: debris, and what fell, would move the mean of a patch."""
-    z = value / sigma
+    z = found.value / found.sigma
     return np.asarray(np.abs(z) < decided().points.outlier * max(nmad(z), 1.0))
 
 
@@ -92,10 +130,8 @@ def _least(expected: float) -> float:
     return max(min(0.0, likely - decided().held_out.sigmas * float(np.sqrt(2 * likely))), -decided().held_out.most_lost)
 
 
-def _value(
-    measurement: Measurement, named: list[Named], residuals: Residuals, trained: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """(n,) residuals, registered by the points `trained`, and predicted sigma against the model with some effects."""
+def _value(measurement: Measurement, named: list[Named], residuals: Residuals, trained: BoolArray) -> _Registered:
+    """Of all points against the model with some effects, registered by the points `trained`; NaN where they are not smooth."""
     found = settled_with(measurement, named, residuals.index[trained]).residuals
     count = len(measurement.cloud.points)
     place = np.full(count, -1)
@@ -105,15 +141,4 @@ def _value(
     value, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     pose = pose_of(found, rows[trained & known])
     value[known], sigma[known] = (found.value - found.pose @ pose)[rows[known]], found.sigma[rows[known]]
-    return value, sigma
-
-
-def _log_score(value: FloatArray, sigma: FloatArray, patch: NDArray[np.int64], reference_sigma: float) -> float:
-    """Of the patches' means, with the reference's error in their variance, and of the deviations from them."""
-    weight = 1 / sigma**2
-    total = np.bincount(patch, weight)
-    mean = np.bincount(patch, weight * value) / total
-    variance = 1 / total + reference_sigma**2
-    left = np.clip((value - mean[patch]) / sigma, -decided().held_out.clip, decided().held_out.clip)
-    among = -0.5 * np.sum(left**2) - np.sum(np.log(sigma)) + 0.5 * np.sum(np.log(1 / total))
-    return float(among - 0.5 * np.sum(mean**2 / variance + np.log(variance)))
+    return _Registered(value, sigma, found.shared_noise.part(rows))

@@ -64,12 +64,14 @@ def name_effects(
     scale: float,
     random: KeyedRandom,
     left_out: frozenset[tuple[str, bool]] = frozenset(),
+    nodes: SpreadFound | None = None,
 ) -> tuple[list[Named], Naming]:
     """Effects on the mean and on the spread.
 
     What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
     slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread; left_out:
-    families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word.
+    families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word;
+    nodes: noise that neighbours share, found in what a search without it had left; it is searched again beside that.
     """
     named: list[Named] = []
     whole, whole_scale, added = part, scale, 0.0
@@ -92,6 +94,8 @@ def name_effects(
     spread, spread_tried, words = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
     if wrong := _too_wide(measurement, spread):
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
+    if not spread and nodes is not None:
+        spread = [nodes]
     points = SearchedPoints(measurement, part, families, spread, (scale, added), random)
     first = MeanSearch(weighed(part, spread, scale), families, random)
     found = followed_up(points, first)
@@ -102,11 +106,14 @@ def name_effects(
     left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
         spread, spread_tried, words = _spread(measurement, found.at, design.cells, left, random, left_out)
-    if not spread and (_NODES, False) not in left_out:
-        match measurement, found.at:
-            case StereoMeasurement(), StereoResiduals():
-                nodes = find_nodes(found.at, left, measurement.model, random)
-                spread = [] if nodes is None else [nodes]
+    if spread in ([], [nodes]) and (_NODES, False) not in left_out:
+        match measurement, part, found.at:
+            case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
+                nodes_left = find_nodes(found.at, left, model, random)
+                if nodes_left is not None and nodes is None and found.chosen:
+                    nodes_in_all = find_nodes(part, registered(part)[0], model, random)
+                    return name_effects(measurement, whole, whole_scale, random, left_out, nodes_in_all or nodes_left)
+                spread = [] if nodes_left is None else [nodes_left]
     if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
     moving = [from_mean(each, found.at) for each in found.estimates]

@@ -188,7 +188,7 @@ def weighed(part: Residuals, spread: list[SpreadFound], scale: float) -> Residua
     if not spread:
         return replace(part, sigma=part.sigma * scale)
     made = (effect_of(each.effect)(**each.parameters) for each in spread if each.parameters)
-    shared = [effect for effect in made if isinstance(effect, MatchingNoise) and effect.shared]
+    shared = [effect for effect in made if isinstance(effect, MatchingNoise)]
     sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in spread))
     return replace(part, sigma=sigma, shared_noise=part.shared_noise.beside(shared))
 

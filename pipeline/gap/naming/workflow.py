@@ -207,7 +207,7 @@ class _State:
     ) -> _State:
         """held_points, touched_points: of the measurement."""
         touched = touched_points[plain.index]
-        shaped, residuals = _shaped(there, plain, shapes, touched)
+        shaped, residuals = _shaped(there, plain, shapes, touched, held_points[plain.index])
         rough, _, scale = registered(residuals)
         sight = Sight.of(there, residuals)
         changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
@@ -324,17 +324,22 @@ def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArr
 
 
 def _shaped(
-    measurement: Measurement, residuals: Residuals, shapes: list[ShapeFound], touched: BoolArray
+    measurement: Measurement, residuals: Residuals, shapes: list[ShapeFound], touched: BoolArray, held_out: BoolArray
 ) -> tuple[Measurement, Residuals]:
-    """The measurement with these effects in its model, and the residuals of the same points against that."""
+    """The measurement with these effects in its model, its sensor where its points say that it stood with them, and the residuals
+    of the same points there. touched, held_out: (n,) points that the effects move, and that have no say."""
     if not shapes:
         return measurement, residuals
     entries = [from_shape(shape).entry for shape in shapes]
-    shaped = measurement.changed(model=with_effects(measurement.model, entries))
-    found = residuals_of(shaped)
-    there = found.of_points(found.value, residuals.index)
-    smooth = residuals.smooth & ~touched & np.isfinite(there)
-    return shaped, replace(residuals, value=np.where(np.isfinite(there), there, residuals.value), smooth=smooth)
+    shaped, found, _ = settled(
+        measurement.changed(model=with_effects(measurement.model, entries)), residuals.index[~(touched | held_out)]
+    )
+    place = np.full(len(measurement.cloud.points), -1)
+    place[found.index] = np.arange(len(found))
+    rows = place[residuals.index]
+    known = rows >= 0
+    there = residuals.with_rows(known, found.part(rows[known]))
+    return shaped, replace(there, smooth=residuals.smooth & ~touched & known)
 
 
 def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:

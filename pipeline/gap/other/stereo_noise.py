@@ -28,7 +28,7 @@ from sensors.model import StereoModel
 
 _LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _LONGEST_PX = 256.0
-_STEPS_PX = tuple(8.0 * 2 ** (half / 2) for half in range(9))
+_STEPS_PX = tuple(8.0 * 2 ** (quarter / 4) for quarter in range(17))
 _POINTS_PER_BLOCK = 400.0
 _FEWEST_BLOCKS, _FEWEST_LAGS = 12, 3
 _CLIP = 4.5
@@ -40,12 +40,14 @@ _DRAWS = 1999
 @dataclass(frozen=True)
 class _Variogram:
     """step: px of the raster; lag: (k, 2) px; blocks: (k, b) px^2 less what the model predicts, of each block of the wall times
-    its share of all points; root: (k, k) whitens their sum (root @ value has unit variance)."""
+    its share of all points; root: (k, k) whitens their sum (root @ value has unit variance); most_smooth: px^2 of the reference's
+    error, at the longest lag, that there may be."""
 
     step: float
     lag: FloatArray
     blocks: FloatArray
     root: FloatArray
+    most_smooth: float
 
     @property
     def value(self) -> FloatArray:
@@ -53,13 +55,14 @@ class _Variogram:
         return np.asarray(self.blocks.sum(axis=1))
 
     def fitted(self, form: FloatArray) -> _Form:
-        """A form (k,) beside the reference's error; both at least 0."""
-        smooth = np.sum(self.lag**2, axis=1)
-        columns = self.root @ np.stack([form, smooth / smooth.max()], axis=1)
-        value = self.root @ self.value
+        """A form (k,) beside the reference's error, both at least 0, and that no more than there may be."""
+        columns, value = self.root @ np.stack([form, self._smooth], axis=1), self.root @ self.value
         weights = np.linalg.pinv(columns)
-        if weights[1] @ value < 0:
-            columns, weights = columns[:, :1], np.linalg.pinv(columns[:, :1])
+        smooth = float(weights[1] @ value)
+        if not 0 <= smooth <= self.most_smooth:
+            value = value - np.clip(smooth, 0, self.most_smooth) * columns[:, 1]
+            columns = columns[:, :1]
+            weights = np.linalg.pinv(columns)
         best = weights @ value
         square = float(np.sum((value - columns @ best) ** 2))
         shares = weights[0] @ self.root @ self.blocks
@@ -68,19 +71,25 @@ class _Variogram:
         return _Form(square, float(best[0]), error, shares)
 
     @property
+    def _smooth(self) -> FloatArray:
+        """(k,) form of the reference's error."""
+        found = np.sum(self.lag**2, axis=1)
+        return np.asarray(found / found.max())
+
+    @property
     def smooth_square(self) -> float:
         """chi^2 of the reference's error alone."""
-        smooth = np.sum(self.lag**2, axis=1)
-        column, value = self.root @ (smooth / smooth.max()), self.root @ self.value
-        return float(value @ value - max(column @ value, 0.0) ** 2 / (column @ column))
+        column, value = self.root @ self._smooth, self.root @ self.value
+        return float(np.sum((value - np.clip(column @ value / (column @ column), 0, self.most_smooth) * column) ** 2))
 
     def best_nodes(self) -> tuple[_Form, float, list[float]] | None:
-        """The grid of nodes that fits best with its step, px, and steps that fit as well; None where all are too fine for it."""
+        """The grid of nodes in the middle of those that fit best, its step, px, and their steps; None where all are too fine."""
         trials = [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= decided().nodes.finest * self.step]
         if not trials:
             return None
-        form, step = min(trials, key=lambda trial: trial[0].square)
-        return form, step, [each for trial, each in trials if trial.square < form.square + 1]
+        least = min(form.square for form, _ in trials)
+        near = [trial for trial in trials if trial[0].square < least + 1]
+        return *near[len(near) // 2], [step for _, step in near]
 
 
 @dataclass(frozen=True)
@@ -189,7 +198,8 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     covariance += (_RIDGE + _FEW * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
     offsets = np.array([[lag * step * (axis == 1), lag * step * (axis == 0)] for axis in (0, 1) for lag in lags])
     blocks = (means - model.semivariogram(offsets)[:, None]) * weight
-    return _Variogram(step, offsets, blocks, np.linalg.inv(np.linalg.cholesky(covariance)))
+    most = (decided().nodes.reference_error / float(np.median(part.unit_m))) ** 2
+    return _Variogram(step, offsets, blocks, np.linalg.inv(np.linalg.cholesky(covariance)), most)
 
 
 def _by_block(raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int) -> tuple[FloatArray, FloatArray]:

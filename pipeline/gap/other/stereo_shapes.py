@@ -17,6 +17,7 @@ from pipeline.formats.measurement import StereoMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
+from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.mesh import FloatArray
@@ -32,16 +33,17 @@ _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 _FINER = (1.1, 1.03)
 _FILLED, _STRAY_FILLED = 0.9, 0.02
 """Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
-_NEAR_STEPS = 2
+_NEAR_STEPS, _REGISTRATIONS = 2, 3
 _FILTERED = 0.02
 """Share by which a low-pass is off since the reference is filtered for the rock, at its own cells and up to its own borders."""
 
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px; sigma: (n,) their spread; blocks; held_out:
-    (n,) points that have no say."""
+    """residuals: without effects on the shape; raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px; sigma: (n,) their spread; blocks;
+    held_out: (n,) points that have no say."""
 
+    residuals: StereoResiduals
     raster: DisparityRaster
     disparity: FloatArray
     rough: FloatArray
@@ -58,6 +60,12 @@ class _Witnesses:
             moved = np.where(np.abs(moved - without) > clear, moved, without)
         more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
         return np.where((moved == without) | self.held_out, 0.0, more)
+
+    def registered_with(self, effects: list[Effect]) -> _Witnesses:
+        """With the registration and the spread that the residuals have where some effects are in the model."""
+        moved = np.nan_to_num(self.raster.moved(effects, self.disparity))
+        value, _, scale = registered(replace(self.residuals, value=self.residuals.value - moved))
+        return replace(self, rough=value + moved, sigma=scale * self.residuals.sigma)
 
     def likelier(self, beside: list[Effect], found: list[ShapeFound]) -> ShapeFound:
         """Of effects that may feign each other, the one that explains more of the points that any of them moves clearly."""
@@ -82,10 +90,12 @@ def find_shapes(
         return []
     scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
     believed = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+    had = raster.moved(believed, residuals.geometry.disparity)
     witnesses = _Witnesses(
+        replace(residuals, value=residuals.value + had),
         raster,
         residuals.geometry.disparity,
-        rough + raster.moved(believed, residuals.geometry.disparity),
+        rough + had,
         scale * residuals.sigma,
         WallBlocks.over(residuals.at),
         held_out,
@@ -139,6 +149,11 @@ def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
         return witnesses.gains(beside, Smoothing(sigma_px=sigma))
 
     sigma = refined(gains, [step * each for each in _SIGMAS], _FINER)
+    if witnesses.blocks.tested(gains(sigma)) is None:
+        return None
+    for _ in range(_REGISTRATIONS):  # that of the first trial, and its spread, make up for some of the low-pass
+        witnesses = witnesses.registered_with([*beside, Smoothing(sigma_px=sigma)])
+        sigma = refined(gains, [sigma], _FINER)
     gain = witnesses.blocks.tested(gains(sigma))
     if gain is None:
         return None

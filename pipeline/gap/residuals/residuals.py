@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
 from scene.mesh import FloatArray
 from sensors.effects.base import Sensor
-from sensors.effects.matching_noise import MatchingNoise
-from sensors.model import StereoModel
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -21,38 +20,6 @@ BoolArray = NDArray[np.bool_]
 Rows = BoolArray | NDArray[np.int64] | slice
 """Some of n points: a mask or indices."""
 _Columns = TypeVar("_Columns", bound="DataclassInstance")
-_GRID = (np.arange(24) + 0.5) / 24
-"""Distances within a square of side 1, along one side, over which a mean is taken."""
-
-
-@dataclass(frozen=True)
-class SharedNoise:
-    """Noise of disparities that neighbours share. effects: what makes it; px_per_m: pixels of the frame per metre of the wall."""
-
-    effects: tuple[MatchingNoise, ...] = ()
-    px_per_m: float = 1.0
-
-    @classmethod
-    def of(cls, model: StereoModel, px_per_m: float) -> SharedNoise:
-        """What a model predicts of it."""
-        return cls(tuple(effect for effect in model.matching_noise if effect.shared and not effect.is_null), px_per_m)
-
-    def of_means(self, side_m: float) -> float:
-        """Variance of the mean over a square of the wall, px2: the covariance averaged over all pairs of its places.
-
-        Along each side the distance h of two places, as a share of it, has the density 2 (1 - h).
-        """
-        weight = np.outer(1 - _GRID, 1 - _GRID).ravel()
-        lag = side_m * self.px_per_m * np.stack([each.ravel() for each in np.meshgrid(_GRID, _GRID)], axis=1)
-        covariance = (effect.total_variance - effect.semivariogram(lag) for effect in self.effects)
-        return float(sum((each @ weight / weight.sum() for each in covariance), 0.0))
-
-    def beside(self, effects: list[MatchingNoise]) -> SharedNoise:
-        """With further noise."""
-        return replace(self, effects=(*self.effects, *effects))
-
-
-NOT_SHARED = SharedNoise()
 
 
 class Geometry(Protocol):
@@ -142,7 +109,21 @@ class Residuals(ABC):
             index=self.index[rows],
             geometry=self.geometry.part(rows),
             away=None if self.away is None else self.away[rows],
+            shared_noise=self.shared_noise.part(rows),
         )
+
+    def with_rows(self, known: BoolArray, other: Self) -> Self:
+        """With what `other` has of the points `known` (n,), in their order, but which of them are smooth or even."""
+
+        def merged(mine: NDArray[Any], theirs: NDArray[Any]) -> NDArray[Any]:
+            found = mine.copy()
+            found[known] = theirs
+            return found
+
+        covariates = {name: merged(values, other.covariates[name]) for name, values in self.covariates.items()}
+        pairs = {name: merged(values, getattr(other.geometry, name)) for name, values in vars(self.geometry).items()}
+        columns = {name: merged(getattr(self, name), getattr(other, name)) for name in ("value", "sigma", "unit_m", "pose", "at")}
+        return replace(self, **columns, covariates=covariates, geometry=replace(self.geometry, **pairs))
 
 
 @dataclass(frozen=True)

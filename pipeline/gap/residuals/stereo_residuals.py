@@ -18,7 +18,8 @@ from pipeline.gap.residuals.nominal_pair import (
     real_pair,
     seen_disparities,
 )
-from pipeline.gap.residuals.residuals import Residuals, SharedNoise
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.shared_noise import SharedNoise
 from pipeline.registration.rigid import RigidTransform
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
@@ -108,7 +109,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         covariates=covariates,
         index=np.arange(len(u)),
         geometry=geometry,
-        shared_noise=SharedNoise.of(model, float(nominal.geometry.f / np.nanmedian(depth))),
+        shared_noise=SharedNoise.of(model, np.stack([u, v], axis=1)),
         notes=(*measurement.notes, *_notes(given, u)),
     )
     return whole.part(hit)

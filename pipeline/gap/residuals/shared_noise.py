@@ -1,0 +1,100 @@
+"""Noise of disparities that neighbours share, as random numbers on the nodes of a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import block_diag
+
+from scene.mesh import FloatArray
+from sensors.effects.matching_noise import MatchingNoise, NodeNoise
+from sensors.model import StereoModel
+from sensors.node_grid import MEAN_VARIANCE, node_weights
+
+_MOST_NODES = 2500
+"""Of one effect; what is finer is represented by nodes farther apart, of the same power at long wavelengths."""
+_SAMPLE = 500
+_RIDGE = 1e-4
+_NEAR = np.arange(-8, 9)
+"""Nodes along either side whose covariance with one counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class NodeField:
+    """Noise as random values on the nodes of a grid, interpolated bilinearly. weights: (n, q); covariance: (q, q), px2."""
+
+    weights: sparse.csr_array
+    covariance: FloatArray
+
+    @property
+    def variance(self) -> float:
+        """Of a point on average, px2."""
+        some = self.weights[:: max(self.weights.shape[0] // _SAMPLE, 1)]
+        return float(np.mean((some @ self.covariance * some.toarray()).sum(axis=1))) if some.shape[1] else 0.0
+
+
+@dataclass(frozen=True)
+class SharedNoise:
+    """What of the predicted noise neighbours share. effects: what makes it; pixels: (n, 2) columns and rows of the points."""
+
+    effects: tuple[NodeNoise, ...] = ()
+    pixels: FloatArray | None = None
+
+    @classmethod
+    def of(cls, model: StereoModel, pixels: FloatArray) -> SharedNoise:
+        """What a model predicts of it."""
+        return cls(_shared(model.matching_noise), pixels)
+
+    def part(self, rows: Any) -> SharedNoise:
+        """Of some of the points."""
+        return self if self.pixels is None else replace(self, pixels=self.pixels[rows])
+
+    def beside(self, effects: Sequence[MatchingNoise]) -> SharedNoise:
+        """With further noise."""
+        return replace(self, effects=(*self.effects, *_shared(effects)))
+
+    def field(self, count: int) -> NodeField:
+        """As values on nodes; of `count` points.
+
+        What is finer than the points' own spacing is as good as white, and left out.
+        """
+        fields = [_none(count)]
+        if self.pixels is not None and count:
+            area = float(np.prod(np.maximum(np.ptp(self.pixels, axis=0), 1.0)))
+            fields += [_on_nodes(effect, self.pixels, area) for effect in self.effects if effect.step_px**2 > area / count]
+        weights = sparse.csr_array(sparse.hstack([each.weights for each in fields], format="csr"))
+        return NodeField(weights, block_diag(*(each.covariance for each in fields)))
+
+
+NOT_SHARED = SharedNoise()
+
+
+def _none(count: int) -> NodeField:
+    return NodeField(sparse.csr_array((count, 0)), np.zeros((0, 0)))
+
+
+def _on_nodes(effect: NodeNoise, pixels: FloatArray, area: float) -> NodeField:
+    """The effect's covariance on nodes half as far apart as its own, where those lie not being known.
+
+    Nodes so far apart that they miss some of it are given its power at long wavelengths, which is 9/4 of the variance times the
+    square of the step (that of bilinear interpolation).
+    """
+    step = max(effect.step_px / 2, float(np.sqrt(area / _MOST_NODES)))
+    weights, nodes = node_weights(pixels, step)
+    around = step * np.stack(np.meshgrid(_NEAR, _NEAR), axis=-1).reshape(-1, 2)
+    power = step**2 * float(np.sum(effect.covariance(around)))
+    scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / power
+    lag = (nodes[:, None] - nodes[None]).reshape(-1, 2)
+    near = np.abs(lag).max(axis=1) < 2 * effect.step_px
+    covariance = np.zeros(len(lag))
+    covariance[near] = scale * effect.covariance(lag[near])
+    matrix = covariance.reshape(len(nodes), -1)
+    return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
+
+
+def _shared(effects: Sequence[MatchingNoise]) -> tuple[NodeNoise, ...]:
+    return tuple(effect for effect in effects if isinstance(effect, NodeNoise) and not effect.is_null)
