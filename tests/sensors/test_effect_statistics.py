@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.gap.residuals.residuals import SharedNoise
+from scipy.sparse import csr_array
+
+from pipeline.gap.residuals.shared_noise import SharedNoise
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from sensors.effects import EFFECTS
@@ -183,8 +185,15 @@ def test_the_mean_of_a_square_has_the_variance_that_its_pairs_give(effect: Match
     count = CELLS // cells
     field = noise(effect, range(20))[:, : count * cells, : count * cells]
     means = field.reshape(20, count, cells, count, cells).mean(axis=(2, 4))
-    stated = SharedNoise((effect,), px_per_m=100.0).of_means(side / 100.0)
-    assert np.mean(means**2) == pytest.approx(stated, rel=0.15)
+    pixels = REDUCTION * (np.stack(np.meshgrid(np.arange(CELLS), np.arange(CELLS)), axis=-1).reshape(-1, 2) + 0.5)
+    inside = (pixels < count * side).all(axis=1)
+    number = (pixels[inside] // side) @ np.array([1, count])
+    nodes = SharedNoise((effect,), pixels[inside]).field(int(inside.sum()))
+    gathered = csr_array((np.full(len(number), 1 / cells**2), (number.astype(int), np.arange(len(number)))))
+    weights = (gathered @ nodes.weights).toarray()
+    stated = np.mean(np.einsum("mi,ij,mj->m", weights, nodes.covariance, weights))
+    assert np.mean(means**2) == pytest.approx(stated, rel=0.2)
+    assert nodes.variance == pytest.approx(effect.total_variance, rel=0.25)
 
 
 @pytest.mark.parametrize("camera", ["left", "right", "both"])

@@ -1,0 +1,119 @@
+"""Noise that neighbours share, in the search for the mean and on held-out blocks, against dense covariance matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, multivariate_normal
+
+from pipeline.gap.mean.candidates import Candidate, Grid, Wave
+from pipeline.gap.mean.mean_model import MeanModel
+from pipeline.gap.mean.normal_equations import NoiseDraws
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.naming.held_out import _Registered
+from pipeline.gap.residuals.cells import Cells, patches
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.shared_noise import NodeField, SharedNoise
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.regularization_noise import RegularizationNoise
+
+STRIDE, SIDE = 4, 40
+NOISE = RegularizationNoise(sigma_px=0.3, step_px=32.0)
+WHITE = 0.2
+SIGMA = float(np.sqrt(WHITE**2 + NOISE.total_variance))
+
+
+def raster(side: int = SIDE) -> FloatArray:
+    """(n, 2) pixels."""
+    return STRIDE * np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2).astype(float)
+
+
+def dense(field: NodeField) -> FloatArray:
+    """(n, n) covariance of what neighbours share."""
+    weights = field.weights.toarray()
+    return np.asarray(weights @ field.covariance @ weights.T)
+
+
+def model_of(pixels: FloatArray) -> tuple[MeanModel, FloatArray]:
+    """On cells of 16 points, and the covariance of the noise over sigma, in the model's rows."""
+    number = np.unique(pixels // (4 * STRIDE) @ np.array([1, 1000]), return_inverse=True)[1]
+    centre = np.stack([np.bincount(number, pixels[:, axis]) / 16 for axis in (0, 1)], axis=1)
+    model = MeanModel(Cells(4.0 * STRIDE, number, centre), np.full(len(pixels), SIGMA), SharedNoise((NOISE,), pixels))
+    shared = dense(SharedNoise((NOISE,), pixels[model.rows]).field(len(pixels))) / SIGMA**2
+    return model, model.noise.white * np.eye(len(pixels)) + shared
+
+
+def test_products_within_cells_are_those_of_the_inverse_covariance() -> None:
+    pixels = raster(24)
+    model, covariance = model_of(pixels)
+    columns = np.random.default_rng(1).standard_normal((len(pixels), 3))
+    found = model.project(columns)
+    off = np.eye(len(pixels)) - _averaged(model, len(pixels))
+    expected = (off @ columns).T @ np.linalg.pinv(off @ covariance @ off.T, rcond=1e-9) @ (off @ columns)
+    np.testing.assert_allclose(found.within.T @ found.weighed, expected, rtol=1e-6)
+
+
+def _averaged(model: MeanModel, count: int) -> FloatArray:
+    whole = np.eye(count)
+    return whole - model.within(whole, model.means(whole))
+
+
+def test_draws_have_the_variance_of_the_products_that_they_stand_for() -> None:
+    """4,000 draws: the variance scatters by 2.2 %; 10 %."""
+    pixels = raster(24)
+    model, _ = model_of(pixels)
+    slow = np.sin(2 * np.pi * pixels[:, :1] / 80)
+    found = model.project(np.concatenate([slow, np.random.default_rng(2).standard_normal((len(pixels), 1))], axis=1)[model.rows])
+    noise = NoiseDraws.of(model, 4000, len(pixels), KeyedRandom(3))
+    drawn = noise.products(found.within[noise.rows], model.noise.on_nodes(found.within))
+    np.testing.assert_allclose(drawn.var(axis=1), np.diag(found.within.T @ found.weighed), rtol=0.1)
+
+
+def test_the_score_on_held_out_blocks_is_the_density_of_all_points_together() -> None:
+    pixels = raster(20)
+    count, reference = len(pixels), 0.07
+    patch = patches(pixels, 30.0)
+    shared = SharedNoise((NOISE,), pixels)
+    field = shared.field(count)
+    together = (patch[:, None] == patch[None]) * reference**2 + dense(field) + (SIGMA**2 - field.variance) * np.eye(count)
+    value = multivariate_normal(np.zeros(count), together).rvs(random_state=4)
+    other = multivariate_normal(np.zeros(count), together).rvs(random_state=5)
+    scores = [_Registered(each, np.full(count, SIGMA), shared).log_score(np.arange(count), patch, reference) for each in (value, other)]
+    expected = [multivariate_normal(np.zeros(count), together).logpdf(each) for each in (value, other)]
+    assert scores[0] - scores[1] == pytest.approx(expected[0] - expected[1], rel=1e-6)
+
+
+def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> Residuals:
+    """Nothing but noise, with a pose of two columns."""
+    random = np.random.default_rng(seed)
+    value = cholesky @ random.standard_normal(len(pixels)) + WHITE * random.standard_normal(len(pixels))
+    at = pixels / 40.0
+    pose = np.stack([np.ones(len(at)), at[:, 0], at[:, 1], at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=1)
+    every = np.ones(len(at), dtype=bool)
+    return Residuals(
+        "stereo", value, np.full(len(at), SIGMA), np.full(len(at), 0.1), every, every, pose, at,
+        {"image_x": pixels[:, 0], "image_y": pixels[:, 1]}, np.arange(len(at)), shared_noise=SharedNoise((NOISE,), pixels),
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_what_remains_has_an_even_p_value_where_there_is_nothing_but_noise() -> None:
+    """60 measurements of nothing but noise, waves of two to twelve cycles along either axis searched.
+
+    Kolmogorov-Smirnov at 0.1 %, which the right distribution fails once in a thousand seeds; with noise taken for white within
+    cells all p-values are at the smallest there is.
+    """
+    pixels = raster(60)
+    weights = SharedNoise((NOISE,), pixels).field(len(pixels))
+    cholesky = weights.weights @ np.linalg.cholesky(weights.covariance)
+    p_values = []
+    for seed in range(60):
+        residuals = noisy(seed, pixels, cholesky)
+        families: list[Candidate | Grid] = [
+            Grid(name, "amplitude", Wave("period", np.ones(len(pixels)), values), np.linspace(2, 12, 21) / 240.0, {}, True)
+            for name, values in residuals.covariates.items()
+        ]
+        search = MeanSearch(residuals, families, KeyedRandom(seed))
+        p_values.append(search.p_value(search.tried(())[0].score))
+    assert kstest(p_values, "uniform").pvalue > 0.001, sorted(p_values)
