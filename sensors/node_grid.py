@@ -50,7 +50,7 @@ def node_semivariogram(lag: FloatArray) -> FloatArray:
 
 
 def node_weights(pixels: FloatArray, step_px: float) -> tuple[csr_array, FloatArray]:
-    """Bilinear weights (n, q) of pixels (n, 2) on the nodes of a grid at multiples of `step_px`, and where the nodes are (q, 2), px.
+    """Bilinear weights (n, q) of pixels (n, 2) on the nodes of a grid at multiples of `step_px`, and their places (q, 2), px.
 
     Only nodes are given that have some weight.
     """

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import kstest, multivariate_normal
 
-from pipeline.gap.mean.candidates import Candidate, Grid, Wave
+from pipeline.gap.mean.candidates import Candidate, SineGrid, Wave
 from pipeline.gap.mean.mean_model import MeanModel
 from pipeline.gap.mean.normal_equations import NoiseDraws
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.held_out import _Registered
 from pipeline.gap.residuals.cells import Cells, patches
-from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.shared_noise import NodeField, SharedNoise
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -22,6 +25,7 @@ STRIDE, SIDE = 4, 40
 NOISE = RegularizationNoise(sigma_px=0.3, step_px=32.0)
 WHITE = 0.2
 SIGMA = float(np.sqrt(WHITE**2 + NOISE.total_variance))
+NOWHERE = PixelGeometry(*[np.zeros(1)] * 9)
 
 
 def raster(side: int = SIDE) -> FloatArray:
@@ -79,22 +83,24 @@ def test_the_score_on_held_out_blocks_is_the_density_of_all_points_together() ->
     together = (patch[:, None] == patch[None]) * reference**2 + dense(field) + (SIGMA**2 - field.variance) * np.eye(count)
     value = multivariate_normal(np.zeros(count), together).rvs(random_state=4)
     other = multivariate_normal(np.zeros(count), together).rvs(random_state=5)
-    scores = [_Registered(each, np.full(count, SIGMA), shared).log_score(np.arange(count), patch, reference) for each in (value, other)]
+    scores = [
+        _Registered(each, np.full(count, SIGMA), shared).log_score(np.arange(count), patch, reference) for each in (value, other)
+    ]
     expected = [multivariate_normal(np.zeros(count), together).logpdf(each) for each in (value, other)]
     assert scores[0] - scores[1] == pytest.approx(expected[0] - expected[1], rel=1e-6)
 
 
-def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> Residuals:
-    """Nothing but noise, with a pose of two columns."""
+def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> StereoResiduals:
+    """Nothing but noise; the pose is a parabola over the wall."""
     random = np.random.default_rng(seed)
     value = cholesky @ random.standard_normal(len(pixels)) + WHITE * random.standard_normal(len(pixels))
     at = pixels / 40.0
     pose = np.stack([np.ones(len(at)), at[:, 0], at[:, 1], at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=1)
     every = np.ones(len(at), dtype=bool)
-    return Residuals(
-        "stereo", value, np.full(len(at), SIGMA), np.full(len(at), 0.1), every, every, pose, at,
-        {"image_x": pixels[:, 0], "image_y": pixels[:, 1]}, np.arange(len(at)), shared_noise=SharedNoise((NOISE,), pixels),
-    )  # fmt: skip
+    covariates = {"image_x": pixels[:, 0], "image_y": pixels[:, 1]}
+    nowhere, sigma, unit = NOWHERE.part(np.zeros(len(at), dtype=int)), np.full(len(at), SIGMA), np.full(len(at), 0.1)
+    found = StereoResiduals(value, sigma, unit, every, every, pose, at, covariates, np.arange(len(at)), nowhere)
+    return replace(found, shared_noise=SharedNoise((NOISE,), pixels))
 
 
 @pytest.mark.slow
@@ -110,8 +116,8 @@ def test_what_remains_has_an_even_p_value_where_there_is_nothing_but_noise() -> 
     p_values = []
     for seed in range(60):
         residuals = noisy(seed, pixels, cholesky)
-        families: list[Candidate | Grid] = [
-            Grid(name, "amplitude", Wave("period", np.ones(len(pixels)), values), np.linspace(2, 12, 21) / 240.0, {}, True)
+        families: list[Candidate | SineGrid] = [
+            SineGrid(name, "amplitude", Wave("period", np.ones(len(pixels)), values), np.linspace(2, 12, 21) / 240.0, {}, True)
             for name, values in residuals.covariates.items()
         ]
         search = MeanSearch(residuals, families, KeyedRandom(seed))

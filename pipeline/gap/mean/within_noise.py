@@ -1,8 +1,8 @@
 """Noise of the deviations within cells: white, and what neighbours share of it.
 
-In units of the predicted spread the deviations have the covariance R = w I + Z C Z', w the white share, C the covariance of random
-numbers on q nodes and Z (n, q) what those do, less its mean in each cell. By Woodbury's identity R^-1 = (I - Z K^-1 Z') / w with
-K = w C^-1 + Z'Z, so that products with R^-1 need q by q matrices only.
+In units of the predicted spread the deviations have the covariance R = w I + Z C Z', w the white share, C the covariance of
+random numbers on q nodes and Z (n, q) what those do, less its mean in each cell. By Woodbury's identity
+R^-1 = (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z, so that products with R^-1 need q by q matrices only.
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ _FILTERED = 0.02
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """residuals: without effects on the shape; raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px; sigma: (n,) their spread; blocks;
-    held_out: (n,) points that have no say."""
+    """residuals: without effects on the shape; raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px;
+    sigma: (n,) their spread; blocks; held_out: (n,) points that have no say."""
 
     residuals: StereoResiduals
     raster: DisparityRaster

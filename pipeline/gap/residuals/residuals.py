@@ -113,17 +113,21 @@ class Residuals(ABC):
         )
 
     def with_rows(self, known: BoolArray, other: Self) -> Self:
-        """With what `other` has of the points `known` (n,), in their order, but which of them are smooth or even."""
+        """With what `other` has of the points `known` (n,), in their order, but for which of them are smooth or even."""
+        names = ("value", "sigma", "unit_m", "pose", "at")
+        columns: dict[str, Any] = {name: _merged(getattr(self, name), getattr(other, name), known) for name in names}
+        columns["covariates"] = {name: _merged(values, other.covariates[name], known) for name, values in self.covariates.items()}
+        mine, theirs = vars(self.geometry), vars(other.geometry)
+        pairs = {name: _merged(values, theirs[name], known) for name, values in mine.items() if values is not None}
+        geometry: Any = self.geometry
+        return replace(self, **columns, geometry=replace(geometry, **pairs))
 
-        def merged(mine: NDArray[Any], theirs: NDArray[Any]) -> NDArray[Any]:
-            found = mine.copy()
-            found[known] = theirs
-            return found
 
-        covariates = {name: merged(values, other.covariates[name]) for name, values in self.covariates.items()}
-        pairs = {name: merged(values, getattr(other.geometry, name)) for name, values in vars(self.geometry).items()}
-        columns = {name: merged(getattr(self, name), getattr(other, name)) for name in ("value", "sigma", "unit_m", "pose", "at")}
-        return replace(self, **columns, covariates=covariates, geometry=replace(self.geometry, **pairs))
+def _merged(mine: NDArray[Any], theirs: NDArray[Any], known: BoolArray) -> NDArray[Any]:
+    """(n, ...) values with others in the rows `known`."""
+    found = mine.copy()
+    found[known] = theirs
+    return found
 
 
 @dataclass(frozen=True)

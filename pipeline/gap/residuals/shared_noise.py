@@ -85,7 +85,7 @@ def _on_nodes(effect: NodeNoise, pixels: FloatArray, area: float) -> NodeField:
     """
     step = max(effect.step_px / 2, float(np.sqrt(area / _MOST_NODES)))
     weights, nodes = node_weights(pixels, step)
-    around = step * np.stack(np.meshgrid(_NEAR, _NEAR), axis=-1).reshape(-1, 2)
+    around = step * np.stack(np.meshgrid(_NEAR, _NEAR), axis=-1).reshape(-1, 2).astype(np.float64)
     power = step**2 * float(np.sum(effect.covariance(around)))
     scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / power
     lag = (nodes[:, None] - nodes[None]).reshape(-1, 2)
