@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
@@ -47,25 +46,6 @@ def node_semivariogram(lag: FloatArray) -> FloatArray:
     """
     across, down = (_spline(np.abs(lag[:, axis])) for axis in (0, 1))
     return np.asarray(MEAN_VARIANCE - across * down)
-
-
-def node_weights(pixels: FloatArray, step_px: float) -> tuple[csr_array, FloatArray]:
-    """Bilinear weights (n, q) of pixels (n, 2) on the nodes of a grid at multiples of `step_px`, and their places (q, 2), px.
-
-    Only nodes are given that have some weight.
-    """
-    corner = np.floor(pixels / step_px).astype(np.int64)
-    share = pixels / step_px - corner
-    width = int(np.ptp(corner[:, 0])) + 2
-    start = (corner - corner.min(axis=0)) @ np.array([1, width])
-    places, weights = [], []
-    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        places.append(start + right + width * down)
-        weights.append(np.abs(1 - right - share[:, 0]) * np.abs(1 - down - share[:, 1]))
-    nodes, number = np.unique(np.stack(places, axis=1), return_inverse=True)
-    rows = np.repeat(np.arange(len(pixels)), 4)
-    found = csr_array((np.stack(weights, axis=1).ravel(), (rows, number.ravel())), shape=(len(pixels), len(nodes)))
-    return found, step_px * (np.stack([nodes % width, nodes // width], axis=1) + corner.min(axis=0))
 
 
 def _spline(x: FloatArray) -> FloatArray:

@@ -197,7 +197,7 @@ def test_the_mean_of_a_square_has_the_variance_that_its_pairs_give(effect: Match
     weights = (gathered @ nodes.weights).toarray()[whole]
     stated = float(np.mean(np.sum(weights @ nodes.covariance * weights, axis=1)))
     assert np.mean(means**2) == pytest.approx(stated, rel=0.2)
-    assert nodes.variance == pytest.approx(effect.total_variance, rel=0.1)
+    assert nodes.variance == pytest.approx(effect.total_variance, rel=0.25)
 
 
 @pytest.mark.parametrize("camera", ["left", "right", "both"])

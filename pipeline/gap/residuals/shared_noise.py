@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from scene.mesh import FloatArray
 from sensors.effects.matching_noise import MatchingNoise, NodeNoise
 from sensors.model import StereoModel
-from sensors.node_grid import MEAN_VARIANCE, node_weights
+from sensors.node_grid import MEAN_VARIANCE
 
 _MOST_NODES = 2500
 """Of one effect; what is finer is represented by nodes farther apart, of the same power at long wavelengths."""
@@ -84,7 +84,7 @@ def _on_nodes(effect: NodeNoise, pixels: FloatArray, area: float) -> NodeField:
     square of the step (that of bilinear interpolation).
     """
     step = max(effect.step_px / 2, float(np.sqrt(area / _MOST_NODES)))
-    weights, nodes = node_weights(pixels, step)
+    weights, nodes = _bilinear(pixels, step)
     around = step * np.stack(np.meshgrid(_NEAR, _NEAR), axis=-1).reshape(-1, 2).astype(np.float64)
     power = step**2 * float(np.sum(effect.covariance(around)))
     scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / power
@@ -94,6 +94,25 @@ def _on_nodes(effect: NodeNoise, pixels: FloatArray, area: float) -> NodeField:
     covariance[near] = scale * effect.covariance(lag[near])
     matrix = covariance.reshape(len(nodes), -1)
     return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
+
+
+def _bilinear(pixels: FloatArray, step_px: float) -> tuple[sparse.csr_array, FloatArray]:
+    """Bilinear weights (n, q) of pixels (n, 2) on the nodes of a grid at multiples of `step_px`, and their places (q, 2), px.
+
+    Only nodes are given that have some weight.
+    """
+    corner = np.floor(pixels / step_px).astype(np.int64)
+    share = pixels / step_px - corner
+    width = int(np.ptp(corner[:, 0])) + 2
+    start = (corner - corner.min(axis=0)) @ np.array([1, width])
+    places, weights = [], []
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        places.append(start + right + width * down)
+        weights.append(np.abs(1 - right - share[:, 0]) * np.abs(1 - down - share[:, 1]))
+    nodes, number = np.unique(np.stack(places, axis=1), return_inverse=True)
+    rows = np.repeat(np.arange(len(pixels)), 4)
+    found = sparse.csr_array((np.stack(weights, axis=1).ravel(), (rows, number.ravel())), shape=(len(pixels), len(nodes)))
+    return found, step_px * (np.stack([nodes % width, nodes // width], axis=1) + corner.min(axis=0))
 
 
 def _shared(effects: Sequence[MatchingNoise]) -> tuple[NodeNoise, ...]:
