@@ -19,7 +19,7 @@ _MOST_NODES = 2500
 """Of one effect; what is finer is represented by nodes farther apart, of the same power at long wavelengths."""
 _SAMPLE = 500
 _RIDGE = 1e-4
-_NEAR = np.arange(-8, 9)
+_NEAR = np.arange(-5, 6)
 """Nodes along either side whose covariance with one counts."""
 
 
@@ -85,14 +85,13 @@ def _on_nodes(effect: NodeNoise, pixels: FloatArray, area: float) -> NodeField:
     """
     step = max(effect.step_px / 2, float(np.sqrt(area / _MOST_NODES)))
     weights, nodes = _bilinear(pixels, step)
-    around = step * np.stack(np.meshgrid(_NEAR, _NEAR), axis=-1).reshape(-1, 2).astype(np.float64)
-    power = step**2 * float(np.sum(effect.covariance(around)))
-    scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / power
-    lag = (nodes[:, None] - nodes[None]).reshape(-1, 2)
-    near = np.abs(lag).max(axis=1) < 2 * effect.step_px
-    covariance = np.zeros(len(lag))
-    covariance[near] = scale * effect.covariance(lag[near])
-    matrix = covariance.reshape(len(nodes), -1)
+    around = step * np.stack(np.meshgrid(_NEAR, _NEAR, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float64)
+    table = effect.covariance(around).reshape(len(_NEAR), -1)
+    scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / (step**2 * float(table.sum()))
+    apart = np.rint((nodes[:, None] - nodes[None]) / step).astype(np.int64)
+    near = np.abs(apart).max(axis=2) <= _NEAR[-1]
+    matrix = np.zeros(near.shape)
+    matrix[near] = scale * table[tuple((apart[near] + _NEAR[-1]).T)]
     return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
 
 
