@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from scene.backend import dr, mi
 from scene.mesh import FloatArray
+from scene.upload import on_device
 
 Mode = Literal["first", "strongest", "mean", "multiple"]
 Ranging = Literal["pulse", "phase"]
@@ -31,7 +32,10 @@ _NOWHERE_M = 1e30
 
 @dataclass(frozen=True)
 class Echo:
-    """What one ray of every pulse, or a whole pulse, brings back; lazy device arrays (n,). Names as in `Pulses`; range in m."""
+    """What one ray of every pulse, or a whole pulse, brings back; device arrays (n,). Names as in `Pulses`; range in m.
+
+    returns: how many the pulse has; strongest: whether this is the strongest of them; None where only one is recorded.
+    """
 
     range_m: mi.Float64
     cos_incidence: mi.Float32
@@ -39,6 +43,20 @@ class Echo:
     power: mi.Float32
     block: mi.Int32
     returned: mi.Bool
+    returns: mi.UInt32 | None = None
+    strongest: mi.Bool | None = None
+
+    def at(self, index: mi.UInt32) -> Echo:
+        """The echoes at the given places."""
+        return Echo(**{name: dr.gather(type(value), value, index) for name, value in self._known()})
+
+    @staticmethod
+    def joined(parts: Sequence[Echo]) -> Echo:
+        """The echoes of all parts, one part after the other."""
+        return Echo(**{name: dr.concat([getattr(part, name) for part in parts]) for name, _ in parts[0]._known()})
+
+    def _known(self) -> list[tuple[str, Any]]:
+        return [(name, value) for name, value in vars(self).items() if value is not None]
 
 
 @dataclass(frozen=True)
@@ -56,13 +74,14 @@ class Beam:
     separation_m: float = 0.0
     modulation_wavelength_m: float | None = None
 
-    def sub_rays_about(self, axis: mi.Array3f64, *across: mi.Array3f64) -> list[mi.Array3f64]:
-        """Unit vectors of the sub-rays, 3 x (n,) each, about the axis and with the two unit vectors across it."""
+    def sub_ray(self, axis: mi.Array3f64, across: Sequence[mi.Array3f64], number: mi.UInt32) -> mi.Array3f64:
+        """Unit vectors of sub-rays by `number` (n,), 3 x (n,), about the axis and with the two unit vectors across it."""
         if self.sub_rays == 1:
-            return [axis]
+            return axis
         divergence = dr.opaque(mi.Float64, self.divergence_rad)
         first, second = (divergence * vectors for vectors in across)
-        return [dr.normalize(axis + float(x) * first + float(y) * second) for x, y in unit_offsets(self.sub_rays)]
+        x, y = (dr.gather(mi.Float64, on_device(mi.Float64, each), number) for each in unit_offsets(self.sub_rays).T)
+        return dr.normalize(axis + x * first + y * second)
 
     def received(self, echoes: Sequence[Echo]) -> Echo:
         """The recorded return of every pulse, from the echoes of its sub-rays."""
@@ -74,24 +93,25 @@ class Beam:
         if self.mode == "mean":
             return _merged(echoes, [echo.returned for echo in echoes])
         low, high = self._extent(echoes)
-        return _merged(echoes, [echo.returned & (echo.range_m >= low) & (echo.range_m <= high) for echo in echoes])
+        found = _merged(echoes, [echo.returned & (echo.range_m >= low) & (echo.range_m <= high) for echo in echoes])
+        return replace(found, returns=self._count(echoes)) if self.records_several else found
 
     @property
     def records_several(self) -> bool:
         """Whether there may be returns beside the one of `received`."""
         return self.mode == "multiple" and self.sub_rays > 1 and self.modulation_wavelength_m is None
 
-    def count(self, echoes: Sequence[Echo]) -> mi.UInt32:
+    def _count(self, echoes: Sequence[Echo]) -> mi.UInt32:
         """(n,) how many returns every pulse has."""
-        (high, energy), *others = self._sorted(_with_misses_last(echoes))
+        (high, energy), *others = self._sorted(echoes)
         gap, number = dr.opaque(mi.Float64, self.separation_m), dr.select(energy > 0, mi.UInt32(1), 0)
         for range_m, power in others:
             number += dr.select((range_m - high > gap) & (power > 0), mi.UInt32(1), 0)
             high = range_m
         return number
 
-    def numbered(self, echoes: Sequence[Echo], number: mi.UInt32) -> tuple[Echo, mi.Bool]:
-        """The return of a number, counted by range from 1, and whether it is the one of `received`, the strongest."""
+    def numbered(self, echoes: Sequence[Echo], number: mi.UInt32) -> Echo:
+        """The return of a number, counted by range from 1; the strongest is the one of `received`."""
         echoes = _with_misses_last(echoes)
         (first, _), *others = self._sorted(echoes)
         gap, current = dr.opaque(mi.Float64, self.separation_m), mi.UInt32(1)
@@ -103,7 +123,7 @@ class Beam:
             high = dr.select(current == number, range_m, high)
             previous = range_m
         chosen = _merged(echoes, [echo.returned & (echo.range_m >= low) & (echo.range_m <= high) for echo in echoes])
-        return chosen, low == self._extent(echoes)[0]
+        return replace(chosen, strongest=low == self._extent(echoes)[0])
 
     def _sorted(self, echoes: Sequence[Echo]) -> list[tuple[mi.Float64, mi.Float32]]:
         """(range, power) of the echoes by range, those that did not return last and without power."""
