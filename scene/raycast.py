@@ -97,8 +97,10 @@ class RayCaster:
         code = mi.Float32(6 * labels + 2 * mi.Int32(axis) + dr.select(largest < 0, 1, 0))  # exact below 2^24: 2.7 million blocks
         columns = [part for value in (following, last, dr.dot(normal, corner)) for part in _split(value)]
         records = dr.empty(mi.Float32, 8 * len(self.mesh.faces))
-        for column, value in enumerate((*columns, self._albedo(vertex), code)):
-            dr.scatter(records, value, 8 * index + column)
+        columns += [self._albedo(vertex), code]
+        dr.eval(columns)
+        for half in (0, 1):
+            dr.scatter(records, mi.Array4f(*columns[4 * half : 4 * half + 4]), 2 * index + half)
         dr.eval(records)
         return records
 
