@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal
@@ -19,7 +19,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray
 from scene.raycast import RayCaster
 from sensors.atmosphere import extinction_per_m
-from sensors.beam import Beam, Echo
+from sensors.beam import Beam, Echo, SubRays
 from sensors.camera import axis_rotation
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Stage, apply_stage
@@ -177,7 +177,7 @@ class LaserScanner:
         pulses, beam = self.emitted(self.emit(), random)
         if beam.records_several and self.config.faces == 2:
             raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
-        echo = real._echo(scene, pulses, beam, beam.received)
+        echo = real.echo(scene, pulses, beam, beam.received)
         seen = self._record(self.measured(pulses, echo, random), real)
         if echo.returns is None or not np.any(echo.returns.numpy() > 1):
             return seen
@@ -234,7 +234,7 @@ class LaserScanner:
             aim_zenith=zenith,
         )
 
-    def _echo(self, scene: RayCaster, pulses: Pulses, beam: Beam, merge: Callable[[Sequence[Echo]], Echo]) -> Echo:
+    def echo(self, scene: RayCaster, pulses: Pulses, beam: Beam, merge: Callable[[SubRays], Echo]) -> Echo:
         """Ray-trace the emitted beams; `merge` makes one echo of those of a pulse's sub-rays.
 
         Rays start from memory and echoes end there, so that one compiled kernel serves whatever effects come before and after.
@@ -248,8 +248,8 @@ class LaserScanner:
             parts.append(echo)
         return Echo.joined(parts)
 
-    def _sub_ray_echoes(self, scene: RayCaster, pulses: Pulses, beam: Beam, start: int, count: int) -> list[Echo]:
-        """The echoes of each sub-ray of `count` pulses from the number `start` on.
+    def _sub_ray_echoes(self, scene: RayCaster, pulses: Pulses, beam: Beam, start: int, count: int) -> SubRays:
+        """The echoes of all sub-rays of `count` pulses from the number `start` on.
 
         The rays of one pulse are traced together: they are neighbours, and several times as fast as one ray of each pulse.
         """
@@ -261,8 +261,7 @@ class LaserScanner:
         across = [rotated(self.rotation, vectors) for vectors in tangents(azimuth, zenith)]
         echoes = self._traced(scene, beam.sub_ray(axis, across, ray - own * many))
         dr.eval(echoes)
-        first = many * dr.arange(mi.UInt32, count)
-        return [echoes.at(first + number) for number in range(beam.sub_rays)] if beam.sub_rays > 1 else [echoes]
+        return SubRays(echoes, beam.sub_rays)
 
     def _traced(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
         """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
@@ -333,7 +332,7 @@ class LaserScanner:
         for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
             index = dr.compress(count >= max(number, 2))
             pulses, beam = self.emitted(emitted.at(index), random)
-            echo = real._echo(scene, pulses, beam, partial(beam.numbered, number=dr.opaque(mi.UInt32, number)))
+            echo = real.echo(scene, pulses, beam, partial(beam.numbered, number=dr.opaque(mi.UInt32, number)))
             recorded = self._recorded(self.measured(pulses, echo, random.child("return", number)), real)
             found.append((index.numpy().astype(np.int64), np.array(echo.strongest, dtype=bool), recorded))
         return further_returns(found, seen)

@@ -52,7 +52,7 @@ class DirectedScanner(LaserScanner):
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
         """(n,) recorded ranges, m; NaN without a return."""
         pulses, beam = self.emitted(self.emit(), random)
-        pulses = self.measured(pulses, self._echo(scene, pulses, beam, beam.received), random)
+        pulses = self.measured(pulses, self.echo(scene, pulses, beam, beam.received), random)
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
