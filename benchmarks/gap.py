@@ -2,8 +2,9 @@
 
     python benchmarks/gap.py [tls] [stereo] [--points 1000000]
 
-The measurements are made by the challenge's generator, in a process of their own. The ratio is to taking the residuals once: what
-has to be paid at the least, a cast of all points and of the four probes beside each that tell edges.
+The measurements are made by the challenge's generator, in a process of their own. Each is diagnosed with an empty kernel cache,
+as a new user's, and again with the kernels of that. To reach: 60 bare casts of the same rays, or 60 s. The other ratio is to
+taking the residuals once: a cast of all points and of the four probes beside each that tell edges.
 """
 
 from __future__ import annotations
@@ -12,28 +13,46 @@ import argparse
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 
-from measure import peak_memory_gb, seconds
+from measure import bare_cast, empty_kernel_cache, medians, peak_memory_gb, seconds
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurement import Measurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.registration import residuals_of
+from scene.upload import vectors_on_device
+from sensors.device import vector
 
 KINDS = {"tls": "vertical_index", "stereo": "focal_length"}
 
 
 def report(folder: Path) -> None:
     """Diagnose a measurement and print where the time goes."""
-    measurement = read_measurement(folder)
-    bare = min(seconds(lambda: residuals_of(measurement)) for _ in range(2))
+    measurement, busy = read_measurement(folder), time.process_time()
     found = diagnose(measurement)
+    busy = time.process_time() - busy
+    residuals = min(seconds(lambda: residuals_of(measurement)) for _ in range(2))
+    (cast,) = medians(bare(measurement), rounds=3)
     for step, lap in found.timings.items():
         print(f"  {step:<28}{lap:>7.1f} s")
-    print(f"  all steps, {len(measurement.cloud.points):,} points{found.seconds:>12.1f} s   (target: about 60)")
-    print(f"  over the residuals alone    {found.seconds / bare:>7.1f}")
+    print(f"  all steps, {len(measurement.cloud.points):,} points{found.seconds:>12.1f} s   (target: {max(60, 60 * cast):.0f})")
+    print(f"  CPU time of all threads     {busy:>7.1f} s")
+    print(f"  over the residuals alone    {found.seconds / residuals:>7.1f}")
+    print(f"  over the bare cast          {found.seconds / cast:>7.0f}")
     print(f"  peak memory                 {peak_memory_gb():>7.2f} GB  (target: at most 4)")
     print(f"  {found.verdict}: {', '.join(each.name for each in found.effects)}", flush=True)
+
+
+def bare(measurement: Measurement) -> Callable[[], None]:
+    """The bare cast of one ray to every point."""
+    if measurement.cameras is None:
+        assert measurement.station is not None
+        origin = measurement.station[0]
+    else:
+        origin = measurement.cameras.in_wall_frame(measurement.frame).left.position
+    return bare_cast(measurement.scene, vector(origin), vectors_on_device(measurement.cloud.points - origin))
 
 
 def made(sensor: str, points: int, folder: Path) -> Path:
@@ -59,8 +78,10 @@ def main() -> None:
     for sensor in arguments.sensors:
         with tempfile.TemporaryDirectory() as folder:
             case = made(sensor, arguments.points, Path(folder))
-            print(sensor, flush=True)
-            subprocess.run([sys.executable, __file__, "--measurement", str(case)], check=True)
+            with empty_kernel_cache() as environment:
+                for cache in ("an empty", "a filled"):
+                    print(f"{sensor}, with {cache} kernel cache", flush=True)
+                    subprocess.run([sys.executable, __file__, "--measurement", str(case)], check=True, env=environment)
 
 
 if __name__ == "__main__":

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import statistics
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from scene.backend import dr, mi
@@ -28,6 +31,13 @@ def medians(*works: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
         seconds(work)
     timed: Sequence[Sequence[float]] = [[seconds(work) for work in works] for _ in range(rounds)]
     return [statistics.median(column) for column in zip(*timed, strict=True)]
+
+
+@contextmanager
+def empty_kernel_cache() -> Iterator[dict[str, str]]:
+    """The environment of a process that finds no compiled kernel, as a new user's, and keeps its own for the next one."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield {**os.environ, "DRJIT_CACHE_DIR": folder}
 
 
 def peak_memory_gb() -> float:

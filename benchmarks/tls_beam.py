@@ -76,7 +76,8 @@ def sub_rays(scanner: LaserScanner) -> list[mi.Array3f64]:
         rotated(scanner.rotation, vectors)
         for vectors in (direction(pulses.azimuth, pulses.zenith), *tangents(pulses.azimuth, pulses.zenith))
     )
-    return Beam(divergence_rad=DIVERGENCE_RAD, sub_rays=SUB_RAYS).sub_rays_about(axis, *across)
+    beam = Beam(divergence_rad=DIVERGENCE_RAD, sub_rays=SUB_RAYS)
+    return [beam.sub_ray(axis, across, mi.UInt32(number)) for number in range(SUB_RAYS)]
 
 
 def equal_echoes(scanner: LaserScanner, caster: RayCaster) -> np.ndarray:

@@ -97,8 +97,10 @@ class RayCaster:
         code = mi.Float32(6 * labels + 2 * mi.Int32(axis) + dr.select(largest < 0, 1, 0))  # exact below 2^24: 2.7 million blocks
         columns = [part for value in (following, last, dr.dot(normal, corner)) for part in _split(value)]
         records = dr.empty(mi.Float32, 8 * len(self.mesh.faces))
-        for column, value in enumerate((*columns, self._albedo(vertex), code)):
-            dr.scatter(records, value, 8 * index + column)
+        columns += [self._albedo(vertex), code]
+        dr.eval(columns)
+        for half in (0, 1):
+            dr.scatter(records, mi.Array4f(*columns[4 * half : 4 * half + 4]), 2 * index + half)
         dr.eval(records)
         return records
 
@@ -137,18 +139,23 @@ class RayCaster:
         ahead = dr.normalize(mi.Vector3f(direction))
         side, other = mi.coordinate_system(ahead)
         reach = mi.Float64(_ASIDE) * dr.norm(direction)
-        candidates = [face]
-        for right, up in _AROUND:
+        distance, inside = self._meets(face, origin, direction, at_edge)
+        nearest = dr.select(at_edge & inside & (distance < np.inf), distance, np.inf)
+
+        def beside(number: mi.UInt32, nearest: mi.Float64, settled: mi.UInt32) -> tuple[mi.UInt32, mi.Float64, mi.UInt32]:
+            (right, *rights), (up, *ups) = zip(*_AROUND, strict=True)
+            right = dr.select(number == 0, mi.Float32(right), dr.select(number == 1, *(mi.Float32(each) for each in rights)))
+            up = dr.select(number == 0, mi.Float32(up), dr.select(number == 1, *(mi.Float32(each) for each in ups)))
             aside = mi.Array3f64(right * side + up * other)
             ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction + reach * aside))
-            beside = self.bare.ray_intersect_preliminary(ray, active=at_edge)
-            candidates.append(dr.select(beside.is_valid(), beside.prim_index, face))
-        nearest, settled = mi.Float64(np.inf), face
-        for candidate in candidates:
+            found = self.bare.ray_intersect_preliminary(ray, active=at_edge)
+            candidate = dr.select(found.is_valid(), found.prim_index, face)
             distance, inside = self._meets(candidate, origin, direction, at_edge)
-            better = at_edge & inside & (distance < nearest)
-            nearest, settled = dr.select(better, distance, nearest), dr.select(better, candidate, settled)
-        return settled
+            better = inside & (distance < nearest)
+            return number + 1, dr.select(better, distance, nearest), dr.select(better, candidate, settled)
+
+        start = (mi.UInt32(0), nearest, face)
+        return dr.while_loop(start, lambda number, *_: at_edge & (number < len(_AROUND)), beside)[2]
 
     def _meets(
         self, face: mi.UInt32, origin: mi.Array3f64, direction: mi.Array3f64, active: mi.Bool

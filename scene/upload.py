@@ -2,6 +2,7 @@
 
 Dr.Jit's LLVM backend takes the memory of a NumPy array as it is, and its kernels read whole packets of 16 elements (Embree, 16
 bytes): past the array's end, where now and then the process owns no memory. So every array is copied into one with room to spare.
+A kernel is compiled anew for every pattern of arrays that start at a multiple of a packet or do not: here all of them do.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ _DTYPES: dict[Any, type] = {
 
 def on_device(kind: Any, values: NDArray[Any]) -> Any:
     """A copy of `values` of any shape as a device array (n,) in C order, of the Dr.Jit type `kind`: mi.Float64, mi.Bool ..."""
-    buffer: NDArray[Any] = np.empty(values.size + _SPARE, _DTYPES[kind])
-    array = buffer[: values.size]
+    buffer: NDArray[Any] = np.empty(values.size + 2 * _SPARE, _DTYPES[kind])
+    start = -(buffer.ctypes.data // buffer.itemsize) % _SPARE
+    array = buffer[start : start + values.size]
     array.reshape(values.shape)[...] = values
     return kind(array)
 

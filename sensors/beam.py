@@ -10,15 +10,15 @@ does worse (0.15 with 19): an edge along the grid crosses many of its sub-rays a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from scene.backend import dr, mi
 from scene.mesh import FloatArray
+from scene.upload import on_device
 
 Mode = Literal["first", "strongest", "mean", "multiple"]
 Ranging = Literal["pulse", "phase"]
@@ -26,12 +26,15 @@ Ranging = Literal["pulse", "phase"]
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _NOWHERE_M = 1e30
-"""Range of a sub-ray without an echo: it sorts behind all others."""
+"""Beyond every echo."""
 
 
 @dataclass(frozen=True)
 class Echo:
-    """What one ray of every pulse, or a whole pulse, brings back; lazy device arrays (n,). Names as in `Pulses`; range in m."""
+    """What one ray of every pulse, or a whole pulse, brings back; device arrays (n,). Names as in `Pulses`; range in m.
+
+    returns: how many the pulse has; strongest: whether this is the strongest of them; None where only one is recorded.
+    """
 
     range_m: mi.Float64
     cos_incidence: mi.Float32
@@ -39,6 +42,39 @@ class Echo:
     power: mi.Float32
     block: mi.Int32
     returned: mi.Bool
+    returns: mi.UInt32 | None = None
+    strongest: mi.Bool | None = None
+
+    def at(self, index: mi.UInt32) -> Echo:
+        """The echoes at the given places."""
+        return Echo(**{name: dr.gather(type(value), value, index) for name, value in self._known()})
+
+    @staticmethod
+    def joined(parts: Sequence[Echo]) -> Echo:
+        """The echoes of all parts, one part after the other."""
+        return Echo(**{name: dr.concat([getattr(part, name) for part in parts]) for name, _ in parts[0]._known()})
+
+    def _known(self) -> list[tuple[str, Any]]:
+        return [(name, value) for name, value in vars(self).items() if value is not None]
+
+
+@dataclass(frozen=True)
+class SubRays:
+    """The echoes (n times `many`,) of all sub-rays of n pulses in memory, pulse by pulse."""
+
+    echoes: Echo
+    many: int
+
+    def over(self, step: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
+        """The state after `step(echo, *state)` for one sub-ray of every pulse after another: a loop in the compiled kernel."""
+        many = dr.opaque(mi.UInt32, self.many)
+        first = many * dr.arange(mi.UInt32, dr.width(self.echoes.range_m) // self.many)
+
+        def next_one(number: mi.UInt32, *state: Any) -> tuple[Any, ...]:
+            return number + 1, *step(self.echoes.at(first + number), *state)
+
+        _, *after = dr.while_loop((first * 0, *state), lambda number, *_: number < many, next_one)
+        return tuple(after)
 
 
 @dataclass(frozen=True)
@@ -56,78 +92,87 @@ class Beam:
     separation_m: float = 0.0
     modulation_wavelength_m: float | None = None
 
-    def sub_rays_about(self, axis: mi.Array3f64, *across: mi.Array3f64) -> list[mi.Array3f64]:
-        """Unit vectors of the sub-rays, 3 x (n,) each, about the axis and with the two unit vectors across it."""
+    def sub_ray(self, axis: mi.Array3f64, across: Sequence[mi.Array3f64], number: mi.UInt32) -> mi.Array3f64:
+        """Unit vectors of sub-rays by `number` (n,), 3 x (n,), about the axis and with the two unit vectors across it."""
         if self.sub_rays == 1:
-            return [axis]
+            return axis
         divergence = dr.opaque(mi.Float64, self.divergence_rad)
         first, second = (divergence * vectors for vectors in across)
-        return [dr.normalize(axis + float(x) * first + float(y) * second) for x, y in unit_offsets(self.sub_rays)]
+        x, y = (dr.gather(mi.Float64, on_device(mi.Float64, each), number) for each in unit_offsets(self.sub_rays).T)
+        return dr.normalize(axis + x * first + y * second)
 
-    def received(self, echoes: Sequence[Echo]) -> Echo:
+    def received(self, rays: SubRays) -> Echo:
         """The recorded return of every pulse, from the echoes of its sub-rays."""
-        if len(echoes) == 1:
-            return echoes[0]
-        echoes = _with_misses_last(echoes)
+        if rays.many == 1:
+            return rays.echoes
         if self.modulation_wavelength_m is not None:
-            return _in_phase(echoes, self.modulation_wavelength_m)
+            return _in_phase(rays, self.modulation_wavelength_m)
         if self.mode == "mean":
-            return _merged(echoes, [echo.returned for echo in echoes])
-        low, high = self._extent(echoes)
-        return _merged(echoes, [echo.returned & (echo.range_m >= low) & (echo.range_m <= high) for echo in echoes])
+            return _merged(rays, lambda echo: echo.returned)
+        count, first, strongest = self._separated(rays, mi.UInt32(1))
+        found = _merged(rays, (first if self.mode == "first" else strongest).holds)
+        return replace(found, returns=count) if self.records_several else found
 
     @property
     def records_several(self) -> bool:
         """Whether there may be returns beside the one of `received`."""
         return self.mode == "multiple" and self.sub_rays > 1 and self.modulation_wavelength_m is None
 
-    def count(self, echoes: Sequence[Echo]) -> mi.UInt32:
-        """(n,) how many returns every pulse has."""
-        (high, energy), *others = self._sorted(_with_misses_last(echoes))
-        gap, number = dr.opaque(mi.Float64, self.separation_m), dr.select(energy > 0, mi.UInt32(1), 0)
-        for range_m, power in others:
-            number += dr.select((range_m - high > gap) & (power > 0), mi.UInt32(1), 0)
-            high = range_m
-        return number
+    def numbered(self, rays: SubRays, number: mi.UInt32) -> Echo:
+        """The return of a number, counted by range from 1; the strongest is the one of `received`."""
+        _, chosen, strongest = self._separated(rays, number)
+        return replace(_merged(rays, chosen.holds), strongest=chosen.low == strongest.low)
 
-    def numbered(self, echoes: Sequence[Echo], number: mi.UInt32) -> tuple[Echo, mi.Bool]:
-        """The return of a number, counted by range from 1, and whether it is the one of `received`, the strongest."""
-        echoes = _with_misses_last(echoes)
-        (first, _), *others = self._sorted(echoes)
-        gap, current = dr.opaque(mi.Float64, self.separation_m), mi.UInt32(1)
-        low = high = previous = first
-        for range_m, _ in others:
-            starts = range_m - previous > gap
-            current += dr.select(starts, mi.UInt32(1), 0)
-            low = dr.select(starts & (current == number), range_m, low)
-            high = dr.select(current == number, range_m, high)
-            previous = range_m
-        chosen = _merged(echoes, [echo.returned & (echo.range_m >= low) & (echo.range_m <= high) for echo in echoes])
-        return chosen, low == self._extent(echoes)[0]
+    def _separated(self, rays: SubRays, number: mi.UInt32) -> tuple[mi.UInt32, _Span, _Span]:
+        """How many returns every pulse has, the reach of the one of a number, counted by range from 1, and of the strongest.
 
-    def _sorted(self, echoes: Sequence[Echo]) -> list[tuple[mi.Float64, mi.Float32]]:
-        """(range, power) of the echoes by range, those that did not return last and without power."""
-        return _by_range([(echo.range_m, dr.select(echo.returned, echo.power, mi.Float32(0))) for echo in echoes])
-
-    def _extent(self, echoes: Sequence[Echo]) -> tuple[mi.Float64, mi.Float64]:
-        """Nearest and farthest range of the recorded return's echoes.
-
-        A return is a chain of echoes, sorted by range, each within the separation of the one before: no bins, so no bias.
+        A return is a chain of echoes, each within the separation of another: no bins, so no bias.
         """
-        zero, gap = mi.Float32(0), dr.opaque(mi.Float64, self.separation_m)
-        (low, energy), *others = self._sorted(echoes)
-        high, recorded, most = low, (low, low), energy
-        for range_m, power in others:
-            joins = range_m - high <= gap
-            if self.mode == "first":
-                high = dr.select(joins, range_m, high)  # once the chain has broken, all others are too far
-                recorded = low, high
-                continue
-            low, high, energy = dr.select(joins, low, range_m), range_m, power + dr.select(joins, energy, zero)
-            stronger = energy > most
-            recorded = dr.select(stronger, low, recorded[0]), dr.select(stronger, high, recorded[1])
-            most = dr.select(stronger, energy, most)
-        return recorded
+        gap = dr.opaque(mi.Float64, self.separation_m)
+
+        def farther(echo: Echo, high: mi.Float64) -> tuple[mi.Float64]:
+            joins = echo.returned & (echo.range_m > high) & (echo.range_m - high <= gap)
+            return (dr.select(joins, echo.range_m, high),)
+
+        def chain(high: mi.Float64, _: mi.Bool) -> tuple[mi.Float64, mi.Bool]:
+            (reached,) = rays.over(farther, high)
+            return reached, reached > high
+
+        def following(
+            count: mi.UInt32, chosen: _Span, strongest: _Span, most: mi.Float32, last: mi.Float64, _: mi.Bool
+        ) -> tuple[Any, ...]:
+            (low,) = rays.over(
+                lambda echo, low: (dr.select(echo.returned & (echo.range_m > last) & (echo.range_m < low), echo.range_m, low),),
+                mi.Float64(_NOWHERE_M),
+            )
+            there = low < _NOWHERE_M
+            high, _ = dr.while_loop((mi.Float64(low), mi.Bool(there)), lambda _, grows: grows, chain)
+            own = _Span(low, high)
+            (energy,) = rays.over(lambda echo, sum_: (sum_ + dr.select(own.holds(echo), echo.power, 0),), mi.Float32(0))
+            count += dr.select(there, mi.UInt32(1), 0)
+            stronger = there & (energy > most)
+            chosen = own.where(there & (count == number), chosen)
+            return count, chosen, own.where(stronger, strongest), dr.select(stronger, energy, most), high, there
+
+        nowhere = _Span(mi.Float64(_NOWHERE_M), mi.Float64(_NOWHERE_M))
+        start = mi.UInt32(0), nowhere, nowhere, mi.Float32(-1), mi.Float64(-1), mi.Bool(True)
+        count, chosen, strongest, *_ = dr.while_loop(start, lambda *state: state[-1], following)
+        return count, chosen, strongest
+
+
+@dataclass
+class _Span:
+    """From the nearest to the farthest echo of a return, m. Not frozen: Dr.Jit's loops put their own variables in."""
+
+    low: mi.Float64
+    high: mi.Float64
+
+    def holds(self, echo: Echo) -> mi.Bool:
+        return echo.returned & (echo.range_m >= self.low) & (echo.range_m <= self.high)
+
+    def where(self, condition: mi.Bool, other: _Span) -> _Span:
+        """This span where the condition holds, else the other."""
+        return _Span(dr.select(condition, self.low, other.low), dr.select(condition, self.high, other.high))
 
 
 def unit_offsets(sub_rays: int) -> FloatArray:
@@ -154,78 +199,53 @@ def _ring_radius(inner: float, outer: float) -> float:
     return float(np.sqrt((tail(inner) - tail(outer)) / (outer - inner) / 8))
 
 
-def _with_misses_last(echoes: Sequence[Echo]) -> list[Echo]:
-    """The echoes, those that did not return beyond all others."""
-    return [replace(echo, range_m=dr.select(echo.returned, echo.range_m, _NOWHERE_M)) for echo in echoes]
+def _merged(rays: SubRays, belongs: Callable[[Echo], mi.Bool]) -> Echo:
+    """One return from the echoes that belong to it, weighted by power; the block is the strongest one's."""
+
+    def gathered(echo: Echo, total: Any, nearest: Any, strongest: Any, block: Any) -> tuple[Any, ...]:
+        power = dr.select(belongs(echo), echo.power, mi.Float32(0))
+        nearer, stronger = echo.returned & (echo.range_m < nearest), power > strongest
+        return (
+            total + power,
+            dr.select(nearer, echo.range_m, nearest),
+            dr.select(stronger, power, strongest),
+            dr.select(stronger, echo.block, block),
+        )
+
+    start = mi.Float32(0), mi.Float64(_NOWHERE_M), mi.Float32(-1), mi.Int32(0)
+    total, nearest, _, block = rays.over(gathered, *start)
+
+    def weighted(echo: Echo, reach: Any, cos_incidence: Any, albedo: Any) -> tuple[Any, ...]:
+        member = belongs(echo)
+        share = dr.select(member, echo.power, mi.Float32(0)) / total
+        return (
+            reach + mi.Float64(share) * dr.select(member, echo.range_m - nearest, 0.0),
+            cos_incidence + dr.select(member, share * echo.cos_incidence, 0),
+            albedo + dr.select(member, share * echo.albedo, 0),
+        )
+
+    reach, cos_incidence, albedo = rays.over(weighted, mi.Float64(0), mi.Float32(0), mi.Float32(0))
+    power = total * dr.opaque(mi.Float32, 1 / rays.many)
+    return Echo(nearest + reach, cos_incidence, albedo, power, block, returned=total > 0)
 
 
-def _merged(echoes: Sequence[Echo], member: Sequence[mi.Bool]) -> Echo:
-    """One return from the member echoes, weighted by power; the block is the strongest member's."""
-    powers = [dr.select(belongs, echo.power, mi.Float32(0)) for echo, belongs in zip(echoes, member, strict=True)]
-    total = sum(powers, mi.Float32(0))
-    shares = [power / total for power in powers]
-    nearest = reduce(_nearer, (echo.range_m for echo in echoes))
-    reach = [dr.select(belongs, echo.range_m - nearest, 0.0) for echo, belongs in zip(echoes, member, strict=True)]
-    strongest, block = powers[0], echoes[0].block
-    for power, echo in zip(powers[1:], echoes[1:], strict=True):
-        block = dr.select(power > strongest, echo.block, block)
-        strongest = dr.select(power > strongest, power, strongest)
-    return Echo(
-        range_m=nearest + sum((mi.Float64(share) * far for share, far in zip(shares, reach, strict=True)), mi.Float64(0)),
-        cos_incidence=_weighted(shares, [echo.cos_incidence for echo in echoes], member),
-        albedo=_weighted(shares, [echo.albedo for echo in echoes], member),
-        power=total / len(echoes),
-        block=block,
-        returned=total > 0,
-    )
-
-
-def _weighted(shares: Sequence[mi.Float32], values: Sequence[mi.Float32], member: Sequence[mi.Bool]) -> mi.Float32:
-    terms = (dr.select(belongs, share * value, 0) for share, value, belongs in zip(shares, values, member, strict=True))
-    return sum(terms, mi.Float32(0))
-
-
-def _in_phase(echoes: Sequence[Echo], wavelength_m: float) -> Echo:
+def _in_phase(rays: SubRays, wavelength_m: float) -> Echo:
     """The return of a phase scanner: R = R_c + w / (4 pi) arg S, S = sum_k p_k exp(4 pi i (R_k - R_c) / w).
 
     Sub-rays add as phasors of the amplitude-modulated wave of length w; the magnitude is the recorded power. The cycle is the
     one nearest to the centroid R_c, which the scanner's longer waves give.
     """
-    centroid = _merged(echoes, [echo.returned for echo in echoes])
+    centroid = _merged(rays, lambda echo: echo.returned)
     wave = dr.opaque(mi.Float64, 4 * np.pi / wavelength_m)
-    real, imaginary = mi.Float64(0), mi.Float64(0)
-    for echo in echoes:
+
+    def added(echo: Echo, real: mi.Float64, imaginary: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
         sine, cosine = dr.sincos(dr.select(echo.returned, wave * (echo.range_m - centroid.range_m), 0.0))
         power = mi.Float64(dr.select(echo.returned, echo.power, mi.Float32(0)))
-        real, imaginary = real + power * cosine, imaginary + power * sine
+        return real + power * cosine, imaginary + power * sine
+
+    real, imaginary = rays.over(added, mi.Float64(0), mi.Float64(0))
     magnitude = dr.sqrt(dr.square(real) + dr.square(imaginary))
     quarter = dr.asin(imaginary / magnitude)  # dr.atan2 aborts in LLVM 15
     phase = dr.select(real >= 0, quarter, dr.select(imaginary < 0, -np.pi, np.pi) - quarter)
-    return replace(centroid, range_m=centroid.range_m + phase / wave, power=mi.Float32(magnitude / len(echoes)))
-
-
-def _nearer(first: mi.Float64, second: mi.Float64) -> mi.Float64:
-    return dr.select(first < second, first, second)
-
-
-def _by_range(echoes: list[tuple[mi.Float64, mi.Float32]]) -> list[tuple[mi.Float64, mi.Float32]]:
-    """(range, power) pairs of every pulse, sorted by range with a network of comparisons."""
-    echoes = list(echoes)
-    for i, j in _network(len(echoes)):
-        (range_i, power_i), (range_j, power_j) = echoes[i], echoes[j]
-        swap = range_j < range_i
-        echoes[i] = dr.select(swap, range_j, range_i), dr.select(swap, power_j, power_i)
-        echoes[j] = dr.select(swap, range_i, range_j), dr.select(swap, power_i, power_j)
-    return echoes
-
-
-def _network(size: int) -> Iterator[tuple[int, int]]:
-    """Batcher's odd-even merge sort for `size` elements (Knuth, TAOCP 3, 5.2.2, algorithm M): pairs (i, j), i < j, in order."""
-    top = 1 << max((size - 1).bit_length() - 1, 0)
-    p = top
-    while p > 0:
-        q, r, d = top, 0, p
-        while d > 0:
-            yield from ((i, i + d) for i in range(size - d) if i & p == r)
-            q, r, d = q // 2, p, q - p
-        p //= 2
+    power = mi.Float32(magnitude * dr.opaque(mi.Float64, 1 / rays.many))
+    return replace(centroid, range_m=centroid.range_m + phase / wave, power=power)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -17,7 +19,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray
 from scene.raycast import RayCaster
 from sensors.atmosphere import extinction_per_m
-from sensors.beam import Beam, Echo
+from sensors.beam import Beam, Echo, SubRays
 from sensors.camera import axis_rotation
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Stage, apply_stage
@@ -31,6 +33,8 @@ from sensors.returns import MOST_RETURNS, Recorded, further_returns
 
 Window = tuple[float, float]
 
+_RAYS_AT_ONCE = 1 << 20
+"""Sub-rays whose echoes are held at a time: 25 MB."""
 _BYTES_PER_PULSE = 400
 """What a pulse takes at the peak: rays, points, surface and the difference's ray tracing of it."""
 
@@ -171,16 +175,13 @@ class LaserScanner:
     def _scan(self, real: LaserScanner, scene: RayCaster, random: KeyedRandom) -> Observation:
         """A scan in one face; real: the scanner where it really stands."""
         pulses, beam = self.emitted(self.emit(), random)
-        echoes = real._echoes(scene, pulses, beam)
-        pulses = self.measured(pulses, beam.received(echoes), random)
-        if not beam.records_several:
-            return self._record(pulses, real)
-        if self.config.faces == 2:
+        if beam.records_several and self.config.faces == 2:
             raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
-        count = beam.count(echoes)
-        dr.schedule(count)  # so that it is computed in the kernel of the scan
-        seen = self._record(pulses, real)
-        return replace(seen, further=self._further(real, scene, random, seen, count)) if np.any(count.numpy() > 1) else seen
+        echo = real.echo(scene, pulses, beam, beam.received)
+        seen = self._record(self.measured(pulses, echo, random), real)
+        if echo.returns is None or not np.any(echo.returns.numpy() > 1):
+            return seen
+        return replace(seen, further=self._further(real, scene, random, seen, echo.returns))
 
     def emitted(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
         """The pulses as they really leave, and the beam."""
@@ -233,20 +234,41 @@ class LaserScanner:
             aim_zenith=zenith,
         )
 
-    def _echoes(self, scene: RayCaster, pulses: Pulses, beam: Beam) -> list[Echo]:
-        """Ray-trace the emitted beams, sub-ray by sub-ray."""
-        azimuth, zenith = pulses.aim_azimuth, pulses.aim_zenith
+    def echo(self, scene: RayCaster, pulses: Pulses, beam: Beam, merge: Callable[[SubRays], Echo]) -> Echo:
+        """Ray-trace the emitted beams; `merge` makes one echo of those of a pulse's sub-rays.
+
+        Rays start from memory and echoes end there, so that one compiled kernel serves whatever effects come before and after.
+        """
+        dr.eval(pulses.aim_azimuth, pulses.aim_zenith)
+        count, parts = dr.width(pulses.aim_azimuth, pulses.aim_zenith), []
+        step = count if beam.sub_rays == 1 else _RAYS_AT_ONCE // beam.sub_rays
+        for start in range(0, count, step):
+            echo = merge(self._sub_ray_echoes(scene, pulses, beam, start, min(step, count - start)))
+            dr.eval(echo)
+            parts.append(echo)
+        return Echo.joined(parts)
+
+    def _sub_ray_echoes(self, scene: RayCaster, pulses: Pulses, beam: Beam, start: int, count: int) -> SubRays:
+        """The echoes of all sub-rays of `count` pulses from the number `start` on.
+
+        The rays of one pulse are traced together: they are neighbours, and several times as fast as one ray of each pulse.
+        """
+        ray, many = dr.arange(mi.UInt32, count * beam.sub_rays), dr.opaque(mi.UInt32, beam.sub_rays)
+        own = ray // many
+        pulse = own + dr.opaque(mi.UInt32, start)
+        azimuth, zenith = (dr.gather(mi.Float64, angle, pulse) for angle in (pulses.aim_azimuth, pulses.aim_zenith))
         axis = rotated(self.rotation, direction(azimuth, zenith))
         across = [rotated(self.rotation, vectors) for vectors in tangents(azimuth, zenith)]
-        return [self._echo(scene, ray) for ray in beam.sub_rays_about(axis, *across)]
+        echoes = self._traced(scene, beam.sub_ray(axis, across, ray - own * many))
+        dr.eval(echoes)
+        return SubRays(echoes, beam.sub_rays)
 
-    def _echo(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
+    def _traced(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
         """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
         hits = scene.intersect(vector(self.position), ray, exact=True)
         cos_incidence = -dr.dot(hits.normal, mi.Vector3f(ray))
         power = hits.albedo * cos_incidence * dr.square(REFERENCE_RANGE_M / mi.Float32(hits.distance))
-        if self.config.extinction_per_m > 0:
-            power *= dr.exp(dr.opaque(mi.Float32, -2 * self.config.extinction_per_m) * mi.Float32(hits.distance))
+        power *= dr.exp(dr.opaque(mi.Float32, -2 * self.config.extinction_per_m) * mi.Float32(hits.distance))
         nearest, farthest = opaque(self.config.minimum_range_m, self.config.maximum_range_m)
         in_reach = (hits.distance >= nearest) & (hits.distance <= farthest)
         returned = hits.valid & (cos_incidence > 0) & in_reach
@@ -310,10 +332,9 @@ class LaserScanner:
         for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
             index = dr.compress(count >= max(number, 2))
             pulses, beam = self.emitted(emitted.at(index), random)
-            echo, in_grid = beam.numbered(real._echoes(scene, pulses, beam), dr.opaque(mi.UInt32, number))
-            dr.schedule(in_grid)
+            echo = real.echo(scene, pulses, beam, partial(beam.numbered, number=dr.opaque(mi.UInt32, number)))
             recorded = self._recorded(self.measured(pulses, echo, random.child("return", number)), real)
-            found.append((index.numpy().astype(np.int64), in_grid.numpy().astype(bool), recorded))
+            found.append((index.numpy().astype(np.int64), np.array(echo.strongest, dtype=bool), recorded))
         return further_returns(found, seen)
 
 

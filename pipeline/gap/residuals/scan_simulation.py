@@ -10,6 +10,7 @@ from pipeline.formats.measurement import TlsMeasurement
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from scene.raycast import RayCaster
 from scene.upload import on_device
 from sensors.beam import Echo
 from sensors.effects.base import ShowsIn
@@ -48,6 +49,12 @@ class DirectedScanner(LaserScanner):
             aim_zenith=zenith,
         )
 
+    def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
+        """(n,) recorded ranges, m; NaN without a return."""
+        pulses, beam = self.emitted(self.emit(), random)
+        pulses = self.measured(pulses, self.echo(scene, pulses, beam, beam.received), random)
+        return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
+
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         power = self.geometry.power
         recorded = echo if power is None else replace(echo, power=on_device(mi.Float32, np.maximum(power, 1e-9)))
@@ -63,7 +70,7 @@ def _scanner(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeomet
 
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, random: KeyedRandom) -> FloatArray:
     """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
-    return _scanner(measurement, model, geometry).observe(measurement.scene, random).depth.reshape(-1)
+    return _scanner(measurement, model, geometry).ranges(measurement.scene, random)
 
 
 def mean_model(model: TlsModel) -> TlsModel:

@@ -1,0 +1,28 @@
+"""What an empty kernel cache has to compile for a diagnosis: few small kernels, however many sets of effects are tried."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from kernels import kernels
+
+from benchmarks.gap_challenge.cases import Case, make
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.naming.workflow import diagnose
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sensor", "kind", "most", "operations", "largest"),
+    [("tls", "vertical_index", 25, 5000, 800), ("stereo", "focal_length", 18, 9000, 2400)],
+)
+def test_a_diagnosis_compiles_few_small_kernels(
+    sensor: str, kind: str, most: int, operations: int, largest: int, tmp_path: Path
+) -> None:
+    """Before, of some 75,000 points: 76 kernels of 264,000 operations in all, the largest of 11,300; stereo 83 of 44,000."""
+    make(Case(0, (1, 1), "one", sensor, (kind,), 5_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    found = kernels(lambda: diagnose(read_measurement(tmp_path / "case")))
+    assert len(found) <= most
+    assert sum(found.values()) <= operations
+    assert max(found.values()) <= largest
