@@ -20,9 +20,10 @@ _STEPS = 13
 _MOST_CYCLES = 12.0
 _CHUNK = 32
 PLACE = "place along"
-HARMONICS, SURFACE = "harmonics", "surface"
+HARMONICS, FOLDED, SURFACE, REPEATED = "harmonics", "folded", "surface", "every"
 _DEGREE = 4
 _OVERTONES = range(2, 6)
+_REPEATED = range(2, 9)
 _DIRECTIONS = (30, 60, 120, 150)
 """Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
 
@@ -208,6 +209,20 @@ def harmonics(covariate: str, sine: Candidate) -> Candidate:
     """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the fifth."""
     columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
     return replace(_free(covariate, HARMONICS, columns), period=sine.period)
+
+
+def repeated(covariate: str, number: FloatArray, step: float) -> list[Candidate]:
+    """Values free within a few scan lines, columns or rows, and again in the next few: facets of a mirror, blocks of a read-out.
+
+    number: (n,) of the line; step: of the covariate from one line to the next.
+    """
+    found = []
+    for lines in _REPEATED:
+        place = np.mod(np.rint(number), lines)
+        columns = (place[:, None] == np.arange(1, lines)) - 1 / lines
+        if all(np.ptp(column) > 0 for column in columns.T):
+            found.append(replace(_free(covariate, f"{REPEATED} {lines}", columns), period=lines * abs(step)))
+    return found
 
 
 def surface_form(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:

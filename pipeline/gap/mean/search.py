@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import Candidate, Explanation, SineGrid, harmonics
+from pipeline.gap.mean.candidates import FOLDED, Candidate, Explanation, SineGrid, harmonics
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
@@ -98,7 +98,9 @@ class MeanSearch:
             return form
         (sine, *others), fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
         overtones = harmonics(form.name, sine)
-        both = replace(overtones, matrix=np.concatenate([sine.columns, overtones.columns], axis=1))
+        unit = float(self.design.residuals.covariates[form.name].std()) or 1.0
+        columns = np.concatenate([sine.columns, overtones.columns], axis=1)
+        both = replace(overtones, matrix=columns, form=FOLDED, period=unit * sine.period)
         gain = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
         score = gain - overtones.columns.shape[1]
         if score < decided().mean.free_margin:

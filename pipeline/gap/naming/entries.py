@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import HARMONICS, SURFACE, Candidate
+from pipeline.gap.mean.candidates import SURFACE, Candidate
 from pipeline.gap.mean.selection import Chosen
 from pipeline.gap.other.locking import Locking
 from pipeline.gap.other.missing import MissingFound
@@ -240,7 +240,7 @@ def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Res
 
 def _curve(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
     x = part.covariates[candidate.name]
-    cycle = candidate.period * (1.0 if candidate.form == HARMONICS else float(x.std()) or 1.0)
+    cycle = candidate.period * ((float(x.std()) or 1.0) if candidate.form == "wave" else 1.0)
     turned = np.mod(x, cycle) if cycle else x
     order = np.argsort(turned)
     low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))

@@ -8,9 +8,10 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import Candidate, SineGrid, free_forms, places, surface_form
+from pipeline.gap.mean.candidates import Candidate, SineGrid, free_forms, places, repeated, surface_form
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.naming.entries import PLANES
+from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import Residuals
 from sensors.effects import EFFECTS, effect_of
 
@@ -36,7 +37,19 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
     ]
     first, second = PLANES[part.sensor]
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
-    return [*map(_with_precision, named), *free, both, *places(part.at)]
+    return [*map(_with_precision, named), *free, both, *_repeated(part), *places(part.at)]
+
+
+def _repeated(part: Residuals) -> list[Candidate]:
+    """Forms that repeat after a few scan lines, or columns or rows of a raster of pixels."""
+    found = part.covariates
+    if "line" in found and np.ptp(found["line"]) > 0:
+        step = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
+        return repeated("azimuth", found["line"], step)
+    axes = [found[name] for name in ("image_x", "image_y") if name in found]
+    step = (axes and spacing(axes[0])) or 0.0
+    numbered = zip(("image_x", "image_y"), axes, strict=False) if step else ()
+    return [form for name, pixels in numbered for form in repeated(name, (pixels - pixels.min()) / step, step)]
 
 
 def _with_precision(candidate: Candidate | SineGrid) -> Candidate | SineGrid:

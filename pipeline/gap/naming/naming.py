@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
-from pipeline.gap.mean.candidates import PLACE
+from pipeline.gap.mean.candidates import PLACE, REPEATED
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Tried
-from pipeline.gap.naming.entries import Named, from_comb, from_locking, from_mean, from_spread, within_bounds
+from pipeline.gap.naming.entries import Estimate, Named, from_comb, from_locking, from_mean, from_spread, within_bounds
 from pipeline.gap.naming.families import believes, families_of
 from pipeline.gap.naming.relinearised import SearchedPoints, beyond, followed_up, noisier, undone, weighed
 from pipeline.gap.other.locking import find_locking
@@ -120,7 +120,7 @@ def name_effects(
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
     share = 1.0 if spread else share_of_spread(found.at, design.cells, left)
-    notes = (*part.notes, *_words(left_out), *filter(None, [words]))
+    notes = (*part.notes, *_words(left_out), *filter(None, [words]), *_repeats(found.estimates))
     p_value = found.search.p_value(found.tried[0].score) if found.tried else None
     alone = first.tried(()) if moving else ()
     p_alone = first.p_value(alone[0].score) if alone else p_value
@@ -130,6 +130,12 @@ def name_effects(
     shown = tuple(item for item in tried if not item.name.startswith(PLACE))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
     return named, Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma)
+
+
+def _repeats(estimates: list[Estimate]) -> list[str]:
+    """Words for forms that repeat after a few lines."""
+    lines = [each.candidate.form.split()[1] for each in estimates if each.candidate.form.startswith(REPEATED)]
+    return [f"what is described repeats every {each} lines exactly: facets of a mirror or a read-out in blocks" for each in lines]
 
 
 def _spread(

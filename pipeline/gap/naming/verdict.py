@@ -23,6 +23,9 @@ VERDICTS = {
     "insufficient_data": "There are too few points on smooth parts of the reference to say anything.",
 }
 _NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px", "regularization_sigma_px")
+STILL_OPEN = (
+    "Effects were named, but most of the gap stays open: the model is rejected with them too, and nothing else explains it."
+)
 NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
 TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
 
@@ -52,6 +55,13 @@ class Evidence:
         measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
         return measured and not self.rejects and not self.far
 
+    @property
+    def stays_open(self) -> bool:
+        """Whether the gap with the named effects is above the floor by more than its uncertainty, and most of what it was."""
+        if self.gap is None or not self.gap.left_open:
+            return False
+        return self.gap.closed is not None and self.gap.closed < decided().verdict.least_closed
+
     def only_too_noisy(self, named: Sequence[Named]) -> bool:
         """Whether the model's noise is too large and nothing else was found to be wrong."""
         return self.spread < 1.0 and not named and not self.rejects and not self.far
@@ -63,7 +73,7 @@ def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
         if evidence.gap is None and not evidence.rejects:
             return "insufficient_data"
         return "no_gap" if evidence.agrees else "unknown"
-    if any(item.kind == "empirical" for item in named):
+    if evidence.stays_open or any(item.kind == "empirical" for item in named):
         return "unknown"
     if len(named) > 1:
         return "several"
@@ -75,7 +85,7 @@ def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> s
     if verdict in ("no_gap", "unknown") and evidence.only_too_noisy(named):
         return TOO_NOISY
     if verdict == "unknown" and not any(item.kind == "empirical" for item in named):
-        return NOT_DESCRIBED
+        return STILL_OPEN if named else NOT_DESCRIBED
     return VERDICTS[verdict]
 
 

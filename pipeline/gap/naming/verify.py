@@ -69,6 +69,11 @@ class Gap:
         return self.before - self.floor > decided().verdict.gap_sigmas * self.floor_error
 
     @property
+    def left_open(self) -> bool:
+        """Whether after lies above the floor by more than the uncertainty of that."""
+        return self.after - self.floor > decided().verdict.gap_sigmas * self.floor_error
+
+    @property
     def uncertain(self) -> bool:
         """Whether before - floor is within its own uncertainty, and before - after, scored on the same patches, within its."""
         return not self.above_floor and self.before - self.after <= decided().verdict.gap_sigmas * self.error

@@ -37,6 +37,8 @@ def title(found: GapDiagnosis) -> str:
             return "Too few data to say what is missing"
         case "unknown" if not found.effects:
             return "Measurement and model disagree, and nothing that was tried says why"
+        case "unknown" if not any(effect.kind == "empirical" for effect in found.effects):
+            return f"{listed(names)} closes little of the gap: something else is missing"
         case "unknown":
             return "Missing: something that is not in the catalogue" + (f", and {listed(names)}" if names else "")
         case _:
