@@ -346,7 +346,7 @@ class RejectionDecisions(_Group):
         0.01, "probability", "Of what remains, at or below which the model is rejected.", "CONTRACT.md", lt=1
     )
     least_closed: PositiveFloat = _by(
-        0.3, "share", "Of a gap, if it is none of chance, that named effects must close to be the answer.", _JUDGEMENT, lt=1
+        0.5, "share", "Of a gap, if it is none of chance, that named effects must close to be the answer.", _JUDGEMENT, lt=1
     )
     gap_sigmas: PositiveFloat = _by(
         2.0, "standard errors", "By which before may lie above the floor for the two to agree.", _JUDGEMENT

@@ -133,6 +133,16 @@ def test_what_is_rejected_without_a_description_says_where_and_how_much() -> Non
             assert "that is not in the catalogue" not in said
 
 
+def test_effects_that_leave_most_of_the_gap_open_are_not_the_answer() -> None:
+    for found, evidence, said in _every():
+        gap = evidence.gap
+        physical = bool(found.effects) and all(effect.kind == "physical" for effect in found.effects)
+        little = gap is not None and gap.closed is not None and gap.closed < 0.5 and gap.after - gap.floor > 2 * ERROR
+        assert (physical and found.verdict == "unknown") == (physical and little)
+        assert ("most of the gap stays open" in said) == (physical and little)
+        assert ("closes little of the gap" in said) == (physical and little)
+
+
 def test_what_an_effect_leaves_over_is_said() -> None:
     for found, evidence, said in _every():
         left = bool(found.effects) and evidence.p_value is not None and evidence.p_value <= 0.01

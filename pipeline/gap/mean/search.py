@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import FOLDED, Candidate, Explanation, SineGrid, harmonics
+from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, Explanation, SineGrid, harmonics
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
@@ -93,7 +93,14 @@ class MeanSearch:
         return {name for name, row in zip(covariates, alike, strict=False) if row.max() > decided().mean.kin}
 
     def folded(self, members: Members, form: Tried) -> Tried:
-        """A wave with its overtones where the data ask for those beside some effects: what is periodic need not be a sine."""
+        """A wave with its overtones where the data ask for those beside some effects: what is periodic need not be a sine.
+
+        Of what repeats every few lines the form of the fewest, as twice as many say it too.
+        """
+        if form.candidate.form.startswith(REPEATED):
+            alike = [each for each in self.tried(members) if each.candidate.form.startswith(REPEATED) and each.name == form.name]
+            good = [each for each in alike if each.score > form.score - decided().mean.free_margin]
+            return min(good, key=lambda each: each.candidate.period)
         if form.candidate.form != "wave":
             return form
         (sine, *others), fit = self.design.refined([form.candidate, *(member.candidate for member in members)])

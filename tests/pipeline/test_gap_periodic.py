@@ -1,0 +1,78 @@
+"""What repeats but is no sine: folded over its period, or over a few scan lines, columns or rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, free_forms, repeated
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.naming.entries import Estimate, from_mean
+from pipeline.gap.residuals.nominal_pair import PixelGeometry
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.curve import surface_on_host
+from sensors.effects.disparity_empirical import DisparityEmpirical
+
+SIDE, STRIDE, SIGMA, PERIOD = 60, 4.0, 0.2, 64.0
+PIXELS = STRIDE * np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
+
+
+def residuals(error: FloatArray) -> StereoResiduals:
+    """An error with white noise on a raster; the pose is a parabola over the wall."""
+    at, count = PIXELS / 40.0, len(PIXELS)
+    pose = np.stack([np.ones(count), *at.T, at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=1)
+    every, covariates = np.ones(count, dtype=bool), {"image_x": PIXELS[:, 0], "image_y": PIXELS[:, 1]}
+    nowhere = PixelGeometry(*[np.zeros(count)] * 9)
+    value = error + SIGMA * np.random.default_rng(7).standard_normal(count)
+    sigma, unit = np.full(count, SIGMA), np.full(count, 0.1)
+    return StereoResiduals(value, sigma, unit, every, every, pose, at, covariates, np.arange(count), nowhere)
+
+
+def best(found: Residuals, families: list[Candidate]) -> tuple[MeanSearch, Estimate]:
+    """The form that a search chooses, with its values."""
+    search = MeanSearch(
+        found, [*free_forms("image_x", PIXELS[:, 0]), *free_forms("image_y", PIXELS[:, 1]), *families], KeyedRandom(1)
+    )
+    (chosen,), _ = search.select()
+    candidates, fit = search.design.refined([chosen.candidate])
+    width = len(fit.coefficients) - found.pose.shape[1]
+    return search, Estimate(chosen, candidates[0], fit.coefficients[-width:], fit.covariance[-width:, -width:])
+
+
+def square(x: FloatArray) -> FloatArray:
+    return 0.12 * np.sign(np.sin(2 * np.pi * x / PERIOD + 0.3))
+
+
+def test_a_square_wave_is_folded_over_its_period_in_pixels() -> None:
+    """A square has the odd overtones: beyond the fifth 7 % of its variance are left, a correlation of 0.97 without noise."""
+    found = residuals(square(PIXELS[:, 0]))
+    _, estimate = best(found, [])
+    assert estimate.candidate.form == FOLDED
+    entry = from_mean(estimate, found).entry
+    assert entry["along"]["period"] == pytest.approx(PERIOD, rel=0.01)
+    effect = DisparityEmpirical.model_validate(entry)
+    curve = surface_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
+    assert np.corrcoef(curve, square(PIXELS[:, 0]))[0, 1] > 0.93
+
+
+def test_a_sine_stays_a_sine() -> None:
+    _, estimate = best(residuals(0.15 * np.sin(2 * np.pi * PIXELS[:, 0] / PERIOD)), [])
+    assert estimate.candidate.form == "wave"
+
+
+@pytest.mark.parametrize("lines", [3, 4, 5])
+def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) -> None:
+    """Facets of 0, 1, -0.6, 0.3 and -0.2 times 0.1 px: no sine of any period has them."""
+    column = PIXELS[:, 0] / STRIDE
+    error = 0.1 * np.array([0.0, 1.0, -0.6, 0.3, -0.2])[(column % lines).astype(int)]
+    found = residuals(error)
+    _, estimate = best(found, repeated("image_x", column, STRIDE))
+    assert estimate.candidate.form == f"{REPEATED} {lines}"
+    entry = from_mean(estimate, found).entry
+    assert entry["along"]["period"] == lines * STRIDE
+    effect = DisparityEmpirical.model_validate(entry)
+    curve = surface_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
+    assert np.std(curve - curve.mean() - (error - error.mean())) < 0.15 * np.std(error)
