@@ -119,6 +119,9 @@ class _Scripted:
     def kin(self, form: Tried) -> set[str]:
         return {form.name}
 
+    def folded(self, members: Any, form: Any) -> Any:
+        return form
+
     def may_be_the_reference(self, members: Members, form: Tried) -> bool:
         return False
 
