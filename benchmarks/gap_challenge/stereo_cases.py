@@ -149,7 +149,7 @@ def _draw(random: Random, kinds: list[str], falls: int, points: int, nodes: int)
         pose=np.concatenate([5e-3 * random.standard_normal(3), 5e-5 * random.standard_normal(3)]),
         registration=(random.uniform() < 0.5)
         * np.concatenate([5e-3 * random.standard_normal(3), 5e-5 * random.standard_normal(3)]),
-        noise=(float(random.uniform(0.1, 0.4)), float(random.uniform(0.03, 0.1))),
+        noise=(float(random.uniform(0.1, 0.4)), float(random.uniform(0.03, 0.15))),
         reference=reference,
         u=u,
         v=v,

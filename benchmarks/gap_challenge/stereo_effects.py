@@ -35,6 +35,7 @@ OFF_MEAN: dict[str, tuple[float, float]] = {
     "off_column_waves": (0.02, 1.0),
     "off_bump": (0.02, 2.0),
     "off_cubic": (0.02, 2.0),
+    "off_column_banding": (0.02, 1.0),
 }
 OFF_SPREAD: dict[str, tuple[float, float]] = {"off_spread_radius": (0.05, 1.5), "off_spread_half": (0.05, 1.5)}
 _ONE_SIDED = ("camera_omega", "camera_phi", "camera_kappa", "camera_shift", "row_jitter")
@@ -88,7 +89,7 @@ def shape(name: str, image: Image, random: Random) -> Parameters:
     if name == "pixel_locking":
         return {"amplitude_px": size}
     if name in SPREAD:
-        more = {"step_px": float(random.choice([16.0, 32.0, 64.0]))} if name == "regularization_noise" else {}
+        more = {"step_px": float(random.choice([16.0, 32.0, 64.0, 96.0]))} if name == "regularization_noise" else {}
         return {"sigma_px": size, **more}
     where, row = (float(np.quantile(values, random.uniform(0.3, 0.7))) for values in (image.u, image.v))
     return {"size": sign, "where": where, "row": row, "width": float(np.ptp(image.u) * random.uniform(0.1, 0.25))}
@@ -130,6 +131,8 @@ def disparity_errors(name: str, p: Parameters, image: Image) -> Array:
             return p["size"] * np.sin(2 * np.pi * u / p["width"])
         case "off_bump":
             return p["size"] * 3 * np.exp(-((u - p["where"]) ** 2 + (v - p["row"]) ** 2) / (2 * (0.8 * p["width"]) ** 2))
+        case "off_column_banding":
+            return p["size"] * np.sign(np.sin(2 * np.pi * (u - p["where"]) / (0.5 * p["width"])))
         case "off_cubic":
             return p["size"] * _standard(u) ** 2 * _standard(v)
     return np.zeros_like(u)

@@ -73,6 +73,7 @@ NEEDS = {
     "off_spread_time": {"gps_time"},
     "off_intensity_square": {"intensity"},
     "off_loss_sector": {"pattern"},
+    "off_facets": {"pattern"},
 }
 """Fields without which a measurement cannot show an effect."""
 OFF_MEAN: dict[str, tuple[float, float]] = {
@@ -83,6 +84,7 @@ OFF_MEAN: dict[str, tuple[float, float]] = {
     "off_azimuth_waves": (1e-3, 0.02),
     "off_saddle": (1e-3, 0.05),
     "off_intensity_square": (1e-3, 0.02),
+    "off_facets": (1e-3, 0.02),
 }
 OFF_SPREAD: dict[str, tuple[float, float]] = {"off_spread_sector": (1e-3, 0.02), "off_spread_time": (1e-3, 0.02)}
 OFF_LOSS = ("off_loss_sector",)
@@ -133,6 +135,7 @@ def _off_shape(name: str, sign: float, rays: Rays, random: Random) -> Parameters
         "period": period,
         "length": reach / random.uniform(1.5, 6),
         "rate": random.uniform(3, 10),
+        "facets": int(random.integers(3, 6)),
     }
 
 
@@ -148,7 +151,9 @@ _KEYS = {
     "range_noise_proportional": "ppm",
     "range_noise_incidence": "sigma_m",
 }
-_FIXED = {"period_m", "phase_rad", "lines_per_cycle", "exponent", "where", "period", "length", "rate"}
+_FACETS = np.array([0.0, 1.0, -0.6, 0.3, -0.2])
+"""Range offsets of a mirror's facets, over the size; of each line the next."""
+_FIXED = {"facets", "period_m", "phase_rad", "lines_per_cycle", "exponent", "where", "period", "length", "rate"}
 
 
 def times(parameters: Parameters, factor: float) -> Parameters:
@@ -205,6 +210,8 @@ def range_errors(name: str, p: Parameters, rays: Rays) -> Array:
             return p["size"] * _standard(rays.az) * _standard(rays.ze)
         case "off_intensity_square":
             return p["size"] * _standard(np.log(rays.power)) ** 2
+        case "off_facets":
+            return p["size"] * _FACETS[np.rint(rays.line).astype(int) % p["facets"]]
     return np.zeros_like(rays.R)
 
 

@@ -241,16 +241,12 @@ def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Res
 def _curve(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
     x = part.covariates[candidate.name]
     cycle = candidate.period * ((float(x.std()) or 1.0) if candidate.form == "wave" else 1.0)
+    x = x + _shift(candidate.name, part)  # as the sensor counts it, before it is folded
     turned = np.mod(x, cycle) if cycle else x
     order = np.argsort(turned)
     low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))
     curve = np.interp(np.linspace(low, high, _NODES), turned[order], error[order], period=cycle or None)
-    shift = _shift(candidate.name, part)
-    return {
-        "covariate": candidate.name,
-        "along": {"low": low + shift, "high": high + shift, "period": cycle},
-        "values": [curve],
-    }
+    return {"covariate": candidate.name, "along": {"low": low, "high": high, "period": cycle}, "values": [curve]}
 
 
 def _surface(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
