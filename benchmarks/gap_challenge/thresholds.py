@@ -2,8 +2,8 @@
 
     python benchmarks/gap_challenge/thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/gap_thresholds.md
 
-Small cases, hours of them: a case is diagnosed again only with thresholds that its first diagnosis asked for. Interrupted, it goes
-on where it was; `--minutes` ends it with the table of what there is.
+Small cases, hours of them: a case is diagnosed again only with thresholds that its first diagnosis asked for.
+Interrupted, it goes on where it was; `--minutes` ends it with the table of what there is.
 """
 
 from __future__ import annotations
