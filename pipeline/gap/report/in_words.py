@@ -139,19 +139,20 @@ def rounded(value: Any) -> Any:
 
 def values(effect: Named) -> str:
     """Parameters with their standard deviations."""
-    return ", ".join(_value(key, value, effect.std.get(key)) for key, value in effect.entry.items() if key != "name")
+    return ", ".join(f"{key} {shown(key, value, effect.std.get(key))}" for key, value in effect.entry.items() if key != "name")
 
 
-def _value(key: str, value: Any, std: float | None) -> str:
+def shown(key: str, value: Any, std: float | None) -> str:
+    """One value of an effect's entry: a number with its standard deviation, an axis or a table by what it spans."""
     if isinstance(value, dict):
         cycle = f", repeated every {number(value['period'])}" if value.get("period") else ""
-        return f"{key} {number(value['low'])} to {number(value['high'])}{cycle}"
+        return f"{number(value['low'])} to {number(value['high'])}{cycle}"
     if isinstance(value, list):
         flat = [each for row in value for each in row]
-        return f"{key} {len(value)} x {len(value[0])} from {number(min(flat), 3)} to {number(max(flat), 3)}"
+        return f"{len(value)} x {len(value[0])} from {number(min(flat), 3)} to {number(max(flat), 3)}"
     if not isinstance(value, float):
-        return f"{key} {value}"
-    return f"{key} {with_std(key, value, std)}"
+        return str(value)
+    return with_std(key, value, std)
 
 
 def _effect(effect: Named) -> str:

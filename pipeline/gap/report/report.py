@@ -23,12 +23,12 @@ from pipeline.gap.report.in_words import (
     outcome,
     paragraph,
     rounded,
+    shown,
     spread_outcome,
     title,
     values,
     with_unit,
 )
-from pipeline.gap.report.quantities import with_std
 from pipeline.report.page import p_value_in_words, template
 
 _MOST_TRIED = 25
@@ -137,9 +137,8 @@ def _page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
         model=_yaml(after),
         number=number,
         decimal=decimal,
-        rounded=rounded,
+        shown=shown,
         p_value=p_value_in_words,
-        with_std=with_std,
         with_unit=with_unit,
         request=_request(found),
         total=sum(found.timings.values()) or 1.0,
@@ -147,4 +146,5 @@ def _page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
 
 
 def _yaml(content: dict[str, Any]) -> str:
-    return yaml.safe_dump(content, sort_keys=False)
+    """Lists of numbers stand in lines, not one number below another."""
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
