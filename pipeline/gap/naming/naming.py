@@ -71,7 +71,8 @@ def name_effects(
     What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
     slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread; left_out:
     families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word;
-    nodes: noise that neighbours share, found in what a search without it had left; it is searched again beside that.
+    nodes: noise that neighbours share, found in what a search had left beside free forms, which such noise feigns; it is
+    searched again beside that.
     """
     named: list[Named] = []
     whole, whole_scale, added = part, scale, 0.0
@@ -110,7 +111,8 @@ def name_effects(
         match measurement, part, found.at:
             case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
                 nodes_left = find_nodes(found.at, left, model, random)
-                if nodes_left is not None and nodes is None and found.chosen:
+                described = any(each.candidate.empirical for each in found.estimates)
+                if nodes_left is not None and nodes is None and described:
                     nodes_in_all = find_nodes(part, registered(part)[0], model, random)
                     return name_effects(measurement, whole, whole_scale, random, left_out, nodes_in_all or nodes_left)
                 spread = [] if nodes_left is None else [nodes_left]
