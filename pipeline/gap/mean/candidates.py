@@ -20,7 +20,9 @@ _STEPS = 13
 _MOST_CYCLES = 12.0
 _CHUNK = 32
 PLACE = "place along"
-HARMONICS, FOLDED, SURFACE, REPEATED = "harmonics", "folded", "surface", "every"
+HARMONICS, FOLDED, SURFACE = "harmonics", "folded", "surface"
+REPEATED = "every"
+"""Of forms that repeat after `fixed["lines"]` scan lines, columns or rows."""
 _DEGREE = 4
 _OVERTONES = range(2, 6)
 _REPEATED = range(2, 9)
@@ -221,7 +223,8 @@ def repeated(covariate: str, number: FloatArray, step: float) -> list[Candidate]
         place = np.mod(np.rint(number), lines)
         columns = (place[:, None] == np.arange(1, lines)) - 1 / lines
         if all(np.ptp(column) > 0 for column in columns.T):
-            found.append(replace(_free(covariate, f"{REPEATED} {lines}", columns), period=lines * abs(step)))
+            form = _free(covariate, f"{REPEATED} {lines}", columns)
+            found.append(replace(form, fixed={"lines": lines}, period=lines * abs(step)))
     return found
 
 

@@ -237,10 +237,8 @@ class Design:
         cross = base.within[:, :count].T @ found.weighed
         cross += base.between[self.null.length][:, :count].T @ (weight * found.between[self.null.length])
         matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
-        size, full = (
-            np.sqrt(np.maximum(np.diag(matrix), 0)),
-            np.sqrt(np.maximum(np.diag(grams[0]), 1e-200)),
-        )  # a signature may be 0
+        size = np.sqrt(np.maximum(np.diag(matrix), 0))
+        full = np.sqrt(np.maximum(np.diag(grams[0]), 1e-200))  # a signature may be 0
         scale = np.maximum(size, 1e-12 * full)
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
 

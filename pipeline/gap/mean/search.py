@@ -93,16 +93,21 @@ class MeanSearch:
         return {name for name, row in zip(covariates, alike, strict=False) if row.max() > decided().mean.kin}
 
     def folded(self, members: Members, form: Tried) -> Tried:
-        """A wave with its overtones where the data ask for those beside some effects: what is periodic need not be a sine.
+        """What is periodic in its plainest form beside some effects.
 
-        Of what repeats every few lines the form of the fewest, as twice as many say it too.
+        A wave has its overtones where the data ask for those, as what is periodic need not be a sine; of what repeats every few
+        lines it is the form of the fewest, as twice as many say it too.
         """
         if form.candidate.form.startswith(REPEATED):
-            alike = [each for each in self.tried(members) if each.candidate.form.startswith(REPEATED) and each.name == form.name]
-            good = [each for each in alike if each.score > form.score - decided().mean.free_margin]
-            return min(good, key=lambda each: each.candidate.period)
-        if form.candidate.form != "wave":
-            return form
+            return self._of_fewest_lines(members, form)
+        return self._with_overtones(members, form) if form.candidate.form == "wave" else form
+
+    def _of_fewest_lines(self, members: Members, form: Tried) -> Tried:
+        alike = [each for each in self.tried(members) if each.candidate.form.startswith(REPEATED) and each.name == form.name]
+        good = [each for each in alike if each.score > form.score - decided().mean.free_margin]
+        return min(good, key=lambda each: each.candidate.period)
+
+    def _with_overtones(self, members: Members, form: Tried) -> Tried:
         (sine, *others), fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
         overtones = harmonics(form.name, sine)
         unit = float(self.design.residuals.covariates[form.name].std()) or 1.0

@@ -44,12 +44,13 @@ def _repeated(part: Residuals) -> list[Candidate]:
     """Forms that repeat after a few scan lines, or columns or rows of a raster of pixels."""
     found = part.covariates
     if "line" in found and np.ptp(found["line"]) > 0:
-        step = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
-        return repeated("azimuth", found["line"], step)
-    axes = [found[name] for name in ("image_x", "image_y") if name in found]
-    step = (axes and spacing(axes[0])) or 0.0
-    numbered = zip(("image_x", "image_y"), axes, strict=False) if step else ()
-    return [form for name, pixels in numbered for form in repeated(name, (pixels - pixels.min()) / step, step)]
+        turn = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
+        return repeated("azimuth", found["line"], turn)
+    step = spacing(found["image_x"]) if "image_x" in found else None
+    if step is None:
+        return []
+    pixels = {name: found[name] for name in ("image_x", "image_y")}
+    return [form for name, values in pixels.items() for form in repeated(name, (values - values.min()) / step, step)]
 
 
 def _with_precision(candidate: Candidate | SineGrid) -> Candidate | SineGrid:

@@ -136,7 +136,7 @@ def name_effects(
 
 def _repeats(estimates: list[Estimate]) -> list[str]:
     """Words for forms that repeat after a few lines."""
-    lines = [each.candidate.form.split()[1] for each in estimates if each.candidate.form.startswith(REPEATED)]
+    lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(REPEATED)]
     return [f"what is described repeats every {each} lines exactly: facets of a mirror or a read-out in blocks" for each in lines]
 
 
