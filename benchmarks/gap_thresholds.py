@@ -1,6 +1,6 @@
 """What each threshold of the diagnosis does when it is 0.7 and 1.4 times as large, on development cases.
 
-    python benchmarks/gap_challenge/thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/gap_thresholds.md
+    python benchmarks/gap_thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/gap_thresholds.md
 
 Small cases, hours of them: a case is diagnosed again only with thresholds that its first diagnosis asked for.
 Interrupted, it goes on where it was; `--minutes` ends it with the table of what there is.
@@ -177,7 +177,7 @@ def main() -> None:
 _HEAD = """# What each threshold does
 
 Each threshold of `pipeline/gap/decisions.py` at 0.7 and 1.4 times its value, on development cases of some thousand points made by
-`benchmarks/gap_challenge/thresholds.py`: in how many of the cases that ask for it the answer changes (verdict or names), and what
+`benchmarks/gap_thresholds.py`: in how many of the cases that ask for it the answer changes (verdict or names), and what
 becomes wrong, or right, by it. A threshold that is missing was asked for by no case; "-": its value may not be so large or small,
 or the time was up."""
 
