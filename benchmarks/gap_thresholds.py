@@ -77,11 +77,17 @@ def jobs(cases: list[Case], out: Path) -> Iterator[tuple[Case, str, float]]:
     """What is to be diagnosed: each case as usual, and then with each threshold that it asked for."""
     for case in cases:
         yield case, "usual", 1.0
-    for case in cases:
-        asked = json.loads((out / case.name / "asked.json").read_text())
-        for key in asked:
-            for factor in FACTORS:
-                yield case, key, factor
+    turns = [(place, key, case) for case in cases for place, key in _asked_of(case, cases, out)]
+    for _, key, case in sorted(turns, key=lambda turn: turn[:2]):
+        for factor in FACTORS:
+            yield case, key, factor
+
+
+def _asked_of(case: Case, cases: list[Case], out: Path) -> list[tuple[int, str]]:
+    """The thresholds that a case asked for, each with the number of cases before it that did: no threshold waits for all others."""
+    asked = {each.name: set(json.loads((out / each.name / "asked.json").read_text())) for each in cases}
+    before = cases[: cases.index(case)]
+    return [(sum(key in asked[each.name] for each in before), key) for key in asked[case.name]]
 
 
 def work(cases: list[Case], out: Path, minutes: float) -> None:

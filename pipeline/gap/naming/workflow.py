@@ -203,11 +203,18 @@ class _State:
 
     @classmethod
     def of(
-        cls, there: Measurement, plain: Residuals, held_points: BoolArray, shapes: list[ShapeFound], touched_points: BoolArray
+        cls,
+        there: Measurement,
+        plain: Residuals,
+        held_points: BoolArray,
+        shapes: list[ShapeFound],
+        touched_points: BoolArray,
+        resettled: bool = True,
     ) -> _State:
-        """held_points, touched_points: of the measurement."""
+        """held_points, touched_points: of the measurement; resettled: the sensor goes where it stood with the shapes."""
         touched = touched_points[plain.index]
-        shaped, residuals = _shaped(there, plain, shapes, touched, held_points[plain.index])
+        trusted = plain.index[~(touched | held_points[plain.index])] if resettled else None
+        shaped, residuals = _shaped(there, plain, shapes, touched, trusted)
         rough, _, scale = registered(residuals)
         sight = Sight.of(there, residuals)
         changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
@@ -257,7 +264,8 @@ def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random:
     """What the naming started from in the end, and what it named.
 
     What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
-    what was named; and where there seemed to be some, beside what is named without them. Fewer effects are the explanation.
+    what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
+    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation.
     """
 
     def beside(found: _Attempt) -> _Attempt:
@@ -270,8 +278,11 @@ def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random:
         feigned = Smoothing.tag() in names - found.shapes
         return found if names == found.shapes or feigned else _Attempt.of(again, random)
 
-    first = _Attempt.of(_State.of(there, plain, held_points, *_shapes(there, plain, held_points)), random)
+    shapes = _shapes(there, plain, held_points)
+    first = _Attempt.of(_State.of(there, plain, held_points, *shapes), random)
     found = [beside(first)]
+    if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0):
+        found.append(beside(_Attempt.of(_State.of(there, plain, held_points, *shapes, resettled=False), random)))
     if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
         untouched = np.zeros(len(held_points), dtype=bool)
         smooth = _Attempt.of(_State.of(there, plain, held_points, [], untouched), random)
@@ -324,16 +335,23 @@ def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArr
 
 
 def _shaped(
-    measurement: Measurement, residuals: Residuals, shapes: list[ShapeFound], touched: BoolArray, held_out: BoolArray
+    measurement: Measurement,
+    residuals: Residuals,
+    shapes: list[ShapeFound],
+    touched: BoolArray,
+    trusted: NDArray[np.int64] | None,
 ) -> tuple[Measurement, Residuals]:
     """The measurement with these effects in its model, its sensor where its points say that it stood with them, and the residuals
-    of the same points there. touched, held_out: (n,) points that the effects move, and that have no say."""
+    of the same points there. touched: (n,) points that the effects move; trusted: rows of the measurement's points that have a say
+    in where the sensor stood, None where it stays."""
     if not shapes:
         return measurement, residuals
     entries = [from_shape(shape).entry for shape in shapes]
-    shaped, found, _ = settled(
-        measurement.changed(model=with_effects(measurement.model, entries)), residuals.index[~(touched | held_out)]
-    )
+    shaped = measurement.changed(model=with_effects(measurement.model, entries))
+    if trusted is None:
+        found = residuals_of(shaped)
+    else:
+        shaped, found, _ = settled(shaped, trusted)
     place = np.full(len(measurement.cloud.points), -1)
     place[found.index] = np.arange(len(found))
     rows = place[residuals.index]

@@ -152,7 +152,7 @@ def find_spread(
             weighed = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
     excess = float(np.mean(best.added(forms)))
     block = block_numbers(residuals.at[kept], cells.side_m)
-    p_value = _p_value(squared, [form.sum(axis=1) for form in forms], block, random)
+    p_value = null_p_value(squared, [form.sum(axis=1) for form in forms], block, random)
     tried = [SpreadTried(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     by = decided().spread
@@ -317,7 +317,7 @@ def _gain(squared: FloatArray, added: FloatArray) -> float:
     return float(0.5 * np.sum(squared * added / (1 + added) - np.log1p(added)))
 
 
-def _p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
+def null_p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
     """Of the largest standardised score over the forms, by signs drawn block by block: (1 + b) / (1 + N)."""
     _, number = np.unique(block, return_inverse=True)
     scores = np.stack([np.bincount(number, (squared - 1) * form) for form in forms])

@@ -70,6 +70,22 @@ class _Variogram:
         error = max(worse * float(np.linalg.norm(weights[0])), float(np.linalg.norm(shares - shares.mean())))
         return _Form(square, float(best[0]), error, shares)
 
+    def p_value(self, random: KeyedRandom) -> float:
+        """Of the largest variance of nodes over its error, whichever their step, by signs drawn block by block: (1 + b) / (1 + N).
+
+        Blocks of noise that the model holds deviate to either side alike.
+        """
+        shares = np.stack([form.blocks / form.error for form, _ in self._trials])
+        signs = random.child("nodes").generator().choice([-1.0, 1.0], size=(shares.shape[1], _DRAWS))
+        largest = np.max(shares @ signs, axis=0)
+        return float((1 + np.sum(largest >= np.max(shares.sum(axis=1)))) / (1 + _DRAWS))
+
+    @property
+    def _trials(self) -> list[tuple[_Form, float]]:
+        """Grids of nodes and their steps, px, that the raster is not too coarse for."""
+        finest = decided().nodes.finest * self.step
+        return [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= finest]
+
     @property
     def _smooth(self) -> FloatArray:
         """(k,) form of the reference's error."""
@@ -84,7 +100,7 @@ class _Variogram:
 
     def best_nodes(self) -> tuple[_Form, float, list[float]] | None:
         """The grid of nodes in the middle of those that fit best, its step, px, and their steps; None where all are too fine."""
-        trials = [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= decided().nodes.finest * self.step]
+        trials = self._trials
         if not trials:
             return None
         least = min(form.square for form, _ in trials)
@@ -127,9 +143,7 @@ def find_nodes(part: StereoResiduals, value: FloatArray, model: StereoModel, ran
     certain = form.square < without - decided().nodes.least_gain and form.variance > decided().nodes.least_sigmas * form.error
     if not certain or np.sqrt(form.variance) * float(np.median(part.unit_m)) < decided().nodes.reference_error:
         return None
-    signs = random.child("nodes").generator().choice([-1.0, 1.0], size=(len(form.blocks), _DRAWS))
-    p_value = float((1 + np.sum(np.abs(form.blocks @ signs) >= form.variance)) / (1 + _DRAWS))
-    name = RegularizationNoise.tag()
+    name, p_value = RegularizationNoise.tag(), variogram.p_value(random)
     found = SpreadFound(name, name, (), p_value, (without - form.square) / 2, {}, {}, False, np.zeros(len(part)))
     return _on_nodes(found, form, step, near)
 

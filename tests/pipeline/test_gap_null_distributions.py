@@ -1,0 +1,126 @@
+"""The p-value of each statistic that the diagnosis tests, where the model is right: even between 0 and 1.
+
+Each by Kolmogorov and Smirnov at 0.1 %, which the right distribution fails once in a thousand seeds; for each something that is
+there as well, which it has to find.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.stats import kstest
+
+from pipeline.gap.mean.candidates import free_forms
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.other.spread import null_p_value
+from pipeline.gap.other.stereo_noise import _variogram
+from pipeline.gap.residuals import cells
+from pipeline.gap.residuals.cells import block_numbers
+from pipeline.gap.residuals.nominal_pair import PixelGeometry
+from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.regularization_noise import RegularizationNoise
+from sensors.model import StereoModel
+
+SIDE = 50
+SIGMA = 0.003
+
+
+def over_the_wall(side: int = SIDE, step: float = 0.1) -> FloatArray:
+    """(n, 2), m, a little irregular."""
+    at = step * np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    return np.asarray(at + np.random.default_rng(1).uniform(-0.4 * step, 0.4 * step, at.shape))
+
+
+def ranges(value: FloatArray, at: FloatArray) -> TlsResiduals:
+    """Residuals of a scan; the pose is a plane over the wall."""
+    nothing, every = np.zeros(len(at)), np.ones(len(at), dtype=bool)
+    pose = np.stack([np.ones(len(at)), at[:, 0], at[:, 1]], axis=1)
+    covariates = {"azimuth": 0.02 * at[:, 0], "zenith": 0.02 * at[:, 1]}
+    geometry = RayGeometry(*[nothing] * 6, nothing, nothing)
+    unit, number = np.ones(len(at)), np.arange(len(at))
+    return TlsResiduals(value, np.full(len(at), SIGMA), unit, every, every, pose, at, covariates, number, geometry)
+
+
+def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.0) -> list[float]:
+    """p-values of what remains in measurements of white noise beside an error of the reference; added: a curve of the azimuth."""
+    at = over_the_wall()
+    root = np.linalg.cholesky(np.exp(-0.5 * (cdist(at, at) / length_m) ** 2) + 1e-8 * np.eye(len(at)))
+    found = []
+    for seed in range(count):
+        random = np.random.default_rng(seed)
+        value = SIGMA * random.standard_normal(len(at)) + reference * root @ random.standard_normal(len(at))
+        residuals = ranges(value + added * np.sin(2 * np.pi * at[:, 0] / 1.7), at)
+        families = [form for name, values in residuals.covariates.items() for form in free_forms(name, values)]
+        search = MeanSearch(residuals, families, KeyedRandom(seed))
+        found.append(search.p_value(search.tried(())[0].score))
+    return found
+
+
+@pytest.mark.parametrize(("reference", "length_m"), [(0.0, 1.0), (0.002, 1.0), (0.006, 0.6)])
+def test_of_a_mean_of_ranges(monkeypatch: pytest.MonkeyPatch, reference: float, length_m: float) -> None:
+    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    found = of_the_mean(40, reference, length_m)
+    assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
+
+
+def test_of_a_mean_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    assert max(of_the_mean(4, 0.002, 1.0, added=0.002)) < 0.01
+
+
+def of_the_spread(count: int, excess: float) -> list[float]:
+    """p-values of one form that grows over the wall, one that is even and one of a few points."""
+    at = over_the_wall()
+    block = block_numbers(at, 0.15)
+    forms = [np.ones(len(at)), at[:, 0], np.exp(-at[:, 1])]
+    found = []
+    for seed in range(count):
+        z = np.random.default_rng(seed).standard_normal(len(at)) * np.sqrt(1 + excess * at[:, 0] / at[:, 0].max())
+        found.append(null_p_value(z**2, forms, block, KeyedRandom(seed)))
+    return found
+
+
+def test_of_a_spread() -> None:
+    found = of_the_spread(200, 0.0)
+    assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
+
+
+def test_of_a_spread_that_is_there() -> None:
+    assert max(of_the_spread(4, 0.5)) < 0.01
+
+
+def of_nodes(count: int, sigma_px: float) -> list[float]:
+    """p-values of noise on nodes in disparities of the model's own white noise."""
+    pixels = 4.0 * np.stack(np.meshgrid(np.arange(120.0), np.arange(120.0)), axis=-1).reshape(-1, 2)
+    number, every = np.arange(len(pixels)), np.ones(len(pixels), dtype=bool)
+    zero = np.zeros(len(pixels))
+    geometry = PixelGeometry(pixels[:, 0], pixels[:, 1], *[zero] * 7)
+    model = StereoModel.model_validate({"effects": [{"name": "parallax_noise", "sigma_px": 0.3}]})
+    field = SharedNoise((RegularizationNoise(sigma_px=1.0, step_px=32.0),), pixels).field(len(pixels))
+    nodes = sigma_px * np.linalg.cholesky(field.covariance)
+    found = []
+    for seed in range(count):
+        random = np.random.default_rng(seed)
+        value = 0.3 * random.standard_normal(len(pixels)) + field.weights @ nodes @ random.standard_normal(len(nodes))
+        part = StereoResiduals(
+            value, np.full(len(pixels), 0.3), np.full(len(pixels), 0.01), every, every, np.ones((len(pixels), 1)),
+            pixels / 40, {}, number, geometry,
+        )  # fmt: skip
+        variogram = _variogram(part, value, model)
+        assert variogram is not None
+        found.append(variogram.p_value(KeyedRandom(seed)))
+    return found
+
+
+def test_of_noise_on_nodes() -> None:
+    found = of_nodes(60, 0.0)
+    assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
+
+
+def test_of_noise_on_nodes_that_is_there() -> None:
+    assert max(of_nodes(4, 0.1)) < 0.01
