@@ -52,11 +52,12 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
 
 
 def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
-    """One column under white noise: (x'x + k)^-1 x'y, and that inverse as the variance."""
+    """One column, alike in all points of a cell, under white noise: (x'x + k)^-1 x'y, and that inverse as the variance."""
     rng = np.random.default_rng(1)
     at = rng.uniform(0, 20, (4000, 2))
-    model = MeanModel(Cells.over(at), np.full(4000, 0.5))
-    x, y = rng.standard_normal((4000, 1)), rng.standard_normal((4000, 1))
+    cells = Cells.over(at)
+    model = MeanModel(cells, at, np.full(4000, 0.5))
+    x, y = rng.standard_normal((len(cells), 1))[cells.cell], rng.standard_normal((4000, 1))
     columns, value = (model.project(each[model.rows] / 0.5) for each in (x, y))
     white = [each for each in model.fine if each.ratio == 0.0]
     gram = float((x[model.rows] ** 2).sum()) / 0.25

@@ -24,7 +24,7 @@ from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
-from sensors.model import StereoModel
+from sensors.model import StereoModel, StereoNoise
 
 SIDE = 50
 SIGMA = 0.003
@@ -61,8 +61,9 @@ def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.
     return found
 
 
-@pytest.mark.parametrize(("reference", "length_m"), [(0.0, 1.0), (0.002, 1.0), (0.006, 0.6)])
+@pytest.mark.parametrize(("reference", "length_m"), [(0.0, 1.0), (0.002, 1.0)])
 def test_of_a_mean_of_ranges(monkeypatch: pytest.MonkeyPatch, reference: float, length_m: float) -> None:
+    """Cells of 0.5 m, ranges of 3 mm; the reference's error (m) is correlated over two cells."""
     monkeypatch.setattr(cells, "_MOST_CELLS", 100)
     found = of_the_mean(40, reference, length_m)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
@@ -100,7 +101,7 @@ def of_nodes(count: int, sigma_px: float) -> list[float]:
     number, every = np.arange(len(pixels)), np.ones(len(pixels), dtype=bool)
     zero = np.zeros(len(pixels))
     geometry = PixelGeometry(pixels[:, 0], pixels[:, 1], *[zero] * 7)
-    model = StereoModel.model_validate({"effects": [{"name": "parallax_noise", "sigma_px": 0.3}]})
+    model = StereoModel(noise=StereoNoise(parallax_sigma_px=0.3, regularization_sigma_px=0.0))
     field = SharedNoise((RegularizationNoise(sigma_px=1.0, step_px=32.0),), pixels).field(len(pixels))
     nodes = sigma_px * np.linalg.cholesky(field.covariance)
     found = []
@@ -123,4 +124,4 @@ def test_of_noise_on_nodes() -> None:
 
 
 def test_of_noise_on_nodes_that_is_there() -> None:
-    assert max(of_nodes(4, 0.1)) < 0.01
+    assert max(of_nodes(4, 0.25)) < 0.01

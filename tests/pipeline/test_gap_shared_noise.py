@@ -44,7 +44,7 @@ def model_of(pixels: FloatArray) -> tuple[MeanModel, FloatArray]:
     """On cells of 16 points, and the covariance of the noise over sigma, in the model's rows."""
     number = np.unique(pixels // (4 * STRIDE) @ np.array([1, 1000]), return_inverse=True)[1]
     centre = np.stack([np.bincount(number, pixels[:, axis]) / 16 for axis in (0, 1)], axis=1)
-    model = MeanModel(Cells(4.0 * STRIDE, number, centre), np.full(len(pixels), SIGMA), SharedNoise((NOISE,), pixels))
+    model = MeanModel(Cells(4.0 * STRIDE, number, centre), pixels, np.full(len(pixels), SIGMA), SharedNoise((NOISE,), pixels))
     shared = dense(SharedNoise((NOISE,), pixels[model.rows]).field(len(pixels))) / SIGMA**2
     return model, model.noise.white * np.eye(len(pixels)) + shared
 
@@ -54,14 +54,14 @@ def test_products_within_cells_are_those_of_the_inverse_covariance() -> None:
     model, covariance = model_of(pixels)
     columns = np.random.default_rng(1).standard_normal((len(pixels), 3))
     found = model.project(columns)
-    off = np.eye(len(pixels)) - _averaged(model, len(pixels))
+    off = np.eye(len(pixels)) - _planes(model, len(pixels))
     expected = (off @ columns).T @ np.linalg.pinv(off @ covariance @ off.T, rcond=1e-9) @ (off @ columns)
     np.testing.assert_allclose(found.within.T @ found.weighed, expected, rtol=1e-6)
 
 
-def _averaged(model: MeanModel, count: int) -> FloatArray:
+def _planes(model: MeanModel, count: int) -> FloatArray:
     whole = np.eye(count)
-    return whole - model.within(whole, model.means(whole))
+    return whole - model.within(whole, model.planes(whole))
 
 
 def test_draws_have_the_variance_of_the_products_that_they_stand_for() -> None:

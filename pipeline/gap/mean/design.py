@@ -93,7 +93,7 @@ class Design:
         """pose_precision: 0 by default."""
         chosen = Families.of(families)
         cells = Cells.over(residuals.at)
-        model = MeanModel(cells, residuals.sigma, residuals.shared_noise)
+        model = MeanModel(cells, residuals.at, residuals.sigma, residuals.shared_noise)
         rows, root = model.rows, model.root[:, None]
         pose, turn = np.linalg.qr(residuals.pose[rows] * root)
         count = pose.shape[1]

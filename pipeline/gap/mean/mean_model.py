@@ -2,8 +2,8 @@
 
 The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over
 metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process plus the
-noise of a mean; the deviations within cells are white. Both parts add their information on b. How the reference's error is
-correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms (isotropic waves of about one length, the covariance
+noise of a mean; the deviations within cells from planes, which take away what g does there, are white. Both parts add their
+information on b. How the reference's error is correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms (isotropic waves of about one length, the covariance
 of each being Bessel's J0) of several lengths are kept as far as the data allow. For each of them one eigendecomposition serves
 every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised over the covariance too.
 """
@@ -36,6 +36,8 @@ _MOST_RATIOS = 6
 _WORSE = 12.0
 """A length of correlation whose likelihood falls short of the best by more, whatever is fitted, is not carried along."""
 _RIDGE = 1e-12
+_NO_SLOPE = 1e-6
+"""Share of a slope's square that a cell's points have to leave beside its mean and the other slope for it to be one."""
 _NOTHING = 1e-14
 """Columns so much smaller than the largest are rounding, and count as absent."""
 
@@ -63,15 +65,18 @@ class MeanFit:
 class MeanModel:
     """The linear algebra of one set of points. Rows of whatever it takes are those of `rows`: points in cells, cell by cell."""
 
-    def __init__(self, cells: Cells, sigma: FloatArray, shared_noise: SharedNoise = NOT_SHARED) -> None:
+    def __init__(self, cells: Cells, at: FloatArray, sigma: FloatArray, shared_noise: SharedNoise = NOT_SHARED) -> None:
+        """at, sigma: (n, 2) m and (n,), of all points."""
         inside = np.flatnonzero(cells.cell >= 0)
         self.rows = inside[np.argsort(cells.cell[inside], kind="stable")]
         self._cell = cells.cell[self.rows]
         self._starts = np.flatnonzero(np.diff(self._cell, prepend=-1))
         self.root = 1 / sigma[self.rows]
         self._total = np.add.reduceat(self.root**2, self._starts)
-        self._gathered = sparse.csr_array((self.root / np.sqrt(self._total)[self._cell], (self._cell, np.arange(len(self.rows)))))
-        self.noise = WithinNoise.of(shared_noise.part(self.rows).field(len(self.rows)), self.root, self._gathered)
+        self._planes = self._orthonormal((at[self.rows] - cells.centre[self._cell]) / cells.side_m)
+        self._across = sparse.csr_array(self._planes.T)
+        field = shared_noise.part(self.rows).field(len(self.rows))
+        self.noise = WithinNoise.of(field, self.root, self._planes, len(cells))
         variance = self.noise.of_means()
         self._root = cholesky(variance, lower=True)
         self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))
@@ -86,6 +91,11 @@ class MeanModel:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    @property
+    def cells(self) -> int:
+        """Their number m."""
+        return len(self._total)
 
     def _at(self, length: int, ratio: float) -> Covariance:
         return Covariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
@@ -119,23 +129,32 @@ class MeanModel:
         """Every covariance of the bases in use."""
         return [self._at(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
 
-    def sums(self, weighted: FloatArray) -> FloatArray:
-        """(m, k) sums over each cell of columns (n, k)."""
-        return np.asarray(np.add.reduceat(weighted, self._starts, axis=0))
+    def _orthonormal(self, offset: FloatArray) -> sparse.csr_array:
+        """(3 m, n) a plane in each cell: rows of the cells' means, of their slopes by x and of those by y; offset: (n, 2)."""
+        found: list[FloatArray] = []
+        for plain in (np.ones(len(self.rows)), *offset.T):
+            row = plain * self.root
+            size = self._summed(row**2)
+            for other in found:
+                row = row - other * self._summed(other * row)[self._cell]
+            left = self._summed(row**2)
+            told = left > _NO_SLOPE * size
+            found.append(row * (told / np.sqrt(np.where(told, left, 1.0)))[self._cell])
+        points = np.arange(len(self.rows))
+        parts = [sparse.csr_array((row, (self._cell, points)), shape=(len(self._total), len(points))) for row in found]
+        return sparse.csr_array(sparse.vstack(parts))
 
-    def means(self, weighted: FloatArray) -> FloatArray:
-        """(m, k) cell means over their standard deviations, of columns (n, k) that are already over sigma."""
-        return self.sums(weighted * self.root[:, None]) / np.sqrt(self._total)[:, None]
+    def _summed(self, column: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(column, self._starts))
 
-    def sums_of(self, rows: slice, weighted: FloatArray) -> FloatArray:
-        """(m, k) what columns (n', k) on some of the rows add to the cell means."""
-        return np.asarray(self._gathered[:, rows] @ weighted)
+    def planes(self, weighted: FloatArray, rows: slice = slice(None)) -> FloatArray:
+        """(3 m, k) the cells' means over their standard deviations, and their slopes likewise, of columns (n', k) on `rows` that
+        are already over sigma."""
+        return np.asarray((self._planes if rows == slice(None) else self._planes[:, rows]) @ weighted)
 
-    def within(self, weighted: FloatArray, means: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Deviations from the cells' means, of `rows`; columns over sigma."""
-        cell = self._cell[rows]
-        spread = (means / np.sqrt(self._total)[:, None])[cell] * self.root[rows, None]
-        return np.asarray(weighted[rows] - spread)
+    def within(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
+        """Deviations from the cells' planes, of `rows`; columns over sigma."""
+        return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def between(self, means: FloatArray) -> list[FloatArray]:
         """Cell means (m, k) in each basis."""
@@ -148,16 +167,16 @@ class MeanModel:
 
     def project(self, weighted: FloatArray) -> Projected:
         """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
-        means = self.means(weighted)
-        within = self.within(weighted, means)
-        return Projected(within, self._weighed(within), self.between(means))
+        planes = self.planes(weighted)
+        within = self.within(weighted, planes)
+        return Projected(within, self._weighed(within), self.between(planes[: self.cells]))
 
     def _weighed(self, within: FloatArray) -> FloatArray:
         """Deviations within cells (n, k), multiplied with the inverse covariance of their noise."""
         if self.noise.is_white:
             return within
         shared = self.noise.nodes @ self.noise.solved(self.noise.on_nodes(within))
-        return np.asarray((within - self.within(shared, self.means(shared))) / self.noise.white)
+        return np.asarray((within - self.within(shared, self.planes(shared))) / self.noise.white)
 
     def null_draws(self, at: Covariance, count: int, random: KeyedRandom) -> list[FloatArray]:
         """Draws of the cell means under the covariance `at`, (m, count) in each basis."""

@@ -39,15 +39,17 @@ class Waves:
         beside = np.concatenate([fixed.weighed, value.weighed], axis=1)
         for grid in grids:
             for _, columns in grid.chunks(model.root):
-                means = model.means(columns)
+                planes = model.planes(columns)
                 products = columns.T @ beside
-                on_nodes = model.noise.on_nodes(columns, means)
-                own = (_squares(columns) - _squares(means) - _squares(model.noise.halved(on_nodes))) / model.noise.white
-                parts.append((products, own, noise.products(model.within(columns, means, noise.rows), on_nodes), means.T))
+                on_nodes = model.noise.on_nodes(columns, planes)
+                own = (_squares(columns) - _squares(planes) - _squares(model.noise.halved(on_nodes))) / model.noise.white
+                parts.append(
+                    (products, own, noise.products(model.within(columns, planes, noise.rows), on_nodes), planes[: model.cells].T)
+                )
         count = fixed.within.shape[1]
         if not parts:
             empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
-            return cls(*empty, np.zeros((0, noise.white.shape[1])), np.zeros((len(model.means(fixed.within[:, :1])), 0)))
+            return cls(*empty, np.zeros((0, noise.white.shape[1])), np.zeros((model.cells, 0)))
         products, own, drawn, means = (np.concatenate([part[k] for part in parts]) for k in range(4))
         return cls(products[:, :count], own, products[:, count:], drawn, means.T)
 
@@ -66,7 +68,7 @@ class NoiseDraws:
         rows = slice(None, None, max(len(model) // most_rows, 1))
         few = len(model.root[rows])
         white = random.generator().standard_normal((few, count)) * np.sqrt(len(model) / few)
-        on_nodes = model.noise.drawn(white, rows, model.sums_of(rows, white), random.child("nodes"))
+        on_nodes = model.noise.drawn(white, rows, model.planes(white, rows), random.child("nodes"))
         return cls(rows, white / np.sqrt(model.noise.white), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:

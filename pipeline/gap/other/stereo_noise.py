@@ -73,9 +73,14 @@ class _Variogram:
     def p_value(self, random: KeyedRandom) -> float:
         """Of the largest variance of nodes over its error, whichever their step, by signs drawn block by block: (1 + b) / (1 + N).
 
-        Blocks of noise that the model holds deviate to either side alike.
+        Blocks of noise that the model holds deviate to either side alike. Lags have the weights that their own scatter gives
+        them: weights by the covariance of so few blocks would fit just these.
         """
-        shares = np.stack([form.blocks / form.error for form, _ in self._trials])
+        size = np.linalg.norm(self.blocks, axis=1)
+        forms = (np.stack([_nodes(self.lag, step), self._smooth], axis=1) for _, step in self._trials)
+        weights = np.stack([np.linalg.pinv(form / size[:, None])[0] / size for form in forms])
+        shares = weights @ self.blocks
+        shares /= np.linalg.norm(shares, axis=1, keepdims=True)
         signs = random.child("nodes").generator().choice([-1.0, 1.0], size=(shares.shape[1], _DRAWS))
         largest = np.max(shares @ signs, axis=0)
         return float((1 + np.sum(largest >= np.max(shares.sum(axis=1)))) / (1 + _DRAWS))
