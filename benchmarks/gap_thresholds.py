@@ -84,7 +84,7 @@ def jobs(cases: list[Case], out: Path) -> Iterator[tuple[Case, str, float]]:
 
 
 def _asked_of(case: Case, cases: list[Case], out: Path) -> list[tuple[int, str]]:
-    """The thresholds that a case asked for, each with the number of cases before it that did: no threshold waits for all others."""
+    """The thresholds that a case asked for, each with how many cases before it did: none waits for all the others."""
     asked = {each.name: set(json.loads((out / each.name / "asked.json").read_text())) for each in cases}
     before = cases[: cases.index(case)]
     return [(sum(key in asked[each.name] for each in before), key) for key in asked[case.name]]

@@ -3,9 +3,10 @@
 The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over
 metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process plus the
 noise of a mean; the deviations within cells from planes, which take away what g does there, are white. Both parts add their
-information on b. How the reference's error is correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms (isotropic waves of about one length, the covariance
-of each being Bessel's J0) of several lengths are kept as far as the data allow. For each of them one eigendecomposition serves
-every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised over the covariance too.
+information on b. How the reference's error is correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms
+(isotropic waves of about one length, the covariance of each being Bessel's J0) of several lengths are kept as far as the data
+allow. For each of them one eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each
+candidate is maximised over the covariance too.
 """
 
 from __future__ import annotations

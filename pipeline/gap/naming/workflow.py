@@ -342,8 +342,8 @@ def _shaped(
     trusted: NDArray[np.int64] | None,
 ) -> tuple[Measurement, Residuals]:
     """The measurement with these effects in its model, its sensor where its points say that it stood with them, and the residuals
-    of the same points there. touched: (n,) points that the effects move; trusted: rows of the measurement's points that have a say
-    in where the sensor stood, None where it stays."""
+    of the same points there. touched: (n,) points that the effects move; trusted: rows of the measurement's points that say where
+    the sensor stood, None where it stays."""
     if not shapes:
         return measurement, residuals
     entries = [from_shape(shape).entry for shape in shapes]

@@ -71,7 +71,7 @@ class _Variogram:
         return _Form(square, float(best[0]), error, shares)
 
     def p_value(self, random: KeyedRandom) -> float:
-        """Of the largest variance of nodes over its error, whichever their step, by signs drawn block by block: (1 + b) / (1 + N).
+        """Of the largest variance of nodes over its error, whichever the step, by signs drawn block by block: (1 + b) / (1 + N).
 
         Blocks of noise that the model holds deviate to either side alike. Lags have the weights that their own scatter gives
         them: weights by the covariance of so few blocks would fit just these.
