@@ -16,7 +16,7 @@ from pipeline.gap.naming.held_out import _Registered
 from pipeline.gap.residuals import cells
 from pipeline.gap.residuals.cells import Cells, patches
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
-from pipeline.gap.residuals.shared_noise import NOT_SHARED, NodeField, SharedNoise
+from pipeline.gap.residuals.shared_noise import NodeField, SharedNoise
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -104,7 +104,7 @@ def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> StereoResidual
     return replace(found, shared_noise=SharedNoise((NOISE,), pixels))
 
 
-def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch, *, believed_white: bool) -> list[float]:
+def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Of what remains in measurements of nothing but noise, all free forms along either axis searched."""
     monkeypatch.setattr(cells, "_MOST_CELLS", 100)
     pixels = raster(60)
@@ -114,8 +114,7 @@ def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch, *, believed_white: boo
     for seed in range(seeds):
         residuals = noisy(seed, pixels, cholesky)
         families = [form for name, values in residuals.covariates.items() for form in free_forms(name, values)]
-        known = replace(residuals, shared_noise=NOT_SHARED) if believed_white else residuals
-        search = MeanSearch(known, families, KeyedRandom(seed))
+        search = MeanSearch(residuals, families, KeyedRandom(seed))
         found.append(search.p_value(search.tried(())[0].score))
     return found
 
@@ -123,11 +122,5 @@ def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch, *, believed_white: boo
 @pytest.mark.slow
 def test_what_remains_has_an_even_p_value_where_there_is_nothing_but_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """40 measurements; Kolmogorov-Smirnov at 0.1 %, which the right distribution fails once in a thousand seeds."""
-    found = p_values(40, monkeypatch, believed_white=False)
+    found = p_values(40, monkeypatch)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
-
-
-@pytest.mark.slow
-def test_the_same_noise_taken_for_white_seems_to_hold_effects(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the test above would find if neighbours were believed to share nothing."""
-    assert kstest(p_values(12, monkeypatch, believed_white=True), "uniform").pvalue < 0.001

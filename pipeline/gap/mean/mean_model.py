@@ -2,11 +2,12 @@
 
 The residual of a point is y = J p + S b + g + e: pose p, signatures S, an error g of the reference that is correlated over
 metres, white noise e of the predicted spread. Points are gathered in cells. The cells' means follow a Gaussian process plus the
-noise of a mean; the deviations within cells from planes, which take away what g does there, are white. Both parts add their
-information on b. How the reference's error is correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms
-(isotropic waves of about one length, the covariance of each being Bessel's J0) of several lengths are kept as far as the data
-allow. For each of them one eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each
-candidate is maximised over the covariance too.
+noise of a mean; the deviations within cells from planes, which take away what g does there, are white. Where neighbours share
+noise, which is larger than g, they are deviations from the means, of that noise. Both parts add their information on b. How the
+reference's error is correlated is not known: rough (Matern 3/2), smooth (Gaussian) and wavy forms (isotropic waves of about one
+length, the covariance of each being Bessel's J0) of several lengths are kept as far as the data allow. For each of them one
+eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised over
+the covariance too.
 """
 
 from __future__ import annotations
@@ -74,9 +75,10 @@ class MeanModel:
         self._starts = np.flatnonzero(np.diff(self._cell, prepend=-1))
         self.root = 1 / sigma[self.rows]
         self._total = np.add.reduceat(self.root**2, self._starts)
-        self._planes = self._orthonormal((at[self.rows] - cells.centre[self._cell]) / cells.side_m)
-        self._across = sparse.csr_array(self._planes.T)
         field = shared_noise.part(self.rows).field(len(self.rows))
+        offsets = (at[self.rows] - cells.centre[self._cell]).T / cells.side_m
+        self._planes = self._orthonormal([] if field.weights.shape[1] else list(offsets))
+        self._across = sparse.csr_array(self._planes.T)
         self.noise = WithinNoise.of(field, self.root, self._planes, len(cells))
         variance = self.noise.of_means()
         self._root = cholesky(variance, lower=True)
@@ -130,10 +132,10 @@ class MeanModel:
         """Every covariance of the bases in use."""
         return [self._at(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
 
-    def _orthonormal(self, offset: FloatArray) -> sparse.csr_array:
-        """(3 m, n) a plane in each cell: rows of the cells' means, of their slopes by x and of those by y; offset: (n, 2)."""
+    def _orthonormal(self, offsets: list[FloatArray]) -> sparse.csr_array:
+        """(3 m, n) a plane in each cell: rows of the cells' means, and of their slopes by each of the offsets (n,)."""
         found: list[FloatArray] = []
-        for plain in (np.ones(len(self.rows)), *offset.T):
+        for plain in (np.ones(len(self.rows)), *offsets):
             row = plain * self.root
             size = self._summed(row**2)
             for other in found:
@@ -150,11 +152,11 @@ class MeanModel:
 
     def planes(self, weighted: FloatArray, rows: slice = slice(None)) -> FloatArray:
         """(3 m, k) the cells' means over their standard deviations, and their slopes likewise, of columns (n', k) on `rows` that
-        are already over sigma."""
+        are already over sigma; (m, k) means alone where neighbours share noise."""
         return np.asarray((self._planes if rows == slice(None) else self._planes[:, rows]) @ weighted)
 
     def within(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Deviations from the cells' planes, of `rows`; columns over sigma."""
+        """Deviations from the cells' planes, or means, of `rows`; columns over sigma."""
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def between(self, means: FloatArray) -> list[FloatArray]:
