@@ -23,6 +23,8 @@ class BeamDivergence(Effect):
     """
 
     name: Literal["beam_divergence"] = "beam_divergence"
+    means = "The beam is wider than the model says: at edges it mixes near and far rock, and niches look smaller."
+    act = "Put the divergence found into the model; no processing undoes it: move nearer, and mask points at depth edges."
     sensor = "tls"
     stage = Stage.FOOTPRINT
     shows_in = ShowsIn.EDGES

@@ -67,6 +67,11 @@ def test_every_verdict_has_a_report(
     assert {path.name for path in tmp_path.iterdir()} >= FILES
     assert VERDICTS[verdict] in page
     assert ("What to measure" in page) == (not told)
+    assert ("What it means, and what to do" in page) == (verdict in EFFECTS)
+    order = ["What it means", "Where they disagree", "What was named", "<h2>The gap", "What was tried", "The model after"]
+    places = [page.index(title) for title in order if title in page]
+    assert places == sorted(places)
+    assert "On blocks that no step has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
     assert ("± &lt; 0.001 mm" in page) == (verdict in ("named", "several", "ambiguous"))
 
 

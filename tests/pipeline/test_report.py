@@ -180,6 +180,18 @@ def test_page_holds_every_number(html: str) -> None:
     assert "nan" not in text
 
 
+def test_reports_give_the_answer_the_picture_the_evidence_and_then_the_settings(html: str) -> None:
+    places = [
+        html.index(part) for part in ('class="lead"', "<figure>", "How good the maps are", "Settings", "The resolved config")
+    ]
+    assert places == sorted(places)
+    for name in ("calibration", "comparison", "planning"):
+        page = (TEMPLATES / name / "report.html.jinja").read_text()
+        places = [page.index(part) for part in ('class="lead"', "<figure>", 'class="wide"', "Settings")]
+        if name != "calibration":  # its picture is a macro, called before the tables
+            assert places == sorted(places), name
+
+
 def test_page_is_whole_escaped_and_needs_no_network(html: str) -> None:
     page = Page(html)
     assert page.open == []

@@ -15,13 +15,15 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.decisions import deciding
 from pipeline.gap.naming.verdict import closing, in_a_sentence
 from pipeline.gap.naming.workflow import GapDiagnosis
+from pipeline.gap.report.advice import advice, page_of
 from pipeline.gap.report.covariate_ranking import steady, where
 from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
 from pipeline.gap.report.in_words import (
+    answer,
     decimal,
+    gap_in_words,
     number,
     outcome,
-    paragraph,
     rounded,
     shown,
     spread_outcome,
@@ -127,7 +129,10 @@ def _page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
     return template("gap/report/report.html.jinja").render(
         found=found,
         title=title(found),
-        paragraph=paragraph(found, rows),
+        answer=answer(found, rows),
+        scores=gap_in_words(found),
+        advice=advice,
+        page_of=page_of,
         pictures=pictures,
         where=rows,
         tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
