@@ -50,9 +50,7 @@ RUN = (INIT, FIRST, MY_SITE, MY_SET, PLAN, SCRIPT, COMPLETION, VIEW)
 """Carried out by the tests of their own below."""
 
 RESOLVED = (
-    "simulate --sensor stereo --config configs/sites/bulga.yaml --set epochs=20 --set 'tiles={size_px: 512}' --out runs/bulga",
     "simulate --sensor stereo --set matcher=sgbm",
-    "simulate --sensor tls --config gap/model_after.yaml",
     "simulate --sensor tls --config runs/mine/run.json",
     "simulate --sensor tls --set scanner=my_scanner.yaml",
     "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high --set reconstruction=vertices "
@@ -96,6 +94,12 @@ PARSED = (
     "scarpsim view diagnosis",
     "scarpsim view sets/small/test",
     "scarpsim doctor",
+    "scarpsim export runs/my_run picture --epoch 1 --out wall.png",
+    "scarpsim export runs/my_run epochs --out epochs.gif",
+    "scarpsim export runs/my_run scan --out scan.gif",
+    "scarpsim export runs/my_run gltf --out wall.glb",
+    "scarpsim export sets/small yolo --out sets/small_yolo",
+    "scarpsim export runs/my_run package",
 )
 """Work on results alone: their words are parsed."""
 
@@ -112,11 +116,10 @@ NAMED = (
     "[--own-step]",
     "scarpsim detect",
     "scarpsim detect default",
-    "scarpsim evaluate",
+    "scarpsim export",
     "scarpsim gap",
     "scarpsim gap --identifiability",
     "scarpsim gap --identifiability CONFIG",
-    "scarpsim gap --identifiability SITE.yaml",
     "scarpsim gap MEASUREMENT --identifiability",
     "scarpsim gap MEASUREMENT --out DIR",
     "scarpsim gap MEASUREMENT --out gap",
