@@ -92,6 +92,7 @@ PARSED = (
     "scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis",
     "scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis",
     "scarpsim view diagnosis",
+    "scarpsim view runs/stereo runs/tls",
     "scarpsim view sets/small/test",
     "scarpsim doctor",
     "scarpsim export runs/my_run picture --epoch 1 --out wall.png",
