@@ -20,6 +20,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
@@ -113,7 +114,8 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
     places = block_boxes(block)
     for label, (_, right, _, top) in places.items() if len(places) <= _MOST_NUMBERED else ():
         at = grid.x_min + right * grid.gsd, grid.y_max - top * grid.gsd
-        axes.annotate(f"{label}", at, fontsize=6, annotation_clip=True)
+        number = axes.annotate(f"{label}", at, fontsize=8, annotation_clip=True)
+        number.set_path_effects([withStroke(linewidth=2, foreground="white")])
     _sigma_bar(figure, axes, image, sigma_m * 1e3)
     _no_data_legend(axes, values, NO_DATA, "outline: block, numbered as in the table" if inside.any() else "")
     return png_bytes(figure)

@@ -28,7 +28,6 @@ class BeamDivergence(Effect):
     sensor = "tls"
     stage = Stage.FOOTPRINT
     shows_in = ShowsIn.EDGES
-    looks_at = "neighbours"
     planned = True
     divergence_rad: float = parameter(
         "full divergence, 1/e^2", unit="rad", source="datasheets (mind their conventions)", typical=3e-4, ge=0, le=0.1
