@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from pipeline.change.difference import DifferenceStatistics, statistics
@@ -56,6 +56,8 @@ _GREYS = colormaps["gray"].resampled(64)
 SEQUENTIAL = colormaps["viridis"].resampled(48)
 _MOST_NUMBERED, _MOST_ZOOMED, _ZOOMS_A_ROW = 200, 24, 6
 """Blocks whose numbers stand on a map, and that are shown by themselves."""
+_TWO_DECADES = 250.0
+"""Span of a logarithmic axis from which on the numbers of 2 and 5 have no room."""
 _CROWDED = 0.15
 """A map whose median lies within this share of its range from the low end would be of one colour."""
 
@@ -204,9 +206,15 @@ def _scale(known: NDArray[np.floating]) -> Normalize:
 
 
 def plain_numbers(axis: Axis) -> None:
-    """Ticks at 1, 2, 5, 10, ... of a logarithmic axis, as people write numbers."""
+    """Ticks at 1, 2, 5, 10, ... of a logarithmic axis, as people write numbers; of many decades 1, 10, ... alone."""
+
+    def number(value: float, _: Any) -> str:
+        low, high = axis.get_view_interval()
+        is_power = f"{value:.6e}".startswith("1.000000")
+        return f"{value:g}" if is_power or high < _TWO_DECADES * low else ""
+
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_major_formatter(FuncFormatter(number))
     axis.set_minor_formatter(NullFormatter())
 
 
