@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from pipeline.cli.answer import Answer
@@ -32,6 +31,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.view.server import serve
 
-    print(f"opening {arguments.folder}", file=sys.stderr, flush=True)
     serve(arguments.folder, arguments.second, arguments.detections, arguments.port, open_browser=not arguments.no_browser)
     return Answer("the page is closed")
