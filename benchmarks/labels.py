@@ -107,7 +107,7 @@ def main() -> None:
                 config = load_config(bundled_config("sites", "glendale"), settings, "stereo", None)
                 found = outcome(config, size, arguments.epochs)
                 good, placed = (np.mean(values[~np.isnan(values)] >= 0.75) for values in (found.raw, found.placed))
-                figures = f"{len(found.raw)} | {good:.1%} | {placed:.1%} | {np.nanmedian(found.raw):.3f}"
+                figures = f"{len(found.raw)} | {100 * good:.1f} % | {100 * placed:.1f} % | {np.nanmedian(found.raw):.3f}"
                 print(f"| {reconstruction} | {noise} | {size} | {figures} |", flush=True)
 
 

@@ -168,7 +168,7 @@ def table(found: list[tuple[str, GapDiagnosis]]) -> str:
         figures = ["", "", "", ""]
         if gap is not None:
             figures = [f"{1e3 * value:.2f} mm" for value in (gap.before, gap.after, gap.floor)]
-            figures.append("within its uncertainty" if gap.closed is None else f"{gap.closed:.0%}")
+            figures.append("within its uncertainty" if gap.closed is None else f"{100 * gap.closed:.0f} %")
         rows.append(f"| {name} | {each.verdict} | {named} | " + " | ".join(figures) + " |")
     return "\n".join(rows)
 

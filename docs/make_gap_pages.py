@@ -239,7 +239,9 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
         for each in sorted(rows, key=lambda item: (item.name.partition(".")[0], item.pattern)):
             cell = f"[{each.name}](../effects/{each.name}.md)"
             alike = _alike(each.name, tables[each.name.partition(".")[0]])
-            lines.append(f"| ![{each.name}](images/{each.name}.png) | {each.pattern} | {cell} | {each.left:.0%} | {alike} |")
+            lines.append(
+                f"| ![{each.name}](images/{each.name}.png) | {each.pattern} | {cell} | {100 * each.left:.0f} % | {alike} |"
+            )
     return "\n".join(lines) + "\n"
 
 

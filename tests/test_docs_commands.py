@@ -50,9 +50,7 @@ RUN = (INIT, FIRST, MY_SITE, MY_SET, PLAN, SCRIPT, COMPLETION, VIEW)
 """Carried out by the tests of their own below."""
 
 RESOLVED = (
-    "simulate --sensor stereo --config configs/sites/bulga.yaml --set epochs=20 --set 'tiles={size_px: 512}' --out runs/bulga",
     "simulate --sensor stereo --set matcher=sgbm",
-    "simulate --sensor tls --config gap/model_after.yaml",
     "simulate --sensor tls --config runs/mine/run.json",
     "simulate --sensor tls --set scanner=my_scanner.yaml",
     "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high --set reconstruction=vertices "
@@ -63,6 +61,12 @@ RESOLVED = (
     "scarpsim inspect configs/sites/glendale.yaml --sensor tls --set scanner=riegl_vz400i --json",
     "scarpsim compare my_site.yaml riegl_vz400i",
     "scarpsim compare configs/demo.yaml riegl_vz400i --own-step --epochs 8 --sizes-m 0.04 0.6",
+    "scarpsim compare pilkington leica_p50 --epochs 4 --sizes-m 0.02 0.3 --out road",
+    "scarpsim compare glendale riegl_vz400i --set wall.width_m=35 --set wall.height_m=22 --epochs 4 "
+    "--sizes-m 0.05 0.6 --out cliff",
+    "scarpsim compare glendale riegl_vz2000i --set wall.width_m=60 --set wall.height_m=40 --set wall.resolution_m=0.1 "
+    "--set cameras.distance_m=400 --set cameras.base_m=100 --set cameras.focal_length_m=0.2 --set station.distance_m=400 "
+    "--set difference.gsd_m=0.05 --epochs 4 --sizes-m 0.1 1.5 --out far",
     "scarpsim calibrate maps/*.tif --sensor stereo --config my_site.yaml --out calibration",
     "scarpsim calibrate maps --config configs/sites/glendale.yaml --sensor stereo --set sensor=glendale_independent_low "
     "--set difference.gsd_m=0.04 --set calibration.window_px=32 --set calibration.simulations=100",
@@ -94,8 +98,15 @@ PARSED = (
     "scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis",
     "scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis",
     "scarpsim view diagnosis",
+    "scarpsim view runs/stereo runs/tls",
     "scarpsim view sets/small/test",
     "scarpsim doctor",
+    "scarpsim export runs/my_run picture --epoch 1 --out wall.png",
+    "scarpsim export runs/my_run epochs --out epochs.gif",
+    "scarpsim export runs/my_run scan --out scan.gif",
+    "scarpsim export runs/my_run gltf --out wall.glb",
+    "scarpsim export sets/small yolo --out sets/small_yolo",
+    "scarpsim export runs/my_run package",
 )
 """Work on results alone: their words are parsed."""
 
@@ -112,11 +123,10 @@ NAMED = (
     "[--own-step]",
     "scarpsim detect",
     "scarpsim detect default",
-    "scarpsim evaluate",
+    "scarpsim export",
     "scarpsim gap",
     "scarpsim gap --identifiability",
     "scarpsim gap --identifiability CONFIG",
-    "scarpsim gap --identifiability SITE.yaml",
     "scarpsim gap MEASUREMENT --identifiability",
     "scarpsim gap MEASUREMENT --out DIR",
     "scarpsim gap MEASUREMENT --out gap",
@@ -124,6 +134,7 @@ NAMED = (
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",
     "scarpsim inspect CONFIG",
+    "scarpsim inspect my_site.yaml",
     "scarpsim dataset",
     "scarpsim surface",
     "scarpsim surface scan.laz --seen-from X Y Z --out wall.ply",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.api.extras import library
 from pipeline.api.pictures import Picture, html_table
 from pipeline.formats.laz import EXACT_INTENSITY
+from pipeline.formats.pcd import write_pcd
 from pipeline.formats.ply import write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import write_xyz
@@ -55,16 +56,18 @@ class Points(np.ndarray[Any, Any]):
         return PointCloud(self.xyz, intensity, further.pop("gps_time", None), further)
 
     def save(self, path: Path | str) -> Path:
-        """Write .laz, .las, .ply or .xyz; returns the path. Raises InputError for another suffix."""
+        """Write .laz, .las, .ply, .pcd or .xyz; returns the path. Raises InputError for another suffix."""
         path, cloud = Path(path), self.cloud()
         if path.suffix in (".laz", ".las"):
             write_cloud(path, cloud)
         elif path.suffix == ".ply":
             write_ply_points(path, cloud)
+        elif path.suffix == ".pcd":
+            write_pcd(path, cloud)
         elif path.suffix in (".xyz", ".txt"):
             write_xyz(path, cloud)
         else:
-            raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".laz .las .ply .xyz")
+            raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".laz .las .ply .pcd .xyz")
         return path
 
     def to_open3d(self) -> Any:

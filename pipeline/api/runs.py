@@ -19,7 +19,6 @@ from pipeline.api.tables import boxes, frame, spread_out
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.atomic import new_folder
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.gltf import write_gltf
 from pipeline.formats.laz import read_laz
 from pipeline.formats.result_records import RUN_FILE
 from pipeline.report.notebook_progress import python_progress
@@ -239,15 +238,11 @@ class Epoch:
         return Picture(self.file(pick(dict(zip(PICTURES, PICTURES, strict=True)), kind, "plot"), ".png").read_bytes())
 
     def save_gltf(self, path: Path | str) -> Path:
-        """Write the surface as .glb, coloured by the difference as the report's map is, grey without data; returns the path."""
-        from pipeline.report.figures import COLOURS, NO_DATA, SCALE_SIGMAS
+        """Write the surface as .glb, coloured by the difference, each niche a part of its own; returns the path."""
+        from pipeline.export.exported_run import ExportedRun
+        from pipeline.export.gltf import save_gltf
 
-        surface, (values, grid) = self.surface, read_geotiff(self.file("difference", ".tif"))
-        limit = SCALE_SIGMAS * self.record["statistics"]["sigma_m"]
-        place = grid.rows(surface.vertices[:, 1]), grid.columns(surface.vertices[:, 0])
-        rows, columns = (np.clip(each.astype(int), 0, most - 1) for each, most in zip(place, grid.shape, strict=True))
-        colours = COLOURS.with_extremes(bad=NO_DATA)((values[rows, columns] / limit + 1) / 2, bytes=True)
-        write_gltf(Path(path), surface, colours)
+        save_gltf(ExportedRun(self.run.folder), self.number, Path(path))
         return Path(path)
 
     def _mesh(self, name: str) -> Mesh:

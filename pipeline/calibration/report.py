@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from pipeline.calibration.calibrate import Baseline, CalibrationResult
+from pipeline.calibration.parameters import ORIENTATION
 from pipeline.change.difference import statistics
 from pipeline.formats.atomic import write_text
 from pipeline.report.figures import DIFFERENCE_LABEL, DPI, FAMILY, difference_figure, dress, plain_numbers, png_bytes
@@ -25,6 +26,10 @@ Pictures = Sequence[tuple[str, str, bytes]]
 _MEASURED, _SIMULATED = FAMILY[:2]
 _COLOURS = "Red: rock is missing; blue: the surface stands further out; grey: no data; axes in m, wall frame."
 _SIGMAS = 3.0
+_READ_IN = {"m": (" mm", 1e3), "rad": (" \N{MICRO SIGN}rad", 1e6), "px": (" px", 1.0), "ppm": (" ppm", 1.0)}
+"""Unit and factor by the suffix of a parameter's name."""
+_LEAST_P = 0.01
+"""At or below which the model is said not to make such maps."""
 _INSTRUMENTS = {"stereo": "stereo pair", "tls": "laser scanner"}
 
 
@@ -52,11 +57,12 @@ def warnings(result: CalibrationResult) -> list[str]:
         f"{first} and {second} cannot be told apart by these maps (correlation {value:+.2f}): only their combination is known."
         for first, second, value in result.inseparable()
     ]
-    if found.misfit_p < 0.01:
+    if found.misfit_p < _LEAST_P:
         worst = np.argsort(-np.abs(found.misfit))[:3]
         names = ", ".join(f"{result.statistics[place]} ({found.misfit[place]:+.1f} sigma)" for place in worst)
         texts.append(
-            f"The model cannot make such maps (p = {found.misfit_p:.3f}); farthest off: {names}. `scarpsim gap` may say why."
+            f"The model cannot make such maps (p = {found.misfit_p:.3f}, below {_LEAST_P:g}); farthest off: {names}. "
+            "`scarpsim gap` may say why."
         )
     if not found.settled:
         texts.append("The search did not settle: the values lie beyond the last simulations. Raise calibration.simulations.")
@@ -67,9 +73,14 @@ def warnings(result: CalibrationResult) -> list[str]:
     return texts
 
 
+def scale_m(result: CalibrationResult) -> float:
+    """NMAD of the last measured map in the windows, m: the scale of all maps."""
+    return max(statistics(result.windows.cut(result.material.maps[-1])).nmad, 1e-6)
+
+
 def pictures(result: CalibrationResult, simulated: FloatArray | None) -> Pictures:
     """All pictures. simulated: (h, w) a map of the whole wall, m, where there is one."""
-    material, sigma = result.material, max(statistics(result.windows.cut(result.material.maps[-1])).nmad, 1e-6)
+    material, sigma = result.material, scale_m(result)
     none = np.zeros(material.grid.shape, dtype=np.int32)
     shown: list[tuple[str, str, bytes]] = [
         ("windows", "The last measured map and a simulated one in the windows that are compared, on one scale; white: no data.",
@@ -138,9 +149,15 @@ def _values(result: CalibrationResult) -> list[tuple[str, str]]:
     found = result.found
     columns = (np.exp(each) for each in (found.x, found.low, found.high))
     return [
-        (name, f"{value:.4g}  ({low:.4g} to {high:.4g})")
+        (name, _with_interval(name, value, low, high))
         for name, value, low, high in zip(result.parameters.names, *columns, strict=True)
     ]
+
+
+def _with_interval(name: str, value: float, low: float, high: float) -> str:
+    """A parameter in the unit that people read it in; of the orientation the factor to the config's sigmas."""
+    unit, factor = _READ_IN.get(name.rpartition("_")[2], (" times the config's" if name == ORIENTATION else "", 1.0))
+    return f"{factor * value:.4g}{unit}  ({factor * low:.4g} to {factor * high:.4g})"
 
 
 def _tables(result: CalibrationResult) -> list[_Table]:

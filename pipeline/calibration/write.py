@@ -10,10 +10,12 @@ import numpy as np
 
 from pipeline.calibration.calibrate import Baseline, CalibrationResult
 from pipeline.calibration.maps import noise_map
-from pipeline.calibration.report import pictures, write_calibration_report
+from pipeline.calibration.report import pictures, scale_m, write_calibration_report
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
 from pipeline.formats.geotiff import write_geotiff
+from pipeline.report.figures import SCALE_SIGMAS
+from pipeline.report.map_styles import difference_style
 from pipeline.report.provenance import versions
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -32,10 +34,13 @@ def write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs
 
 def _write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> None:
     write_text(out / MODEL_FILE, model_yaml(result))
+    limit = SCALE_SIGMAS * scale_m(result)
     write_geotiff(out / "systematic.tif", result.systematic, result.material.grid, description="mean of the measured maps")
+    difference_style(out / "systematic.tif", limit)
     whole = None if result.material.of_points else _whole_map(config, result)
     if whole is not None:
         write_geotiff(out / "simulated.tif", whole, result.material.grid, description="simulated with the calibrated noise")
+        difference_style(out / "simulated.tif", limit)
     shown = pictures(result, whole)
     for name, _, png in shown:
         write_bytes(out / f"{name}.png", png)

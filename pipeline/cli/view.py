@@ -10,6 +10,7 @@ from pipeline.cli.parser import at_least
 
 SUMMARY = "look at results in 3D: wall, differences, blocks, detections, residuals"
 EXAMPLE = """  scarpsim view runs/my_run
+  scarpsim view runs/my_run runs/other_sensor
   scarpsim view runs/my_run --detections found --port 8123
   scarpsim view diagnosis"""
 _PORT = 8050
@@ -17,6 +18,9 @@ _PORT = 8050
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run, a result of scarpsim gap, or a split of a data set")
+    parser.add_argument(
+        "second", type=Path, nargs="?", metavar="SECOND", help="another run of the same wall, beside the first by a slider"
+    )
     parser.add_argument("--detections", type=Path, metavar="FOLDER", help="result of scarpsim detect on the run")
     parser.add_argument(
         "--port", type=at_least(0, at_most=65_535), default=_PORT, metavar="N", help="of the page; 0: any (default: %(default)s)"
@@ -27,5 +31,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.view.server import serve
 
-    serve(arguments.folder, arguments.detections, arguments.port, open_browser=not arguments.no_browser)
+    serve(arguments.folder, arguments.second, arguments.detections, arguments.port, open_browser=not arguments.no_browser)
     return Answer("the page is closed")

@@ -27,6 +27,7 @@ from pipeline.comparison.trial import Trial
 from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.report.figures import DIFFERENCE_LABEL
+from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import millimetres, p_value_in_words, percent, template
 from pipeline.report.provenance import versions
 from pipeline.run.products import write_cloud
@@ -147,12 +148,15 @@ def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 def _write_products(out: Path, comparison: ComparedSensors) -> dict[str, dict[str, int]]:
     """Write maps, level of detection and the reference's points of each sensor; returns files' sizes by sensor, bytes."""
     trial, sizes = comparison.trial, {}
+    limit = scale_limit_m(shared_scale_m(list(comparison.noises().values())))
     for seen, each in zip(trial.seen, comparison.found, strict=True):
         folder = out / each.name
         for epoch, change in zip(trial.epochs, seen.changes, strict=True):
             path = folder / f"difference_{epoch.number:03d}.tif"
             write_geotiff(path, change, trial.grid, description="reference minus epoch, m; missing rock is positive")
+            difference_style(path, limit)
         write_geotiff(folder / "level_of_detection.tif", each.noise.level, trial.grid, description="95 % level of detection, m")
+        quantity_style(folder / "level_of_detection.tif", each.noise.level, "mm", 1e3)
         write_cloud(folder / "points.laz", recorded_points(seen.reference.observations))
         sizes[each.name] = {name: (folder / name).stat().st_size for name in ("points.laz", "difference_001.tif")}
     return sizes

@@ -94,7 +94,9 @@ class ProductsConfig(Config):
     crs: str | None = Field(
         None, description="coordinate system of the wall's own coordinates, such as EPSG:28356: stated in points_world.laz"
     )
-    formats: tuple[Literal["ply", "xyz", "e57"], ...] = Field((), description="points in these formats too, beside points.laz")
+    formats: tuple[Literal["ply", "xyz", "e57", "pcd"], ...] = Field(
+        (), description="points in these formats too, beside points.laz"
+    )
     block_meshes: bool = Field(
         False, description="four meshes of each block: wall difference, intersection, niche, removed block"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -23,6 +24,7 @@ class Event:
     """One rockfall. x_m, y_m: centre of its mask in the map's frame, the wall's; depth_m: largest; volume_m3: over the mask.
 
     Depth and volume are those of the difference map, along the wall's normal; pixels without data count with the mean depth.
+    world_x_m ...: the rock's place before it fell, in the survey's coordinates, NaN where they are not known.
     """
 
     image: str
@@ -36,6 +38,9 @@ class Event:
     mean_depth_m: float
     volume_m3: float
     score: float
+    world_x_m: float = float("nan")
+    world_y_m: float = float("nan")
+    world_z_m: float = float("nan")
 
 
 def event(item: Detection, number: int, image: str, difference: NDArray[np.float32], grid: Grid) -> Event:
@@ -62,20 +67,26 @@ def event(item: Detection, number: int, image: str, difference: NDArray[np.float
 
 
 def write_events(events: Sequence[Event], path: Path) -> None:
-    """A CSV table, one line per event, metres with 4 decimals."""
+    """A CSV table, one line per event, metres with 4 decimals, what is not known left empty."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(Event.__dataclass_fields__)
     for item in events:
-        table.writerow([f"{value:.4f}" if isinstance(value, float) else value for value in asdict(item).values()])
+        table.writerow([_written(value) for value in asdict(item).values()])
     write_text(path, text.getvalue())
+
+
+def _written(value: Any) -> Any:
+    if not isinstance(value, float):
+        return value
+    return "" if math.isnan(value) else f"{value:.4f}"
 
 
 def read_events(path: Path) -> list[Event]:
     """A table that `write_events` wrote."""
     types = {field.name: {"str": str, "int": int}.get(str(field.type), float) for field in fields(Event)}
     with path.open(encoding="utf-8", newline="") as file:
-        return [Event(**{name: types[name](value) for name, value in row.items()}) for row in csv.DictReader(file)]
+        return [Event(**{name: types[name](value) for name, value in row.items() if value}) for row in csv.DictReader(file)]
 
 
 def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -17,6 +17,7 @@ from pipeline.detection import baseline, events
 from pipeline.detection.data import CocoFolder
 from pipeline.detection.detections import Detection
 from pipeline.detection.figures import write_overlay
+from pipeline.detection.places import placed
 from pipeline.formats.geotiff import read_geotiff, write_geotiff
 from pipeline.report.progress import Progress
 from scene.errors import InputError
@@ -128,7 +129,7 @@ def _searched(item: Input, find: Detector, lowest: float) -> _Result:
     difference, grid = read_geotiff(item.path)
     found = find(difference)
     sure = [each for each in found if each.score >= lowest]
-    told = [events.event(each, count, item.name, difference, grid) for count, each in enumerate(sure, start=1)]
+    told = [placed(events.event(each, count, item.name, difference, grid), item.path) for count, each in enumerate(sure, start=1)]
     return _Result(item, difference.shape, found, told)
 
 

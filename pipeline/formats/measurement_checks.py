@@ -158,7 +158,8 @@ def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
     if not off <= _MOST_OFF * left.width:
         raise InputError(
             f"pixel_x and pixel_y lie {off:,.0f} px from where the left camera sees the points (median)", where=where,
-            allowed=f"up to {_MOST_OFF:.0%} of its width", remedy="check that they are of the left picture, or leave them out",
+            allowed=f"up to {100 * _MOST_OFF:.0f} % of its width",
+            remedy="check that they are of the left picture, or leave them out",
         )  # fmt: skip
 
 

@@ -68,10 +68,15 @@ class _Change(_Record):
     volume_m3: float
 
 
+class _Effect(_Record):
+    name: str
+
+
 class _Gap(_Record):
     sensor: Literal["stereo", "tls"]
     verdict: str
     scene_changes: list[_Change] = []
+    effects: list[_Effect] = []
 
 
 def read_run(path: Path, remedy: str) -> dict[str, Any]:

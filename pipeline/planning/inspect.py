@@ -11,6 +11,7 @@ from pipeline.formats.atomic import filling, write_json
 from pipeline.formats.geotiff import write_geotiff
 from pipeline.planning.maps import Plan, plans
 from pipeline.planning.report import write_plan_report
+from pipeline.report.map_styles import quantity_style
 from pipeline.report.provenance import versions
 from pipeline.run.site import prepare_site
 from scene.keyed_random import KeyedRandom
@@ -38,7 +39,9 @@ def _write(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> None:
     for each in found:
         for plotted in each.maps:
             path = out / f"{each.prefix}_{plotted.name}.tif"
-            write_geotiff(path, each.raster.image(plotted.values), each.raster.grid, description=plotted.title)
+            values = each.raster.image(plotted.values)
+            write_geotiff(path, values, each.raster.grid, description=plotted.title)
+            quantity_style(path, values, plotted.unit, plotted.factor)
     record: dict[str, Any] = {
         "schema": 1,
         "seed": config.seed,

@@ -20,7 +20,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from pipeline.change.difference import DifferenceStatistics, statistics
@@ -55,6 +56,8 @@ _GREYS = colormaps["gray"].resampled(64)
 SEQUENTIAL = colormaps["viridis"].resampled(48)
 _MOST_NUMBERED, _MOST_ZOOMED, _ZOOMS_A_ROW = 200, 24, 6
 """Blocks whose numbers stand on a map, and that are shown by themselves."""
+_TWO_DECADES = 250.0
+"""Span of a logarithmic axis from which on the numbers of 2 and 5 have no room."""
 _CROWDED = 0.15
 """A map whose median lies within this share of its range from the low end would be of one colour."""
 
@@ -113,7 +116,8 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
     places = block_boxes(block)
     for label, (_, right, _, top) in places.items() if len(places) <= _MOST_NUMBERED else ():
         at = grid.x_min + right * grid.gsd, grid.y_max - top * grid.gsd
-        axes.annotate(f"{label}", at, fontsize=6, annotation_clip=True)
+        number = axes.annotate(f"{label}", at, fontsize=8, annotation_clip=True)
+        number.set_path_effects([withStroke(linewidth=2, foreground="white")])
     _sigma_bar(figure, axes, image, sigma_m * 1e3)
     _no_data_legend(axes, values, NO_DATA, "outline: block, numbered as in the table" if inside.any() else "")
     return png_bytes(figure)
@@ -202,9 +206,15 @@ def _scale(known: NDArray[np.floating]) -> Normalize:
 
 
 def plain_numbers(axis: Axis) -> None:
-    """Ticks at 1, 2, 5, 10, ... of a logarithmic axis, as people write numbers."""
+    """Ticks at 1, 2, 5, 10, ... of a logarithmic axis, as people write numbers; of many decades 1, 10, ... alone."""
+
+    def number(value: float, _: Any) -> str:
+        low, high = axis.get_view_interval()
+        is_power = f"{value:.6e}".startswith("1.000000")
+        return f"{value:g}" if is_power or high < _TWO_DECADES * low else ""
+
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_major_formatter(FuncFormatter(number))
     axis.set_minor_formatter(NullFormatter())
 
 

@@ -28,10 +28,19 @@ from pipeline.formats.e57 import E57Scan, write_e57
 from pipeline.formats.geotiff import write_geotiff, write_tiff
 from pipeline.formats.inside import inside
 from pipeline.formats.laz import LazHeader, PulseChannels, write_laz
+from pipeline.formats.pcd import write_pcd
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.xyz import write_xyz
-from pipeline.report.figures import blocks_figure, convergence_figure, difference_figure, hillshade_figure, histogram_figure
+from pipeline.report.figures import (
+    SCALE_SIGMAS,
+    blocks_figure,
+    convergence_figure,
+    difference_figure,
+    hillshade_figure,
+    histogram_figure,
+)
+from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import litres
 from pipeline.run.acquisition import Look
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch
@@ -90,6 +99,7 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
             _write_m3c2(out, epoch.number, epoch.m3c2)
         images = list(_images(out, config, epoch, reference, name))
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
+        difference_style(out / f"{name}.tif", SCALE_SIGMAS * sigma)
         masks = epoch.raster.block != WALL
         write_bytes(out / f"{name}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
         largest = sorted(epoch.blocks, key=lambda record: -record["volume_m3"])
@@ -141,6 +151,8 @@ def _write_m3c2(out: Path, number: int, found: M3c2Map) -> None:
     write_geotiff(out / f"m3c2_lod_{number:03d}.tif", found.level, found.grid, description="M3C2 level of detection 95 %, m")
     calm = statistics(found.distance[found.block == WALL])
     sigma = max(calm.nmad, 1e-4) if calm.count else 1e-3
+    difference_style(out / f"m3c2_{number:03d}.tif", SCALE_SIGMAS * sigma)
+    quantity_style(out / f"m3c2_lod_{number:03d}.tif", found.level, "mm", 1e3)
     write_bytes(out / f"m3c2_{number:03d}.png", difference_figure(found.distance, found.grid, found.block, sigma, "M3C2"))
     maps: dict[str, NDArray[Any]] = {"distance_m": found.distance, "lod_m": found.level, "block": found.block}
     maps["significant"] = found.significant.astype(np.uint8)
@@ -207,6 +219,8 @@ def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans:
         write_ply_points(stem.with_suffix(".ply"), cloud)
     if "xyz" in formats:
         write_xyz(stem.with_suffix(".xyz"), cloud)
+    if "pcd" in formats:
+        write_pcd(stem.with_suffix(".pcd"), cloud)
     if "e57" in formats:
         write_e57(stem.with_suffix(".e57"), scans())
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +31,16 @@ class GapResults:
     """
 
     step_name = "model"
-    steps = {"before": "before: model as it was", "after": "after: with what was named"}  # noqa: RUF012
     surfaces = {"surface": "mean of the points"}  # noqa: RUF012
 
     def __init__(self, folder: Path) -> None:
         """Raises InputError where a file of the diagnosis is absent or damaged."""
         self._record = read_gap(folder / GAP_FILE)
         self.title = f"{folder.name}: {INSTRUMENTS[self._record['sensor']]}, verdict: {self._record['verdict'].replace('_', ' ')}"
-        self._clouds = {step: read_laz(folder / f"{step}.laz") for step in self.steps}
+        self._clouds = {step: read_laz(folder / f"{step}.laz") for step in ("before", "after")}
+        names = [each["name"] for each in self._record.get("effects", [])]
+        self._clouds |= _in_part(self._clouds["before"], names)
+        self.steps = {step: _in_words(step, names) for step in ("before", *list(self._clouds)[2:], "after")}
         before = self._clouds["before"].points
         if len(before) < 3:
             raise InputError("holds too few points to show", where=str(folder))
@@ -93,6 +97,31 @@ class GapResults:
         x, y = low[0] + (np.arange(width) + 0.5) * side, high[1] - (np.arange(height) + 0.5) * side
         shape = height, width
         return Patch(x, y, z.reshape(shape), mean.reshape(shape), np.zeros(shape, int), 1)
+
+
+def _in_part(before: PointCloud, names: list[str]) -> dict[str, PointCloud]:
+    """The points with the residuals that are left with some of several effects in the model, by the effects' numbers: "1", "13".
+
+    Empty where before.laz does not say what each effect takes away.
+    """
+    parts = [before.extra.get(f"effect_{number}_m") for number in range(1, len(names) + 1)]
+    if len(parts) < 2 or any(part is None for part in parts):
+        return {}
+    numbers = range(1, len(names) + 1)
+    some = [chosen for size in range(1, len(names)) for chosen in combinations(numbers, size)]
+    clouds = {}
+    for chosen in some:
+        left = before.extra["residual_m"] - sum(np.asarray(parts[number - 1]) for number in chosen)
+        clouds["".join(map(str, chosen))] = replace(before, extra={**before.extra, "residual_m": left})
+    return clouds
+
+
+def _in_words(step: str, names: list[str]) -> str:
+    if step == "before":
+        return "before: model as it was"
+    return (
+        "after: with what was named" if step == "after" else f"with {' and '.join(names[int(each) - 1] for each in step)} alone"
+    )
 
 
 def _residual(cloud: PointCloud) -> FloatArray:

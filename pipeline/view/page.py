@@ -8,16 +8,23 @@ from typing import Any
 import dash
 from dash import Input, Output, State, ctx, dcc, html, no_update
 
+from pipeline.view.beside import OTHER, Pair, beside, border
 from pipeline.view.figures import ITEM_TRACES, map_figure, wall_figure
 from pipeline.view.results import Item, Layer, Results, ViewWindow
 
 CELLS, POINTS = 60_000, 40_000
 """What a window is thinned to: it turns smoothly on a laptop without a graphics card."""
+_NOTHING = ""
+"""The choice of nothing beside."""
+_PLAY, _STOP, _EPOCH_MS = "play", "stop", 2500
 _GRAPH: Any = {"displaylogo": False, "scrollZoom": True, "modeBarButtonsToRemove": ["sendDataToCloud", "select2d", "lasso2d"]}
 
 
-def layout(results: Results) -> html.Div:
-    """Controls at the left, the wall in 3D, the map and what is known of the thing that was clicked on."""
+def layout(results: Results, other: Results | None = None) -> html.Div:
+    """Controls at the left, the wall in 3D, the map and what is known of the thing that was clicked on.
+
+    other: a second run of the same wall, to be put beside.
+    """
     first, surface = next(iter(results.steps)), next(iter(results.surfaces))
     shown = ["surface", *ITEM_TRACES]
     controls = [
@@ -25,8 +32,21 @@ def layout(results: Results) -> html.Div:
         _control("colour", dcc.Dropdown([], None, id="layer", clearable=False)),
         _control("surface", dcc.Dropdown(_options(results.surfaces), surface, id="surface", clearable=False)),
         _control("show", dcc.Checklist(["surface", "points", *_kinds(results)], shown, id="shown")),
+        _control(
+            "beside it, right of the border",
+            dcc.Dropdown(
+                _options({_NOTHING: "nothing"} | Pair(results, other).choices), _first_beside(other), id="beside", clearable=False
+            ),
+        ),
+        dcc.Slider(0, 100, value=50, marks=None, id="border", updatemode="mouseup"),
         _control("look at", dcc.Dropdown([], None, id="item", placeholder="block, detection, ...")),
         html.Div([html.Button("previous", id="previous"), html.Button("next", id="next"), html.Button("whole wall", id="whole")]),
+        html.Div(
+            [
+                html.Button(_PLAY, id="play", disabled=len(results.steps) < 2),
+                dcc.Interval(id="clock", interval=_EPOCH_MS, disabled=True),
+            ]
+        ),
         html.Div(id="facts"),
         html.P(id="note", className="note"),
     ]
@@ -51,13 +71,26 @@ def layout(results: Results) -> html.Div:
     )
 
 
-def register_callbacks(app: dash.Dash, results: Results, lock: Lock) -> None:
+def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Results | None = None) -> None:
     """Connect the page's parts; `lock` lets one request at a time compute."""
 
     @app.callback(Output("layer", "options"), Output("layer", "value"), Input("step", "value"), State("layer", "value"))
     def offer_layers(step: str, chosen: str | None) -> tuple[list[dict[str, str]], str]:
         keys = {layer.key: layer.label for layer in results.layers(step)}
         return _options(keys), chosen if chosen in keys else next(iter(keys))
+
+    @app.callback(
+        Output("clock", "disabled"), Output("play", "children"), Input("play", "n_clicks"), State("clock", "disabled"),
+        prevent_initial_call=True,
+    )  # fmt: skip
+    def play(_clicks: Any, stopped: bool) -> tuple[bool, str]:
+        return not stopped, _STOP if stopped else _PLAY
+
+    @app.callback(
+        Output("step", "value"), Input("clock", "n_intervals"), State("step", "value"), prevent_initial_call=True
+    )  # fmt: skip
+    def turn(_count: Any, step: str) -> str:
+        return following(list(results.steps), step)
 
     @app.callback(Output("item", "options"), Input("step", "value"))
     def offer_items(step: str) -> list[dict[str, Any]]:
@@ -115,30 +148,60 @@ def register_callbacks(app: dash.Dash, results: Results, lock: Lock) -> None:
         Input("shown", "value"),
         Input("item", "value"),
         Input("window", "data"),
+        Input("beside", "value"),
+        Input("border", "value"),
     )
-    def draw(step: str, key: str | None, surface: str, shown: list[str], number: int | None, window: Any) -> Any:
+    def draw(
+        step: str, key: str | None, surface: str, shown: list[str], number: int | None, window: Any, choice: str, share: float
+    ) -> Any:
         layers = {layer.key: layer for layer in results.layers(step)}
         if key not in layers:
             return no_update, no_update, no_update
         with lock:
-            return pictures(results, step, surface, layers[key], shown, number, ViewWindow(*window) if window else None)
+            part = ViewWindow(*window) if window else None
+            second = (Pair(results, other), choice, share / 100) if choice else None
+            return pictures(results, step, surface, layers[key], shown, number, part, second)
 
 
 def pictures(
-    results: Results, step: str, surface: str, layer: Layer, shown: list[str], number: int | None, window: ViewWindow | None
+    results: Results,
+    step: str,
+    surface: str,
+    layer: Layer,
+    shown: list[str],
+    number: int | None,
+    window: ViewWindow | None,
+    second: tuple[Pair, str, float] | None = None,
 ) -> tuple[Any, Any, str]:
-    """Both pictures of a window, and what is to be known about them."""
+    """Both pictures of a window, and what is to be known about them.
+
+    second: what stands right of a border, its choice, and the border's share of the width, 0 to 1.
+    """
     patch = results.patch(step, surface, layer, window, CELLS)
+    sides = ""
+    if second is not None:
+        pair, choice, share = second
+        at = border(patch, share)
+        patch = beside(patch, pair.patch(choice, surface, layer, window, CELLS), share)
+        own = f"{results.title}, {results.steps[step]}" if choice.startswith(OTHER) else results.steps[step]
+        sides = f"left of the border: {own}; right of it: {pair.choices[choice]}, on the same colours"
     points = results.points(step, layer, window, POINTS) if "points" in shown else None
     items = results.items(step)
     flat = map_figure(patch, items, layer, shown, window, number)
+    if second is not None:
+        flat.add_vline(x=at, line={"color": "#000000", "width": 1.5})
     cells = (
         f"a cell shows the mean of {patch.pooled} x {patch.pooled} pixels; zoom the map to see each" if patch.pooled > 1 else ""
     )
     thinned = f"{len(points.points):,} points are shown, {100 * points.share:.2f} % of all" if points is not None else ""
     outside = "where there is no data the map is grey and the wall open"
-    note = ". ".join(part[0].upper() + part[1:] for part in (cells, thinned, outside) if part) + "."
+    note = ". ".join(part[0].upper() + part[1:] for part in (sides, cells, thinned, outside) if part) + "."
     return wall_figure(patch, points, items, layer, shown, number), flat, note
+
+
+def following(steps: list[str], step: str) -> str:
+    """The step after one, the first after the last."""
+    return steps[(steps.index(step) + 1) % len(steps)]
 
 
 def clicked(data: Any) -> int | None:
@@ -164,6 +227,11 @@ def facts_table(item: Item) -> html.Div:
     """What is known of an item."""
     rows = [html.Tr([html.Th(name), html.Td(value)]) for name, value in item.facts.items()]
     return html.Div([html.H2(item.name), html.Table(html.Tbody(rows))])
+
+
+def _first_beside(other: Results | None) -> str:
+    """What stands beside at first: of a second run its first step."""
+    return _NOTHING if other is None else f"{OTHER}{next(iter(other.steps))}"
 
 
 def _kinds(results: Results) -> list[str]:

@@ -39,6 +39,7 @@ class RunResults:
         self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
         if not self._epochs or "wall" not in record or any("statistics" not in each for each in self._epochs.values()):
             raise InputError("holds no finished epoch", where=str(folder), remedy="go on with it by simulate --resume")
+        self.world_to_wall = np.array(record["wall_frame"]["matrix_world_to_wall"]) if "wall_frame" in record else np.eye(4)
         self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
         self.steps = {key: f"epoch {key}" for key in self._epochs}
         self.surfaces = {"surface": "as measured", "reference": "reference, as measured", "truth": "as it really is"}
@@ -49,6 +50,12 @@ class RunResults:
         self._map = lru_cache(4)(read_geotiff)
         self._heights = lru_cache(3)(self._raster_of)
         self._cloud = lru_cache(1)(read_laz)
+
+    @property
+    def extent_m(self) -> float:
+        """The longer side of the maps."""
+        grid = self._map(self._map_path("difference", next(iter(self.steps))))[1]
+        return max(grid.width, grid.height) * grid.gsd
 
     def layers(self, step: str) -> list[Layer]:
         limit = SCALE_SIGMAS * self._epochs[step]["statistics"]["sigma_m"] * _MM

@@ -17,6 +17,7 @@ import dash
 import flask
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
+from pipeline.view.beside import check_same_wall
 from pipeline.view.gap_results import GapResults
 from pipeline.view.page import layout, register_callbacks
 from pipeline.view.results import Results
@@ -58,8 +59,8 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
     raise InputError("holds nothing to look at", where=str(folder), allowed=allowed)
 
 
-def make_app(results: Results, token: str) -> dash.Dash:
-    """The page on `results`, for those who know the token."""
+def make_app(results: Results, token: str, other: Results | None = None) -> dash.Dash:
+    """The page on `results`, for those who know the token; other: a second run of the same wall."""
     app = dash.Dash(
         __name__,
         serve_locally=True,
@@ -67,28 +68,38 @@ def make_app(results: Results, token: str) -> dash.Dash:
         update_title="",
         assets_folder=str(Path(__file__).parent / "assets"),
     )
-    app.layout = layout(results)
-    register_callbacks(app, results, threading.Lock())
+    app.layout = layout(results, other)
+    register_callbacks(app, results, threading.Lock(), other)
     app.server.before_request(_refuse_other_names)
     app.server.before_request(_refuse_strangers(token))
     app.server.after_request(_with_headers(app.csp_hashes()))
     return app
 
 
-def make_page_server(results: Results, port: int, token: str) -> BaseWSGIServer:
+def make_page_server(results: Results, port: int, token: str, other: Results | None = None) -> BaseWSGIServer:
     """The page's server at `port` (0: any that is free); raises InputError where the port is taken."""
     try:
         with redirect_stderr(io.StringIO()):  # where werkzeug says the same at length
-            return make_server(HOST, port, make_app(results, token).server, threaded=True, request_handler=_Silent)
+            return make_server(HOST, port, make_app(results, token, other).server, threaded=True, request_handler=_Silent)
     except (OSError, SystemExit, OverflowError):
         remedy = "choose another, or 0 for any that is free"
         raise InputError(f"port {port} cannot be used", where="--port", remedy=remedy) from None
 
 
-def serve(folder: Path, detections: Path | None, port: int, *, open_browser: bool) -> None:
-    """Show a folder until interrupted."""
+def open_second(folder: Path, first: Results) -> Results:
+    """A second run of the wall of `first`; raises InputError where either is no run, or the walls or frames differ."""
+    second = open_results(folder)
+    if not isinstance(first, RunResults) or not isinstance(second, RunResults):
+        raise InputError("is to be shown beside another", where=str(folder), allowed="two runs of one wall")
+    check_same_wall(first.world_to_wall, second.world_to_wall, first.extent_m, str(folder))
+    return second
+
+
+def serve(folder: Path, second: Path | None, detections: Path | None, port: int, *, open_browser: bool) -> None:
+    """Show a folder until interrupted; second: a run to be put beside it."""
     token = secrets.token_urlsafe(24)
-    server = make_page_server(open_results(folder, detections), port, token)
+    results = open_results(folder, detections)
+    server = make_page_server(results, port, token, open_second(second, results) if second else None)
     address = f"http://{HOST}:{server.server_port}/?token={token}"
     print(f"{address} shows {folder}; Ctrl-C ends it", flush=True)  # noqa: T201  (what the command is asked for)
     if open_browser:

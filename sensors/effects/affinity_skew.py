@@ -14,6 +14,8 @@ class AffinitySkew(CameraEffect):
     """b_real = b_nominal + b: the pixels are not square, or the axes not at right angles."""
 
     name: Literal["affinity_skew"] = "affinity_skew"
+    means = "Pixels are not square or rows not at right angles to columns as calibrated: often a scanned or resampled picture."
+    act = "Work from the original pictures; calibrate the camera again with b1 and b2 free."
     sets = (("b1_px",), ("b2_px",), ("b1_px", "b2_px"))
     b1_px: float = parameter(
         "real minus calibrated affinity", unit="px", source="Metashape user manual, appendix D", typical=1.0, ge=-1e4, le=1e4

@@ -21,6 +21,10 @@ class AngleNoise(Effect):
     """
 
     name: Literal["angle_noise"] = "angle_noise"
+    means = (
+        "The beam's directions scatter more than the model says: seen on slanting rock, where a direction's error becomes depth."
+    )
+    act = "Simulate and plan with the value found; set the tripod firmly, out of the wind, and check that it does not turn."
     sensor = "tls"
     stage = Stage.AIM
     shows_in = ShowsIn.SPREAD

@@ -69,7 +69,8 @@ class Effect(Config, ABC):
     What else is to be known of it stands here too, so that no other place decides by its name:
     shows_in; looks_at: its own pulse or pixel (`element`), neighbouring ones, or the whole scan or image; needs: fields that a
     measurement must have; catalogue: whether `scarpsim gap` may name it; empirical: a term that has no name; planned: whether a
-    plan takes it into account; searched: of a sine; sets: of its parameters that are tried (default: all that switch it on,
+    plan takes it into account; means, act: what it says of an instrument, and what to do about it, in sentences;
+    searched: of a sine; sets: of its parameters that are tried (default: all that switch it on,
     together); trials: a parameter that is not fitted, with the values that are tried; shared: whether neighbours scatter alike;
     held_out_gain: log score on held-out data up to which it is not believed.
     """
@@ -84,6 +85,8 @@ class Effect(Config, ABC):
     catalogue: ClassVar[bool] = True
     empirical: ClassVar[bool] = False
     planned: ClassVar[bool] = False
+    means: ClassVar[str] = ""
+    act: ClassVar[str] = ""
     searched: ClassVar[Search | None] = None
     sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
     trials: ClassVar[tuple[str, tuple[float, ...]] | None] = None

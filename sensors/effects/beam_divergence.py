@@ -23,10 +23,11 @@ class BeamDivergence(Effect):
     """
 
     name: Literal["beam_divergence"] = "beam_divergence"
+    means = "The beam is wider than the model says: at edges it mixes near and far rock, and niches look smaller."
+    act = "Put the divergence found into the model; no processing undoes it: move nearer, and mask points at depth edges."
     sensor = "tls"
     stage = Stage.FOOTPRINT
     shows_in = ShowsIn.EDGES
-    looks_at = "neighbours"
     planned = True
     divergence_rad: float = parameter(
         "full divergence, 1/e^2", unit="rad", source="datasheets (mind their conventions)", typical=3e-4, ge=0, le=0.1

@@ -14,6 +14,8 @@ class CameraKappa(CameraEffect):
     """R_real = R_nominal R_z(angle), camera to world: right-handed about the camera's z axis (x right, y down, z forward)."""
 
     name: Literal["camera_kappa"] = "camera_kappa"
+    means = "A camera is turned about its viewing axis against its surveyed pose."
+    act = "Survey control points on stable rock and orient both cameras by them in every epoch."
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=1e-4, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:

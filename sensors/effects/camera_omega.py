@@ -14,6 +14,8 @@ class CameraOmega(CameraEffect):
     """R_real = R_nominal R_x(angle), camera to world: right-handed about the camera's x axis (x right, y down, z forward)."""
 
     name: Literal["camera_omega"] = "camera_omega"
+    means = "A camera is turned about its x axis against its surveyed pose."
+    act = "Survey control points on stable rock and orient both cameras by them in every epoch."
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=1.7e-4, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:

@@ -14,6 +14,8 @@ class CameraPhi(CameraEffect):
     """R_real = R_nominal R_y(angle), camera to world: right-handed about the camera's y axis (x right, y down, z forward)."""
 
     name: Literal["camera_phi"] = "camera_phi"
+    means = "A camera is turned about its y axis against its surveyed pose: the convergence of the pair is wrong."
+    act = "Survey control points on stable rock and orient both cameras by them in every epoch."
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=5e-5, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:

@@ -16,6 +16,8 @@ class CameraShift(CameraEffect):
     """X_real = X_nominal + (x, y, z), world frame."""
 
     name: Literal["camera_shift"] = "camera_shift"
+    means = "A camera does not stand where it was surveyed: the base is wrong, and all depths with it."
+    act = "Survey control points on stable rock and orient both cameras by them in every epoch; measure the base."
     x_m: float = parameter(
         "real minus nominal perspective centre, world x", unit="m", source="photogrammetry", typical=0.01, ge=-10, le=10
     )

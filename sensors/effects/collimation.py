@@ -17,6 +17,8 @@ class Collimation(AimEffect):
     """
 
     name: Literal["collimation"] = "collimation"
+    means = "The line of sight is not at right angles to the trunnion axis."
+    act = "Run the instrument's own check; measuring in two faces and taking the mean cancels it."
     angle_rad: float = parameter(
         "recorded minus true azimuth at the horizon", unit="rad", source="Lichti 2007, B6", typical=1e-4, ge=-0.1, le=0.1
     )

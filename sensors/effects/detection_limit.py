@@ -18,6 +18,8 @@ class DetectionLimit(Effect):
     """No return where rho cos i / R^2 < minimum, relative to albedo 1, squarely hit, at 100 m (lidar range equation)."""
 
     name: Literal["detection_limit"] = "detection_limit"
+    means = "Echoes below a power are lost: dark, wet, distant or slanting rock leaves holes."
+    act = "Move nearer, wait for dry rock, or lower the pulse rate; do not read a hole as missing rock."
     sensor = "tls"
     stage = Stage.RETURN
     shows_in = ShowsIn.RETURNS

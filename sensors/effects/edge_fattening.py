@@ -24,6 +24,8 @@ class EdgeFattening(RasterEffect):
     """
 
     name: Literal["edge_fattening"] = "edge_fattening"
+    means = "At depth steps the near rock grows over the far rock: the matching window straddles the edge."
+    act = "Use a smaller matching window, and mask a window's width at depth edges before comparing."
     order = 10
     radius_px: float = parameter("reach beyond the outline", unit="px", source="Hirschmueller 2008", typical=8.0, ge=0, le=1000)
 

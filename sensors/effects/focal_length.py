@@ -14,6 +14,8 @@ class FocalLength(CameraEffect):
     """f_real = f_nominal + delta: the lens warms or is refocused (46 mm at 100 m for 20 K, Glendale lens)."""
 
     name: Literal["focal_length"] = "focal_length"
+    means = "The principal distance is another than the calibration's: refocused, another temperature, or a weak calibration."
+    act = "Calibrate the camera again at the site's distance and fix the focus ring."
     delta_px: float = parameter(
         "real minus calibrated principal distance",
         unit="px",

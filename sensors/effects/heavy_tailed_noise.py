@@ -25,6 +25,11 @@ class HeavyTailedNoise(NodeNoise):
     """
 
     name: Literal["heavy_tailed_noise"] = "heavy_tailed_noise"
+    means = "Most disparities are as good as the model says, some patches far worse: bare or repeated rock beside textured rock."
+    act = (
+        "Simulate and plan with the value found; judge change by each place's own level of detection, not by one for "
+        "the whole wall."
+    )
     order = 35
     catalogue = False
     sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.5, ge=0, le=1000)

@@ -14,6 +14,8 @@ class HorizontalEccentricity(AimEffect):
     """daz = a sin(az + phase), once per turn (Lichti 2007, B2 and B3)."""
 
     name: Literal["horizontal_eccentricity"] = "horizontal_eccentricity"
+    means = "The horizontal circle is not centred on its axis: azimuths are off by a wave that repeats with the turn."
+    act = "Compare only scans with the same zero direction, and have the instrument checked by its maker."
     amplitude_rad: float = parameter(
         "amplitude of the azimuth error", unit="rad", source="Lichti 2007, B2, B3", typical=1e-4, ge=-0.1, le=0.1
     )

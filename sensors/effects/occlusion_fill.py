@@ -18,6 +18,8 @@ class OcclusionFill(RasterEffect):
     """
 
     name: Literal["occlusion_fill"] = "occlusion_fill"
+    means = "Strips that one camera alone sees were filled with invented depths."
+    act = "Switch hole filling off, or use a left-right check, and mask the strips beside edges."
     stage = Stage.FILL
     reach_px: float = parameter("widest strip that is filled", unit="px", source="Hirschmueller 2008", typical=80.0, ge=0, le=1e5)
 

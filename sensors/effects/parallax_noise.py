@@ -19,6 +19,8 @@ class ParallaxNoise(MatchingNoise):
     """dd ~ N(0, sigma) per cell of the depth map: the pixel noise of the matching (thesis 3.4)."""
 
     name: Literal["parallax_noise"] = "parallax_noise"
+    means = "Disparities scatter more than the model says, pixel by pixel."
+    act = "Simulate and plan with the value found; sharper pictures, a lower ISO or a longer base lower it."
     order = 40
     sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.3, ge=0, le=1000)
 

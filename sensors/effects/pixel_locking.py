@@ -25,6 +25,8 @@ class PixelLocking(Effect):
     """
 
     name: Literal["pixel_locking"] = "pixel_locking"
+    means = "Sub-pixel disparities are drawn to whole pixels: terraces on the wall, at the depths of whole disparities."
+    act = "Let the matcher refine below the pixel (a larger window, or a refinement after it), or give it larger pictures."
     sensor = "stereo"
     stage = Stage.MATCH
     shows_in = ShowsIn.VALUES

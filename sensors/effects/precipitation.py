@@ -24,6 +24,8 @@ class Precipitation(Effect):
     """
 
     name: Literal["precipitation"] = "precipitation"
+    means = "Rain, snow or dust returns echoes of its own and swallows others."
+    act = "Scan again in clear air; of what is there, keep last echoes and drop lone points in front of the wall."
     sensor = "tls"
     stage = Stage.RETURN
     shows_in = ShowsIn.RETURNS

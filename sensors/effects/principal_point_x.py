@@ -14,6 +14,10 @@ class PrincipalPointX(CameraEffect):
     """cx_real = cx_nominal + delta."""
 
     name: Literal["principal_point_x"] = "principal_point_x"
+    means = (
+        "The principal point has moved along the picture's rows: the lens sits otherwise in its mount, or stabilisation was on."
+    )
+    act = "Calibrate the camera again; switch image stabilisation off and leave the lens on the camera."
     delta_px: float = parameter(
         "real minus calibrated principal point",
         unit="px",

@@ -14,6 +14,10 @@ class PrincipalPointY(CameraEffect):
     """cy_real = cy_nominal + delta."""
 
     name: Literal["principal_point_y"] = "principal_point_y"
+    means = (
+        "The principal point has moved across the picture's rows: the lens sits otherwise in its mount, or stabilisation was on."
+    )
+    act = "Calibrate the camera again; switch image stabilisation off and leave the lens on the camera."
     delta_px: float = parameter(
         "real minus calibrated principal point",
         unit="px",

@@ -18,6 +18,11 @@ class RadialDistortion(CameraEffect):
     """
 
     name: Literal["radial_distortion"] = "radial_distortion"
+    means = "The lens's radial distortion is not what the calibration says: the wall comes out domed or dished."
+    act = (
+        "Calibrate the camera again, with pictures turned by 90 degrees and the target in the corners; do not let the "
+        "adjustment of two parallel pictures find it."
+    )
     sets = (("k1",), ("k1", "k2"), ("k1", "k2", "k3"))
     k1: float = parameter(
         "real minus calibrated k1", unit="1", source="Metashape user manual, appendix D", typical=5e-4, ge=-100, le=100

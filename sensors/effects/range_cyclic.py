@@ -18,6 +18,11 @@ class RangeCyclic(RangeEffect):
     """dR = A sin(2 pi R / period + phase): crosstalk in the phase measurement (Lichti 2007, A3 and A4)."""
 
     name: Literal["range_cyclic"] = "range_cyclic"
+    means = "The range error repeats with the range: crosstalk in a phase-shift instrument, at a fraction of its wavelength."
+    act = (
+        "Correct the ranges by the wave that was found; a constant wave is a matter for calibration: have the "
+        "instrument checked by its maker."
+    )
     searched = Search("period_m", along="range", shortest=0.3, longest=15.0)
     amplitude_m: float = parameter(
         "amplitude of the range error", unit="m", source="Lichti 2007, A3, A4", typical=0.001, ge=-10, le=10

@@ -14,6 +14,8 @@ class RangeIncidenceBias(RangeEffect):
     """dR = k (1 / cos i - 1): the stretched echo of a slanting surface is timed late, or early (TLS against tracker)."""
 
     name: Literal["range_incidence_bias"] = "range_incidence_bias"
+    means = "Ranges on slanting rock are biased: the oblique footprint stretches the echo."
+    act = "Compare epochs from the same place, so that it cancels, and choose stations that face the wall."
     coefficient_m: float = parameter(
         "range error at 60 degrees of incidence", unit="m", source="TLS against laser tracker", typical=0.001, ge=-10, le=10
     )

@@ -22,6 +22,8 @@ class RangeIntensityBias(RangeEffect):
     """
 
     name: Literal["range_intensity_bias"] = "range_intensity_bias"
+    means = "Dark rock is measured at another range than bright rock: the detector's time walk is not fully corrected."
+    act = "Do not take steps at borders of colour or wetness for movement; correct ranges by intensity, or scan in like weather."
     looks_at = "whole"
     needs = ("power",)
     coefficient_m: float = parameter(

@@ -14,6 +14,8 @@ class RangeNoise(RangeSpread):
     """dR ~ N(0, sigma) per pulse; several sources of noise add in quadrature."""
 
     name: Literal["range_noise"] = "range_noise"
+    means = "Ranges scatter more than the model says, everywhere alike."
+    act = "Simulate and plan with the value found; a slower scan or more averaging lowers it. Heat shimmer, too, looks like this."
     sigma_m: float = parameter("standard deviation of the range", unit="m", source="datasheets", typical=0.003, ge=0, le=10)
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:

@@ -17,6 +17,11 @@ class RangeNoiseIntensity(RangeSpread):
     """
 
     name: Literal["range_noise_intensity"] = "range_noise_intensity"
+    means = "Ranges scatter more where little light returns: dark or wet rock."
+    act = (
+        "Simulate and plan with the value found; scan dry rock, nearer, or at a lower pulse rate, which gives each "
+        "pulse more energy."
+    )
     needs = ("power",)
     trials = ("exponent", (-0.5, -0.75, -1.0))
     a_m: float = parameter(

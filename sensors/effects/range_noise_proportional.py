@@ -14,6 +14,8 @@ class RangeNoiseProportional(RangeSpread):
     """dR ~ N(0, ppm R 1e-6) per pulse, the second figure of a datasheet's "1 mm + 10 ppm"."""
 
     name: Literal["range_noise_proportional"] = "range_noise_proportional"
+    means = "Ranges scatter more the farther the rock: less light returns, or the air is unsteady."
+    act = "Simulate and plan with the value found; move nearer, or average several scans."
     ppm: float = parameter("standard deviation per range", unit="ppm", source="datasheets", typical=20.0, ge=0, le=1e5)
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:

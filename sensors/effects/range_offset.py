@@ -14,6 +14,13 @@ class RangeOffset(RangeEffect):
     """dR = offset: the rangefinder's zero point (Lichti 2007, A0; NIST x10)."""
 
     name: Literal["range_offset"] = "range_offset"
+    means = (
+        "Every range is too long or too short by the same length: an additive constant of the instrument or of its calibration."
+    )
+    act = (
+        "Subtract the value from the ranges, or have the instrument checked by its maker. Between epochs of the same "
+        "scanner at one place it cancels."
+    )
     offset_m: float = parameter("recorded minus true range", unit="m", source="Lichti 2007, A0", typical=0.003, ge=-100, le=100)
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:

@@ -21,6 +21,8 @@ class RangeQuantization(Effect):
     """
 
     name: Literal["range_quantization"] = "range_quantization"
+    means = "Ranges come in steps: the timer's resolution, or an export with too few digits."
+    act = "Export with more decimals first. If the steps stay they are the instrument's: average several scans."
     sensor = "tls"
     stage = Stage.RANGE
     shows_in = ShowsIn.VALUES

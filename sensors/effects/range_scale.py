@@ -14,6 +14,13 @@ class RangeScale(RangeEffect):
     """dR = scale R: the instrument's scale, air temperature and pressure (about +1 ppm/K, -0.28 ppm/hPa; Lichti 2007, A1)."""
 
     name: Literal["range_scale"] = "range_scale"
+    means = (
+        "Ranges are wrong in proportion to their length: the clock, or air of another temperature and pressure than was assumed."
+    )
+    act = (
+        "Enter the temperature and pressure of the day in the scanner's software (1 ppm is about 1 K or 3 hPa); if it "
+        "stays, have the instrument checked by its maker."
+    )
     scale_ppm: float = parameter(
         "recorded over true range, less one", unit="ppm", source="Lichti 2007, A1", typical=20.0, ge=-1e5, le=1e5
     )

@@ -24,6 +24,11 @@ class RegularizationNoise(NodeNoise):
     """
 
     name: Literal["regularization_noise"] = "regularization_noise"
+    means = "Disparities have errors that neighbours share, as a smoothing matcher makes them."
+    act = (
+        "Simulate and plan with the value found: averaging neighbours does not lower it. A matcher with less smoothing, "
+        "or another look, does."
+    )
     order = 30
     sigma_px: float = parameter("standard deviation at the nodes", unit="px", source="empirical", typical=0.2, ge=0, le=1000)
 

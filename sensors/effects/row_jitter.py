@@ -25,6 +25,8 @@ class RowJitter(Effect):
     """
 
     name: Literal["row_jitter"] = "row_jitter"
+    means = "Rows of a picture are displaced sideways: a rolling shutter, or vibration during the exposure."
+    act = "Use a mechanical or global shutter, a shorter exposure and a firm stand."
     sensor = "stereo"
     stage = Stage.EXPOSE
     shows_in = ShowsIn.MEAN

@@ -19,6 +19,8 @@ class Smoothing(RasterEffect):
     """
 
     name: Literal["smoothing"] = "smoothing"
+    means = "Disparities are low-pass filtered: small blocks are flattened and lose volume."
+    act = "Lower the matcher's smoothing or its depth filtering; blocks smaller than the length found are not measured."
     order = 20
     held_out_gain = 5.0  # a little low-pass also makes up for rays that are not quite where they are thought to be
     sigma_px: float = parameter("standard deviation of the low-pass", unit="px", source="empirical", typical=8.0, ge=0, le=500)

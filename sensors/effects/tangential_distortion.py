@@ -14,6 +14,8 @@ class TangentialDistortion(CameraEffect):
     """p_real = p_nominal + p, in Metashape's order (OpenCV's p1 and p2 change places)."""
 
     name: Literal["tangential_distortion"] = "tangential_distortion"
+    means = "The lens's elements are not centred as the calibration says."
+    act = "Calibrate the camera again; check that p1 and p2 were not exchanged between two programs (docs/formats/cameras.md)."
     sets = (("p1",), ("p2",), ("p1", "p2"))
     p1: float = parameter(
         "real minus calibrated p1, Metashape's order",

@@ -19,6 +19,8 @@ class TiltDrift(AimEffect):
     """
 
     name: Literal["tilt_drift"] = "tilt_drift"
+    means = "The scanner leaned over during the scan: the tripod settled, or the sun warmed one of its legs."
+    act = "Set it on rock or concrete, let it settle, shade it, keep the compensator on, and scan in less time."
     needs = ("share",)
     rate_x_rad: float = parameter(
         "turn about the scanner's x axis over the scan",

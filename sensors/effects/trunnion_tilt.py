@@ -17,6 +17,8 @@ class TrunnionTilt(AimEffect):
     """
 
     name: Literal["trunnion_tilt"] = "trunnion_tilt"
+    means = "The trunnion axis is not at right angles to the standing axis: directions are off in proportion to the height."
+    act = "Run the instrument's own check; measuring in two faces and taking the mean cancels it."
     angle_rad: float = parameter(
         "recorded minus true azimuth at a zenith angle of 45 degrees",
         unit="rad",

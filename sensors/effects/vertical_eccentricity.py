@@ -14,6 +14,8 @@ class VerticalEccentricity(AimEffect):
     """dz = a sin(z + phase), once per turn (Lichti 2007, C2)."""
 
     name: Literal["vertical_eccentricity"] = "vertical_eccentricity"
+    means = "The vertical circle is not centred on its axis: zenith angles are off by a wave."
+    act = "Measuring in two faces and taking the mean cancels it; else have the instrument checked by its maker."
     amplitude_rad: float = parameter(
         "amplitude of the zenith error", unit="rad", source="Lichti 2007, C2", typical=1e-4, ge=-0.1, le=0.1
     )

@@ -14,6 +14,8 @@ class VerticalIndex(AimEffect):
     """dz = offset, the same in both faces: the recorded zenith angle is too large by it (Lichti 2007, C0; NIST x4)."""
 
     name: Literal["vertical_index"] = "vertical_index"
+    means = "All zenith angles are off by one angle: the vertical circle's zero."
+    act = "Run the instrument's own index check; measuring in two faces and taking the mean cancels it."
     offset_rad: float = parameter(
         "recorded minus true zenith", unit="rad", source="Lichti 2007, C0", typical=1e-4, ge=-0.1, le=0.1
     )

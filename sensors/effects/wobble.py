@@ -18,6 +18,8 @@ class Wobble(AimEffect):
     """dz = a sin(2 pi line / n + phase), line the scan line's number from the scan's first, one step in azimuth each."""
 
     name: Literal["wobble"] = "wobble"
+    means = "The standing axis wobbles as the scanner turns: whole scan lines are tilted by a wave."
+    act = "Check bearings, tribrach and tripod; if it stays, have the instrument checked by its maker."
     needs = ("line",)
     searched = Search("lines_per_cycle", along="line", shortest=4.0, cycles=2.0)
     amplitude_rad: float = parameter(

@@ -144,9 +144,18 @@ def test_a_factor_scales_every_sigma_of_the_orientation_but_those_fitted_singly(
     assert model.noise.orientation.k1.sigma == 0.004
 
 
-@pytest.mark.parametrize("sensor", ["stereo", "tls"])
-def test_chosen_cells_are_those_of_the_whole_observation_to_the_bit(sensor: str) -> None:
-    config, site = small(sensor)
+@pytest.mark.parametrize(
+    ("sensor", "more"),
+    [
+        ("stereo", []),
+        ("tls", []),
+        ("tls", ["scanner.preset=riegl_vz400i"]),
+        ("tls", ["sensor={sensor: tls, effects: [{name: beam_divergence, divergence_rad: 0.001, mode: multiple}]}"]),
+    ],
+)
+def test_chosen_cells_are_those_of_the_whole_observation_to_the_bit(sensor: str, more: list[str]) -> None:
+    """Also of a preset whose beam has a footprint: its sub-rays leave with the pulse and look at no other one."""
+    config, site = small(sensor, *more)
     whole: Any = site.sensor
     seen = whole.observe(RayCaster(site.mesh), KeyedRandom(5)).points.reshape(-1, 3)
     grid = Grid(2.0, 5.0, 0.04, 120, 80)

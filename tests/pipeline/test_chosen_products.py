@@ -28,16 +28,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("chosen")
     wall = make_wall(style="pilkington", width_m=6.0, height_m=4.0, resolution_m=0.2)
     path = wall.with_vertices(wall.vertices + ORIGIN).save(place / "wall.ply")  # type: ignore[attr-defined]
-    chosen = {"truth": False, "surface": False, "crs": "EPSG:28356", "formats": ["xyz", "ply", "e57"]}
+    chosen = {"truth": False, "surface": False, "crs": "EPSG:28356", "formats": ["xyz", "ply", "e57", "pcd"]}
     return simulate(None, "tls", out=place / "run", progress=False, wall={"mesh": path}, products=chosen, **SMALL).folder
 
 
 def test_only_what_was_chosen_is_written(folder: Path) -> None:
     names = {path.name for path in (folder / "epoch_001").iterdir()}
-    points = {f"points{world}.{suffix}" for world in ("", "_world") for suffix in ("laz", "xyz", "ply", "e57")}
+    points = {f"points{world}.{suffix}" for world in ("", "_world") for suffix in ("laz", "xyz", "ply", "e57", "pcd")}
     assert names == {*points, "blocks.json", "epoch.json"}
     with pytest.raises(InputError, match=r"did not write surface\.ply.*products"):
         _ = open_run(folder)[1].surface
+
+
+def test_the_map_has_its_style_beside_it(folder: Path) -> None:
+    assert "singlebandpseudocolor" in (folder / "difference_001.qml").read_text()
 
 
 def test_world_points_state_their_system(folder: Path) -> None:

@@ -97,7 +97,7 @@ MISTAKES = [
     (
         ["frobnicate"],
         "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, measurement, gap, train, detect, evaluate, "
-        "view, surface, init, schema, completion, doctor",
+        "view, export, surface, init, schema, completion, doctor",
     ),
     (["--versio"], "did you mean '--version'?"),
     (["simulate"], "required: --sensor"),

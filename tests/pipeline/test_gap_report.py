@@ -21,6 +21,7 @@ from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report import figures, report
+from pipeline.gap.report.contributions import contributions
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.figures import gap_figure, maps_figure
 from pipeline.gap.report.quantities import with_std
@@ -66,8 +67,23 @@ def test_every_verdict_has_a_report(
     page = report.write(tmp_path, case, measurement).read_text()
     assert {path.name for path in tmp_path.iterdir()} >= FILES
     assert VERDICTS[verdict] in page
+    assert ("effect_2_m" in read_laz(tmp_path / "before.laz").extra) == (verdict == "several")
     assert ("What to measure" in page) == (not told)
+    assert ("What it means, and what to do" in page) == (verdict in EFFECTS)
+    order = ["What it means", "Where they disagree", "What was named", "<h2>The gap", "What was tried", "The model after"]
+    places = [page.index(title) for title in order if title in page]
+    assert places == sorted(places)
+    assert "On blocks that no step has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
     assert ("± &lt; 0.001 mm" in page) == (verdict in ("named", "several", "ambiguous"))
+
+
+def test_each_of_several_effects_says_what_it_takes_away(few: tuple[GapDiagnosis, Measurement]) -> None:
+    """Two of a kind take away the same, no more than the 4 mm that a range offset is."""
+    found, measurement = few
+    first, second = contributions(replace(found, effects=(NAMED, NAMED)), measurement)
+    np.testing.assert_array_equal(first, second)
+    assert 0 < np.abs(first).max() < 0.0045
+    assert contributions(replace(found, effects=()), measurement).shape == (0, len(found.before))
 
 
 def test_nothing_is_written_where_the_report_cannot_be_made(

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.report.advice import advice, page_of
 from pipeline.gap.report.in_words import decimal, number, rounded, with_unit
+from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
+from sensors.effects.base import Effect
 
 
 @pytest.mark.parametrize(
@@ -27,3 +31,16 @@ def test_rounding_goes_into_tables_and_leaves_all_but_fractions_alone() -> None:
 def test_covariates_have_the_unit_of_their_sensor() -> None:
     assert [with_unit("edge_step", sensor) for sensor in ("tls", "stereo")] == ["edge_step, m", "edge_step, px"]
     assert with_unit("zenith", "tls") == "zenith, rad"
+
+
+@pytest.mark.parametrize("effect", [*TLS_EFFECTS, *STEREO_EFFECTS], ids=lambda effect: effect.__name__)
+def test_every_effect_of_the_catalogue_says_what_it_means_and_what_to_do(effect: type[Effect]) -> None:
+    assert all(text[0].isupper() and text.endswith(".") and len(text) > 25 for text in (effect.means, effect.act))
+    assert page_of(f"effects/{effect.sensor}.{effect.model_fields['name'].default}").startswith("file://")
+
+
+def test_what_the_catalogue_does_not_hold_is_told_in_general_words() -> None:
+    term = Named("tls.range_empirical", "empirical", {"name": "range_empirical"}, {}, (), None, 9.0)
+    assert "does not hold" in advice(term).means
+    assert "Simulate with model_after.yaml" in advice(Named("tls.range_empirical", "physical", {}, {}, (), None, 9.0)).act
+    assert page_of("effects/tls.nothing") == ""

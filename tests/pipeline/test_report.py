@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from pipeline.report.figures import (
     block_boxes,
@@ -23,6 +24,7 @@ from pipeline.report.figures import (
     difference_figure,
     hillshade_figure,
     histogram_figure,
+    plain_numbers,
 )
 from pipeline.report.page import litres, template
 from pipeline.run.page import BlockRow, EpochReport, RegistrationSummary, RunReport, write_report
@@ -180,6 +182,18 @@ def test_page_holds_every_number(html: str) -> None:
     assert "nan" not in text
 
 
+def test_reports_give_the_answer_the_picture_the_evidence_and_then_the_settings(html: str) -> None:
+    places = [
+        html.index(part) for part in ('class="lead"', "<figure>", "How good the maps are", "Settings", "The resolved config")
+    ]
+    assert places == sorted(places)
+    for name in ("calibration", "comparison", "planning"):
+        page = (TEMPLATES / name / "report.html.jinja").read_text()
+        places = [page.index(part) for part in ('class="lead"', "<figure>", 'class="wide"', "Settings")]
+        if name != "calibration":  # its picture is a macro, called before the tables
+            assert places == sorted(places), name
+
+
 def test_page_is_whole_escaped_and_needs_no_network(html: str) -> None:
     page = Page(html)
     assert page.open == []
@@ -237,6 +251,20 @@ def test_blocks_are_shown_by_themselves_in_the_order_given() -> None:
     assert both != blocks_figure(difference, GRID, block, SIGMA_M, {1: "2 l", 7: "1 l"})
     assert blocks_figure(difference, GRID, np.zeros_like(block), SIGMA_M, {1: "2 l"}) is None
     assert block_boxes(np.zeros_like(block)) == {}
+
+
+@pytest.mark.parametrize(
+    ("limits", "shown"), [((0.01, 0.6), ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5"]), ((2e-4, 0.2), ["0.001", "0.01", "0.1"])]
+)
+def test_numbers_of_a_logarithmic_axis_have_room(limits: tuple[float, float], shown: list[str]) -> None:
+    axes = Figure().add_subplot()
+    axes.set_xscale("log")
+    plain_numbers(axes.xaxis)
+    axes.set_xlim(limits)
+    labels = [
+        text for at, text in zip(axes.get_xticks(), axes.xaxis.get_ticklabels(), strict=True) if limits[0] <= at <= limits[1]
+    ]
+    assert [text.get_text() for text in labels if text.get_text()] == shown
 
 
 def test_volumes_are_read_in_litres() -> None:

@@ -28,10 +28,11 @@ from pipeline.formats.laz import read_laz, write_laz
 from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.run.simulation import simulate
+from pipeline.view.beside import Pair, beside, border
 from pipeline.view.figures import map_figure, wall_figure
-from pipeline.view.page import clicked, zoom
+from pipeline.view.page import clicked, following, pictures, zoom
 from pipeline.view.results import Item, Layer, Patch, ViewWindow, cut
-from pipeline.view.server import cookie_name, make_app, make_page_server, open_results
+from pipeline.view.server import cookie_name, make_app, make_page_server, open_results, open_second
 from scene.config import parse
 from scene.errors import InputError
 from scene.grid import Grid
@@ -167,6 +168,72 @@ def test_a_diagnosis_in_the_wall_s_own_frame(gap: Path) -> None:
     assert set(points.facts["held out"]) == {"yes", "no"}
     (change,) = results.items("before")
     assert change.facts == {"volume": "0.12 m³"}
+
+
+def test_effects_of_a_diagnosis_are_switched_on_and_off(gap: Path, tmp_path: Path) -> None:
+    """Before 1 mm a metre of x; the first effect takes half of it away, the second 0.3 mm everywhere."""
+    shutil.copytree(gap, tmp_path / "gap")
+    before = read_laz(gap / "before.laz")
+    x = 1e3 * before.extra["residual_m"]
+    parts = {"effect_1_m": 5e-4 * x, "effect_2_m": np.full(len(x), 3e-4)}
+    write_laz(tmp_path / "gap/before.laz", PointCloud(before.points, extra={**before.extra, **parts}))
+    record = json.loads((gap / "gap.json").read_text())
+    write_json(tmp_path / "gap/gap.json", {**record, "effects": [{"name": "tls.wobble"}, {"name": "tls.range_offset"}]})
+    results = open_results(tmp_path / "gap")
+    assert dict(results.steps) == {
+        "before": "before: model as it was",
+        "1": "with tls.wobble alone",
+        "2": "with tls.range_offset alone",
+        "after": "after: with what was named",
+    }
+    layer = results.layers("1")[0]
+    for step, expected in (("1", 0.5 * x), ("2", x - 0.3)):
+        points = results.points(step, layer, None, MANY)
+        assert points is not None
+        assert points.value is not None
+        np.testing.assert_allclose(points.value, expected, atol=1e-6)
+    assert list(open_results(gap).steps) == ["before", "after"]
+
+
+def test_what_stands_beside_begins_at_the_border() -> None:
+    """The right one has cells twice as large, ends sooner and has no data in its last column."""
+    left = Patch(np.arange(10.0), np.arange(4.0)[::-1], np.zeros((4, 10)), np.zeros((4, 10)), np.zeros((4, 10), int), 1)
+    value = np.array([[1.0, 2.0, 3.0, np.nan], [5.0, 6.0, 7.0, np.nan]])
+    right = Patch(np.array([0.5, 2.5, 4.5, 6.5]), np.array([2.5, 0.5]), value, value, np.ones((2, 4), int), 1)
+    assert border(left, 1 / 3) == 3
+    both = beside(left, right, 1 / 3)
+    np.testing.assert_array_equal(both.value[0], [0, 0, 0, 0, 3, 3, np.nan, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(both.value[3], [0, 0, 0, 0, 7, 7, np.nan, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(both.label[0], [0, 0, 0, 0, 1, 1, 1, 1, 0, 0])
+    np.testing.assert_array_equal(beside(left, left, 0.0).value, left.value)
+
+
+def test_two_runs_of_one_wall_stand_side_by_side(run: Path, gap: Path, tmp_path: Path) -> None:
+    first = open_results(run)
+    second = open_second(run, first)
+    pair = Pair(first, second)
+    assert list(pair.choices) == ["own 1", "own 2", "other 1", "other 2"]
+    layer, window = first.layers("1")[0], ViewWindow(2.0, 4.0, 1.0, 3.0)
+    other = pair.patch("other 2", "surface", layer, window, MANY)
+    np.testing.assert_array_equal(other.value, first.patch("2", "surface", layer, window, MANY).value)
+    _, flat, note = pictures(first, "1", "surface", layer, ["surface"], None, window, (pair, "other 2", 0.5))
+    assert note.startswith("Left of the border: run: laser scanner, glendale, epoch 1; right of it: run: ")
+    drawn, plain = np.asarray(flat.data[0].z), np.asarray(pictures(first, "1", "surface", layer, [], None, window)[1].data[0].z)
+    half = drawn.shape[1] // 2
+    np.testing.assert_array_equal(drawn[:, : half - 1], plain[:, : half - 1])
+    assert not np.array_equal(drawn[:, half + 1 :], plain[:, half + 1 :], equal_nan=True)
+    with pytest.raises(InputError, match="allowed: two runs of one wall"):
+        open_second(gap, first)
+    shutil.copytree(run, tmp_path / "moved")
+    record = json.loads((run / "run.json").read_text())
+    record["wall_frame"]["matrix_world_to_wall"][0][3] += 1.0
+    write_json(tmp_path / "moved/run.json", record)
+    with pytest.raises(InputError, match="is of another wall, or in another frame"):
+        open_second(tmp_path / "moved", first)
+
+
+def test_playing_goes_round() -> None:
+    assert [following(["1", "2", "3"], step) for step in "123"] == ["2", "3", "1"]
 
 
 def test_a_tile_as_relief(tiles: Path) -> None:

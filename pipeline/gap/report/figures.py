@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
@@ -20,6 +20,7 @@ from pipeline.gap.report.in_words import with_unit
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.report.figures import COLOURS, dress_map
 from pipeline.report.pictures import png
+from pipeline.report.plain_text import power_of_ten
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
 
@@ -138,7 +139,7 @@ def _log_axis(panel: Axes) -> None:
     panel.set_xscale("log")
     low, high = panel.get_xlim()
     panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < _MANY * low else (1.0,)))
-    panel.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
     panel.xaxis.set_minor_formatter(NullFormatter())
 
 

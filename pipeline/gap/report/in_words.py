@@ -8,7 +8,6 @@ from typing import Any
 from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verdict import closing, in_a_sentence, left_over
-from pipeline.gap.naming.verify import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.other.spread import SpreadTried
 from pipeline.gap.report.quantities import with_std
@@ -47,19 +46,37 @@ def title(found: GapDiagnosis) -> str:
 
 def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     """What was compared, what was found, how far the gap closes. rows: as `where` gives them."""
+    return " ".join(each for each in (*_findings(found, rows), gap_in_words(found), *_asides(found)) if each)
+
+
+def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
+    """The same for a reader who wants to know what is the matter: scores stand elsewhere."""
+    return " ".join(each for each in (*_findings(found, rows), _closed(found), *_asides(found)) if each)
+
+
+def _findings(found: GapDiagnosis, rows: list[dict[str, Any]]) -> list[str]:
     parts = [f"{len(found.residuals):,} {_INSTRUMENTS[found.residuals.sensor]} were compared with what the model predicts."]
     parts.append(in_a_sentence(found.verdict, found.effects, found.evidence))
     parts += [_effect(effect) for effect in found.effects]
-    parts += [each for each in (left_over(found.effects, found.evidence), _shown_most(found, rows)) if each]
-    if found.gap is not None:
-        parts.append(_gap(found.gap, found.mended))
+    return [*parts, left_over(found.effects, found.evidence), _shown_most(found, rows)]
+
+
+def _closed(found: GapDiagnosis) -> str:
+    """How much of the gap closes, where something was named; the scores are evidence."""
+    if found.gap is None or found.gap.closed is None or not found.mended:
+        return ""
+    return f"With it in the model {closing(found.gap, found.mended)}, on rock that no step had used."
+
+
+def _asides(found: GapDiagnosis) -> list[str]:
+    parts = []
     if found.changes:
         volume = sum(abs(change.volume_m3) for change in found.changes)
         regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
         parts.append(f"{regions} where the rock itself moved ({volume:.2g} m\N{SUPERSCRIPT THREE} in all) were set aside.")
     if found.remaining.get("note"):
         parts.append(f"Note: {found.remaining['note']}.")
-    return " ".join(parts)
+    return parts
 
 
 def _shown_most(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
@@ -170,7 +187,11 @@ def _described(effect: Named) -> str:
     return "is in the directions from which nothing returns" if lost else "is larger than the model says"
 
 
-def _gap(gap: Gap, mended: bool) -> str:
+def gap_in_words(found: GapDiagnosis) -> str:
+    """The scores before and after, and what the model's own noise leaves; "" where they were not measured."""
+    if found.gap is None:
+        return ""
+    gap, mended = found.gap, found.mended
     factor, unit = gap.shown
     before, after, floor = (f"{factor * value:.3f} {unit}" for value in (gap.before, gap.after, gap.floor))
     scores = f"{before} before, {after} after" if mended else f"{before} before"

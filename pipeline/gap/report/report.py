@@ -15,13 +15,16 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.decisions import deciding
 from pipeline.gap.naming.verdict import closing, in_a_sentence
 from pipeline.gap.naming.workflow import GapDiagnosis
+from pipeline.gap.report.advice import advice, page_of
+from pipeline.gap.report.contributions import contributions
 from pipeline.gap.report.covariate_ranking import steady, where
 from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
 from pipeline.gap.report.in_words import (
+    answer,
     decimal,
+    gap_in_words,
     number,
     outcome,
-    paragraph,
     rounded,
     shown,
     spread_outcome,
@@ -57,9 +60,11 @@ def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
 def write(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
     """Write all files of a diagnosis into `out`, once all pictures are drawn; returns report.html.
 
-    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one.
+    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one; of
+    several effects before.laz holds what each takes away by itself, `effect_1_m` ..., in the order of gap.json.
     """
     with deciding(found.decisions):
+        parts = contributions(found, measurement) if len(found.effects) > 1 else np.empty((0, len(found.before)))
         pictures = _pictures(found)
         page = _page(found, pictures)
     write_json(out / "gap.json", to_dict(found, measurement))
@@ -67,6 +72,8 @@ def write(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
     points = measurement.frame.to_world(measurement.cloud.points[found.residuals.index])
     for name, residual in (("before", found.before), ("after", found.after)):
         extra: dict[str, Any] = {"residual_m": residual * found.residuals.depth_m, "held_out": found.held_out.astype(np.uint8)}
+        if name == "before":
+            extra |= {f"effect_{number}_m": part * found.residuals.depth_m for number, part in enumerate(parts, start=1)}
         write_laz(out / f"{name}.laz", PointCloud(points, extra=extra))
     for file, png in pictures.items():
         with writing(out / file) as temporary:
@@ -127,7 +134,10 @@ def _page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
     return template("gap/report/report.html.jinja").render(
         found=found,
         title=title(found),
-        paragraph=paragraph(found, rows),
+        answer=answer(found, rows),
+        scores=gap_in_words(found),
+        advice=advice,
+        page_of=page_of,
         pictures=pictures,
         where=rows,
         tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],

@@ -1,0 +1,112 @@
+"""`scarpsim export`: results in the forms that others take."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from pipeline.cli.answer import Answer
+from pipeline.cli.parser import add_output_options, at_least, between, one_of
+from scene.errors import InputError
+
+SUMMARY = "make pictures, animations, glTF, YOLO sets or checksummed lists of results"
+EXAMPLE = """  scarpsim export runs/my_run picture --epoch 1 --out wall.png
+  scarpsim export runs/my_run gltf --out wall.glb
+  scarpsim export runs/my_run epochs --out epochs.gif
+  scarpsim export sets/small yolo --out sets/small_yolo
+  scarpsim export runs/my_run package"""
+_SUFFIXES = {"picture": ".png", "gltf": ".glb", "epochs": ".gif", "scan": ".gif"}
+"""What is made of a run, and the ending of its file."""
+FORMS = (*_SUFFIXES, "yolo", "package")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run; of yolo a data set; of package any result")
+    parser.add_argument(
+        "form",
+        type=one_of(*FORMS),
+        metavar="FORM",
+        help="picture: the wall in 3D (PNG); gltf: wall and niches with the difference as colours (.glb); epochs, scan: animated "
+        "GIF of the epochs, or of a laser scan coming in; yolo: a data set for YOLO; package: datapackage.json with checksums",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="PATH", help="the file, of yolo the folder (default: beside what is exported)"
+    )
+    parser.add_argument("--epoch", type=at_least(0, at_most=9999), metavar="N", help="of picture, gltf, scan (default: 1)")
+    parser.add_argument("--width", type=at_least(320, at_most=4000), metavar="PX", help="of picture (default: 1280)")
+    parser.add_argument(
+        "--limit-m",
+        type=between(1e-4, 100),
+        metavar="M",
+        help="yolo: difference at the ends of the grey values (default: 6 sigma)",
+    )
+    add_output_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    form = arguments.form
+    _check_options(arguments)
+    if form == "yolo":
+        return _yolo(arguments)
+    if form == "package":
+        from pipeline.export.package import PACKAGE_FILE, save_package
+
+        path = arguments.out or arguments.folder / PACKAGE_FILE
+        count = save_package(arguments.folder, path)
+        return Answer(f"{count:,} files: {path}", lambda: {"file": str(path), "files": count})
+    return _of_a_run(arguments)
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """Raise InputError for an option of another form, and a file of another ending."""
+    allowed = {"epoch": ("picture", "gltf", "scan"), "width": ("picture",), "limit_m": ("yolo",)}
+    for option, forms in allowed.items():
+        if getattr(arguments, option) is not None and arguments.form not in forms:
+            raise InputError(f"goes with {', '.join(forms)}", where=f"--{option.replace('_', '-')}", remedy="leave it out")
+    suffix = _SUFFIXES.get(arguments.form)
+    if suffix and arguments.out is not None and arguments.out.suffix.lower() != suffix:
+        raise InputError(f"got '{arguments.out.suffix}'", where="--out", allowed=suffix)
+
+
+def _yolo(arguments: argparse.Namespace) -> Answer:
+    from pipeline.export.yolo import save_yolo, summary, to_dict
+    from pipeline.formats.atomic import empty_folder
+    from pipeline.report.progress import shown_progress
+
+    out = empty_folder(arguments.out or arguments.folder.with_name(f"{arguments.folder.resolve().name}_yolo"))
+    with shown_progress(quiet=arguments.quiet) as progress:
+        made = save_yolo(arguments.folder, out, arguments.limit_m, progress)
+    return Answer(summary(made), lambda: to_dict(made))
+
+
+def _of_a_run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.export.exported_run import ExportedRun
+    from pipeline.report.progress import shown_progress
+
+    run, form, number = ExportedRun(arguments.folder), arguments.form, 1 if arguments.epoch is None else arguments.epoch
+    if number > run.last or (number == 0 and form == "gltf"):
+        raise InputError(f"epoch {number} is not there", where="--epoch", allowed=f"{int(form == 'gltf')} to {run.last}")
+    path = arguments.out or arguments.folder / f"{form}{'' if form == 'epochs' else f'_{number:03d}'}{_SUFFIXES[form]}"
+    with shown_progress(quiet=arguments.quiet) as progress:
+        _save(form, run, number, path, arguments.width or 1280, progress)
+    return Answer(str(path), lambda: {"file": str(path), "bytes": path.stat().st_size})
+
+
+def _save(form: str, run: Any, number: int, path: Path, width: int, progress: Any) -> None:
+    if form == "gltf":
+        from pipeline.export.gltf import save_gltf
+
+        with progress.stage("surface"):
+            save_gltf(run, number, path)
+        return
+    from pipeline.export import pictures
+
+    if form == "epochs":
+        pictures.save_epochs(run, path, progress)
+        return
+    with progress.stage(form):
+        if form == "scan":
+            pictures.save_scan(run, number, path)
+        else:
+            pictures.save_picture(run, number, path, width)

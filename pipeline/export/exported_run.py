@@ -1,0 +1,67 @@
+"""A run's folder as it is exported: surfaces, maps, points and what fell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.geotiff import read_geotiff
+from pipeline.formats.laz import read_laz
+from pipeline.formats.ply import read_ply
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.result_records import RUN_FILE, read_run
+from pipeline.report.figures import SCALE_SIGMAS
+from scene.errors import InputError
+from scene.grid import Grid
+from scene.mesh import TriangleMesh
+
+
+@dataclass(frozen=True)
+class ExportedRun:
+    """A run's folder. Raises InputError, here and where its files are read, for what is no finished run or was not written."""
+
+    folder: Path
+
+    @cached_property
+    def record(self) -> dict[str, Any]:
+        """run.json."""
+        found = read_run(self.folder / RUN_FILE, "go on with it by simulate --resume")
+        if len(found.get("epochs", [])) < 2:
+            raise InputError("holds no finished epoch", where=str(self.folder), remedy="go on with it by simulate --resume")
+        return found
+
+    @property
+    def last(self) -> int:
+        """Number of the last epoch."""
+        return len(self.record["epochs"]) - 1
+
+    def limit_m(self, number: int) -> float:
+        """Where the colours of an epoch's map end in the report."""
+        return float(SCALE_SIGMAS * self.record["epochs"][number]["statistics"]["sigma_m"])
+
+    def blocks(self, number: int) -> list[dict[str, Any]]:
+        """What fell in an epoch, the largest first."""
+        return sorted(self.record["epochs"][number]["blocks"], key=lambda block: -block["volume_m3"])
+
+    def surface(self, number: int) -> TriangleMesh:
+        """The measured surface of an epoch, wall frame."""
+        return read_ply(self._file(number, "surface.ply"))
+
+    def points(self, number: int) -> PointCloud:
+        """The sensor's points of an epoch, wall frame."""
+        return read_laz(self._file(number, "points.laz"))
+
+    def difference(self, number: int) -> tuple[NDArray[np.float32], Grid]:
+        """(h, w) reference minus epoch, m, and its grid."""
+        return read_geotiff(self.folder / f"difference_{number:03d}.tif")
+
+    def _file(self, number: int, name: str) -> Path:
+        path = self.folder / f"epoch_{number:03d}" / name
+        if not path.is_file():
+            raise InputError(f"the run did not write {name}", where=str(path.parent), remedy="see `products` in the config")
+        return path

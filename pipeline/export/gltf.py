@@ -1,0 +1,26 @@
+"""A run's wall and the niches of its blocks as glTF, for slides and web pages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.export.exported_run import ExportedRun
+from pipeline.export.perspective import colours_of, difference_at
+from pipeline.formats.gltf import GltfPart, write_gltf
+from scene.mesh import WALL, TriangleMesh
+
+
+def save_gltf(run: ExportedRun, number: int, path: Path) -> None:
+    """Write the measured surface as .glb: the wall, and the niche of each block as a part of its own (`block_12`), all coloured
+    by the difference as the report's map is, grey without data. Raises InputError where the run wrote no surface."""
+    surface, (values, grid) = run.surface(number), run.difference(number)
+    colours = colours_of(difference_at(surface.vertices, values, grid), run.limit_m(number))
+    label = np.full(len(surface.faces), WALL) if surface.face_block is None else surface.face_block
+    parts = []
+    for block in np.unique(label).tolist():
+        vertices, faces = np.unique(surface.faces[label == block], return_inverse=True)
+        mesh = TriangleMesh(surface.vertices[vertices], faces.reshape(-1, 3).astype(np.int32))
+        parts.append(GltfPart("wall" if block == WALL else f"block_{block}", mesh, colours[vertices]))
+    write_gltf(path, parts)

@@ -1,0 +1,54 @@
+"""A list of a result folder's files with checksums, as a Data Package (datapackage.org), which archives and catalogues read."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from pipeline.formats.atomic import write_json
+from pipeline.formats.checksum import sha256
+from scene.errors import InputError
+
+PACKAGE_FILE = "datapackage.json"
+_PROFILE = "https://datapackage.org/profiles/2.0/datapackage.json"
+_MEDIA = {
+    ".tif": "image/tiff; application=geotiff", ".png": "image/png", ".json": "application/json", ".html": "text/html",
+    ".laz": "application/vnd.laszip", ".csv": "text/csv", ".yaml": "application/yaml", ".md": "text/markdown",
+    ".ply": "model/ply", ".txt": "text/plain", ".qml": "application/xml",
+}  # fmt: skip
+
+
+def package(folder: Path) -> dict[str, Any]:
+    """The package of all files in a folder but hidden ones and itself, by path: size, bytes, and SHA-256.
+
+    Raises InputError where there is nothing to list.
+    """
+    if not folder.is_dir():
+        raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_listed(path.relative_to(folder))]
+    if not files:
+        raise InputError("holds no file", where=str(folder), remedy="give the folder that a command filled")
+    return {"$schema": _PROFILE, "name": _slug(folder.resolve().name), "resources": [_resource(folder, path) for path in files]}
+
+
+def save_package(folder: Path, path: Path) -> int:
+    """Write the package; returns how many files it lists."""
+    made = package(folder)
+    write_json(path, made)
+    return len(made["resources"])
+
+
+def _is_listed(path: Path) -> bool:
+    return path.name != PACKAGE_FILE and not any(part.startswith(".") for part in path.parts)
+
+
+def _resource(folder: Path, path: Path) -> dict[str, Any]:
+    name = path.relative_to(folder).as_posix()
+    known = {"mediatype": _MEDIA[path.suffix]} if path.suffix in _MEDIA else {}
+    return {"name": _slug(name), "path": name, **known, "bytes": path.stat().st_size, "hash": f"sha256:{sha256(path)}"}
+
+
+def _slug(name: str) -> str:
+    """A name of small letters, digits, dots, hyphens and underscores."""
+    return re.sub(r"[^a-z0-9._-]+", "-", name.lower()).strip("-") or "result"

@@ -1,0 +1,108 @@
+"""A wall as a camera in front of it sees it: pictures for slides and frames of animations, ray traced on this machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.report.figures import COLOURS, NO_DATA
+from scene.grid import Grid
+from scene.mesh import FloatArray, TriangleMesh
+from scene.raycast import RayCaster
+
+_FROM = np.array([-0.42, -0.12, 1.0])
+"""Towards the camera, wall frame: from the left, a little from below."""
+_LIGHT = np.array([-0.45, 0.55, 0.7])
+_HALF_VIEW = np.tan(np.radians(16.0))
+"""Half of the field of view across; a long lens keeps the wall's lines straight."""
+_MARGIN = 1.04
+_OVERSAMPLED = 2
+_PLACES = 200_000
+"""That the picture is made to hold, at least where there are more."""
+_ROCK = np.array([0.80, 0.77, 0.73])
+_DARKEST = 0.25
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class PerspectiveView:
+    """A camera. position: (3,) m, wall frame; axes: (3, 3) right, down, forward as rows; width, height: px; focal_px."""
+
+    position: FloatArray
+    axes: FloatArray
+    width: int
+    height: int
+    focal_px: float
+
+    @classmethod
+    def on(cls, places: FloatArray, width: int = 1280) -> PerspectiveView:
+        """The camera that has all of `places`, (n, 3) m, in its picture of `width` px."""
+        forward = -_FROM / np.linalg.norm(_FROM)
+        right = np.cross(forward, [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(forward, right), forward])
+        own = places[:: max(1, len(places) // _PLACES)] @ axes.T
+        middle = (own.min(axis=0) + own.max(axis=0)) / 2
+        across, down = _MARGIN * np.abs(own - middle)[:, :2].T
+        ahead = own[:, 2] - middle[2]
+        distance = float((across / _HALF_VIEW - ahead).max())
+        focal_px = width / 2 / _HALF_VIEW
+        height = 2 * int(np.ceil(float((down / (distance + ahead)).max()) * focal_px))
+        return cls(middle @ axes - distance * forward, axes, width, max(height, 2), focal_px)
+
+    def rays(self, times: int) -> FloatArray:
+        """(h * times * w * times, 3) directions through the pixels' parts, row by row."""
+        columns, rows = np.meshgrid(*((np.arange(size * times) + 0.5) / times for size in (self.width, self.height)))
+        right, down = columns - self.width / 2, rows - self.height / 2
+        own = np.stack([right, down, np.full_like(right, self.focal_px)], axis=-1).reshape(-1, 3) / self.focal_px
+        return np.asarray(own @ self.axes)
+
+    def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) column and row of points (n, 3), px from the top-left corner, and (n,) how far ahead they are, m."""
+        own = (points - self.position) @ self.axes.T
+        ahead = own[:, 2]
+        place = own[:, :2] / ahead[:, None] * self.focal_px + np.array([self.width, self.height]) / 2
+        return place, ahead
+
+
+def draw_wall(
+    view: PerspectiveView, mesh: TriangleMesh, difference: NDArray[np.floating] | None, grid: Grid | None, limit_m: float
+) -> Image:
+    """(h, w, 3) the mesh (wall frame) lit from the upper left, on white.
+
+    difference: (h, w) of `grid`, m, or None for bare rock: red where rock is missing, colours end at +-`limit_m`, grey: no data.
+    """
+    caster, rays = RayCaster(mesh), view.rays(_OVERSAMPLED)
+    distance, face = caster.cast(view.position, rays)
+    met = face >= 0
+    normals = mesh.vertex_normals()[mesh.faces[face[met]]].sum(axis=1)
+    lit = normals @ (_LIGHT / np.linalg.norm(_LIGHT)) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    colour = np.broadcast_to(_ROCK, (int(met.sum()), 3))
+    if difference is not None and grid is not None:
+        colour = _colours(view.position + distance[met, None] * rays[met], difference, grid, limit_m)
+    drawn = np.ones((len(rays), 3))
+    drawn[met] = colour * np.clip(_DARKEST + (1 - _DARKEST) * lit, _DARKEST, 1.0)[:, None]
+    fine = drawn.reshape(view.height * _OVERSAMPLED, view.width * _OVERSAMPLED, 3).astype(np.float32)
+    small = cv2.resize(fine, (view.width, view.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(np.round(255 * small), dtype=np.uint8)
+
+
+def difference_at(places: FloatArray, difference: NDArray[np.floating], grid: Grid) -> NDArray[np.floating]:
+    """(n,) the map's value at places (n, 2 or 3), m; NaN outside of it."""
+    columns, rows = np.floor(grid.columns(places[:, 0])).astype(int), np.floor(grid.rows(places[:, 1])).astype(int)
+    inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
+    values = np.full(len(places), np.nan)
+    values[inside] = difference[rows[inside], columns[inside]]
+    return values
+
+
+def colours_of(values: NDArray[np.floating], limit_m: float) -> NDArray[np.uint8]:
+    """(n, 4) RGBA of differences, m, as the reports' maps have them."""
+    return np.asarray(COLOURS.with_extremes(bad=NO_DATA)((values / limit_m + 1) / 2, bytes=True))
+
+
+def _colours(places: FloatArray, difference: NDArray[np.floating], grid: Grid, limit_m: float) -> FloatArray:
+    return np.asarray(colours_of(difference_at(places, difference, grid), limit_m)[:, :3] / 255.0)

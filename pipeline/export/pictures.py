@@ -1,0 +1,155 @@
+"""A run's wall in perspective: an epoch as a picture, all epochs and the scan as animations."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from PIL import Image
+
+from pipeline.export.exported_run import ExportedRun
+from pipeline.export.perspective import Image as Pixels
+from pipeline.export.perspective import PerspectiveView, draw_wall
+from pipeline.formats.atomic import write_bytes, writing
+from pipeline.report.figures import COLOURS, DIFFERENCE_LABEL, SCALE_SIGMAS, SEQUENTIAL
+from pipeline.report.page import litres, millimetres
+from pipeline.report.plain_text import plain_text
+from pipeline.report.progress import Progress
+from scene.errors import InputError
+from scene.mesh import FloatArray
+
+_DPI = 100
+_TITLE_PX, _BAR_PX = 46, 78
+_MOST_NUMBERED = 60
+_EPOCH_MS, _SCAN_MS, _LAST_MS = 1200, 80, 2500
+_SCAN_FRAMES, _SCAN_POINTS = 48, 400_000
+_ANIMATED_PX, _COLOURS_OF_GIF = 900, 96
+_NIGHT, _BEAM = 26, np.array([255, 150, 30], dtype=np.uint8)
+
+
+def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -> None:
+    """Write an epoch's wall as PNG, coloured by the difference, its largest blocks numbered as in the report."""
+    write_bytes(path, _png(_epoch_picture(run, number, _view(run, width), _limit(run, number))))
+
+
+def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
+    """Write the epochs, the reference first, as an animated GIF on one scale of colours."""
+    numbers = range(1, run.last + 1)
+    view, limit = _view(run, _ANIMATED_PX), max(run.limit_m(number) for number in numbers)
+    with progress.stage("reference"):
+        frames = [_epoch_picture(run, 0, view, limit)]
+    for number in numbers:
+        with progress.stage(f"epoch {number}"):
+            frames.append(_epoch_picture(run, number, view, limit))
+    _write_gif(path, frames, [_EPOCH_MS] * len(numbers) + [_LAST_MS])
+
+
+def save_scan(run: ExportedRun, number: int, path: Path) -> None:
+    """Write how an epoch's points came in, line by line, as an animated GIF, coloured by how far they stand out.
+
+    Raises InputError for a run of a stereo pair, which has all of its points at once.
+    """
+    if run.record["sensor"] != "tls":
+        raise InputError("is of a stereo pair", where=str(run.folder), allowed="a run of a laser scanner")
+    cloud = run.points(number)
+    count, clock = len(cloud.points), np.zeros(len(cloud.points)) if cloud.gps_time is None else cloud.gps_time
+    order = np.argsort(clock, kind="stable")[:: max(1, count // _SCAN_POINTS)]
+    places, time = cloud.points[order], clock[order]
+    view = PerspectiveView.on(places, _ANIMATED_PX)
+    ends = np.linspace(0, len(places), _SCAN_FRAMES + 1).astype(int)[1:]
+    frames = []
+    for start, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
+        came = f"{end * count / len(places) / 1e6:.2f} of {count / 1e6:.2f} million points"
+        title = f"{came}, {time[end - 1] - time[0]:.1f} s"
+        frames.append(_framed(_cloud_pixels(view, places, start, end), title, None))
+    frames.append(_framed(_cloud_pixels(view, places, len(places), len(places)), title, None))
+    _write_gif(path, frames, [_SCAN_MS] * _SCAN_FRAMES + [_LAST_MS])
+
+
+def _cloud_pixels(view: PerspectiveView, places: FloatArray, start: int, end: int) -> Pixels:
+    """(h, w, 3) the points up to `end`, nearer ones over farther ones; those from `start` on as the beam lights them."""
+    low, high = np.quantile(places[:, 2], [0.02, 0.98])
+    shown = places[:end]
+    at, ahead = view.project(shown)
+    column, row = np.floor(at).astype(int).T
+    colours = SEQUENTIAL(np.clip((shown[:, 2] - low) / max(high - low, 1e-9), 0, 1), bytes=True)[:, :3]
+    colours[start:] = _BEAM
+    kept = np.flatnonzero((column >= 0) & (column < view.width) & (row >= 0) & (row < view.height))
+    kept = kept[np.argsort(-ahead[kept], kind="stable")]
+    pixels = np.full((view.height, view.width, 3), _NIGHT, dtype=np.uint8)
+    pixels[row[kept], column[kept]] = colours[kept]
+    return pixels
+
+
+def _view(run: ExportedRun, width: int) -> PerspectiveView:
+    return PerspectiveView.on(run.surface(0).vertices, width)
+
+
+def _limit(run: ExportedRun, number: int) -> float:
+    return run.limit_m(max(number, 1))
+
+
+def _epoch_picture(run: ExportedRun, number: int, view: PerspectiveView, limit: float) -> Image.Image:
+    if number == 0:
+        return _framed(draw_wall(view, run.surface(0), None, None, limit), "Reference: before rocks fall", limit)
+    values, grid = run.difference(number)
+    blocks = run.blocks(number)
+    volume, noise = sum(block["volume_m3"] for block in blocks), millimetres(run.limit_m(number) / SCALE_SIGMAS)
+    title = f"Epoch {number}: {len(blocks)} blocks of {litres(volume)} l fell; noise {noise} (NMAD)"
+    labels = {block["label"]: np.array(block["position_m"]) for block in blocks[:_MOST_NUMBERED]}
+    pixels = draw_wall(view, run.surface(number), values, grid, limit)
+    return _framed(pixels, title, limit, {label: view.project(place[None])[0][0] for label, place in labels.items()})
+
+
+def _framed(pixels: Pixels, title: str, limit: float | None, numbers: dict[int, FloatArray] | None = None) -> Image.Image:
+    """The pixels with a title above and, with a limit in m, the scale of colours beneath."""
+    height, width, _ = pixels.shape
+    bar = 0 if limit is None else _BAR_PX
+    whole = height + _TITLE_PX + bar
+    figure = Figure(figsize=(width / _DPI, whole / _DPI), dpi=_DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, bar / whole, 1, height / whole))
+    axes.imshow(pixels, interpolation="nearest", aspect="auto", extent=(0, width, height, 0))
+    axes.set_axis_off()
+    for label, (column, row) in (numbers or {}).items():
+        text = axes.annotate(f"{label}", (column, row), (6, 6), textcoords="offset points", fontsize=8, annotation_clip=True)
+        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+    figure.text(0.5, 1 - 0.5 * _TITLE_PX / whole, title, ha="center", va="center", fontsize=11)
+    if limit is not None:
+        place = figure.add_axes((0.25, 0.62 * bar / whole, 0.5, 0.16 * bar / whole))
+        scale = ScalarMappable(Normalize(-1e3 * limit, 1e3 * limit), COLOURS)
+        figure.colorbar(scale, cax=place, orientation="horizontal", extend="both").set_label(DIFFERENCE_LABEL, fontsize=9)
+        place.tick_params(labelsize=8)
+    with plain_text(figure):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    return Image.open(buffer).convert("RGB")
+
+
+def _png(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def _write_gif(path: Path, frames: Sequence[Image.Image], milliseconds: list[int]) -> None:
+    """One palette for all frames, so that what stays looks the same throughout."""
+    sample = Image.new("RGB", (frames[0].width, sum(frame.height for frame in (frames[0], frames[-1]))))
+    sample.paste(frames[0], (0, 0))
+    sample.paste(frames[-1], (0, frames[0].height))
+    palette = sample.quantize(_COLOURS_OF_GIF, Image.Quantize.MEDIANCUT)
+    drawn = list(_on_palette(frames, palette))
+    with writing(path) as temporary, temporary.open("wb") as file:
+        drawn[0].save(file, "GIF", save_all=True, append_images=drawn[1:], duration=milliseconds, loop=0, optimize=True)
+
+
+def _on_palette(frames: Sequence[Image.Image], palette: Image.Image) -> Iterator[Image.Image]:
+    for frame in frames:
+        yield frame.quantize(palette=palette, dither=Image.Dither.NONE)

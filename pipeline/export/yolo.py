@@ -1,0 +1,124 @@
+"""A data set in the form that YOLO programs train on: 8-bit pictures, a text file of outlines each, data.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pipeline.dataset.loaders import Sample, Tiles
+from pipeline.dataset.plan import SPLITS
+from pipeline.formats.atomic import filling, write_bytes, write_text
+from pipeline.report.progress import Progress
+from scene.errors import InputError
+
+_ZERO, _STEPS = 128, 127
+_FINER = 4
+"""Parts of a pixel in which outlines run around masks: they lie an eighth of a pixel inside of them."""
+_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class YoloSet:
+    """What was written. limit_m: the difference at the ends of the grey values; images, blocks: by split."""
+
+    folder: Path
+    limit_m: float
+    images: dict[str, int]
+    blocks: dict[str, int]
+
+
+def save_yolo(folder: Path, out: Path, limit_m: float | None, progress: Progress) -> YoloSet:
+    """Write the splits of a set as Ultralytics' YOLO reads them: images/SPLIT/*.png, labels/SPLIT/*.txt, data.yaml.
+
+    Grey values: 128 + 127 * difference / limit_m, cut off at 1 and 255, 0 without data; limit_m: none: six times the median
+    noise of the set's images. A label's line is class 0 and the outline of a block, in shares of width and height; detectors
+    make its box of it. Raises InputError where the folder holds no split.
+    """
+    splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
+    if not splits:
+        raise InputError("holds no split of a data set", where=str(folder), allowed=f"a folder with {', '.join(SPLITS)}")
+    sets: dict[str, Tiles] = {split: Tiles(folder / split) for split in splits}
+    limit = limit_m or _usual_limit(sets, folder)
+    blocks: dict[str, int] = {}
+    with filling(out) as into:
+        for split, tiles in sets.items():
+            with progress.stage(split):
+                blocks[split] = sum(_write(into, split, sample, limit) for sample in tiles)
+        described: dict[str, Any] = {**{split: f"images/{split}" for split in splits}, "names": {0: "block"}}
+        head = f"# Difference maps in grey values: 128 + 127 * difference / {limit:.6g} m, 0 without data. Made by scarpsim.\n"
+        write_text(into / "data.yaml", head + yaml.safe_dump(described, sort_keys=False))
+    return YoloSet(out, limit, {split: len(tiles) for split, tiles in sets.items()}, blocks)
+
+
+def _usual_limit(sets: dict[str, Tiles], folder: Path) -> float:
+    noise = [record["noise_sigma_m"] for tiles in sets.values() for record in tiles.records if record.get("noise_sigma_m")]
+    if not noise:
+        raise InputError(
+            "says nothing of its images' noise", where=str(folder), remedy="give the grey values' end with --limit-m"
+        )
+    return _SIGMAS * float(np.median(noise))
+
+
+def _write(out: Path, split: str, sample: Sample, limit: float) -> int:
+    """Write a tile's picture and labels; returns how many blocks it shows."""
+    name = Path(sample.record["file_name"]).with_suffix("").as_posix().replace("/", "_")
+    _, encoded = cv2.imencode(".png", grey_values(sample.image, sample.valid, limit))
+    write_bytes(out / "images" / split / f"{name}.png", encoded.tobytes())
+    outlines = [outline(mask) for mask in sample.masks]
+    write_text(out / "labels" / split / f"{name}.txt", "".join(_line(each, sample.valid.shape) for each in outlines if len(each)))
+    return sum(len(each) > 0 for each in outlines)
+
+
+def grey_values(image: NDArray[np.float32], valid: NDArray[np.bool_], limit_m: float) -> NDArray[np.uint8]:
+    """(h, w) a difference map, m, in 8 bits: 128 is no change, 0 no data."""
+    grey = np.clip(np.round(_ZERO + _STEPS * image / limit_m), 1, 255)
+    return np.where(valid, grey, 0).astype(np.uint8)
+
+
+def outline(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(k, 2) x and y, px from the top-left corner, around a mask (h, w); parts are joined by lines there and back."""
+    fine = np.kron(mask.astype(np.uint8), np.ones((_FINER, _FINER), np.uint8))
+    found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    parts = [(part.reshape(-1, 2) + 0.5) / _FINER for part in found]
+    if not parts:
+        return np.empty((0, 2))
+    joined = parts[0]
+    for part in parts[1:]:
+        joined = _joined(joined, part)
+    return np.asarray(joined)
+
+
+def _joined(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """One outline that goes round the second where it comes nearest to it."""
+    apart = np.linalg.norm(first[:, None] - second[None], axis=2)
+    here, there = (int(place) for place in np.unravel_index(np.argmin(apart), apart.shape))
+    around = np.roll(second, -there, axis=0)
+    return np.concatenate([first[: here + 1], around, around[:1], first[here:]])
+
+
+def _line(points: NDArray[np.float64], shape: tuple[int, ...]) -> str:
+    shares = points / np.array([shape[1], shape[0]])
+    return f"0 {' '.join(f'{value:.6f}' for value in shares.ravel())}\n"
+
+
+def summary(made: YoloSet) -> str:
+    """What was written, in lines."""
+    return "\n".join(_sentences(made))
+
+
+def _sentences(made: YoloSet) -> Iterator[str]:
+    for split, images in made.images.items():
+        yield f"{split}: {images:,} images, {made.blocks[split]:,} blocks"
+    yield f"grey values end at {1e3 * made.limit_m:.3g} mm; train with {made.folder / 'data.yaml'}"
+
+
+def to_dict(made: YoloSet) -> dict[str, Any]:
+    """As --json prints it."""
+    return {"folder": str(made.folder), "limit_m": made.limit_m, "images": made.images, "blocks": made.blocks}

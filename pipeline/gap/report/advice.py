@@ -1,0 +1,38 @@
+"""What a named effect means, and what to do about it: a report's words for a reader who has to act on a name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.gap.naming.entries import Named
+
+_ROOT = Path(__file__).parents[3]
+
+
+@dataclass(frozen=True)
+class Advice:
+    """means: what it says of the instrument or the measurement; act: what to do. Whole sentences."""
+
+    means: str
+    act: str
+
+
+def advice(named: Named) -> Advice:
+    """Of an effect what its class says; of one that says nothing its docstring; of an empirical term general words."""
+    if named.kind == "empirical":
+        return Advice(
+            "Something that the catalogue does not hold: the term describes its pattern and says nothing of its cause.",
+            "Look at where it shows below, think of what the instrument does there, and measure so that it would move: another "
+            "station, another time, the second face. Simulations with model_after.yaml have the pattern meanwhile.",
+        )
+    effect = named.effect
+    first = " ".join((effect.__doc__ or "").strip().partition("\n\n")[0].split())
+    return Advice(effect.means or first, effect.act or "Simulate with model_after.yaml, and ask whoever wrote the effect.")
+
+
+def page_of(name: str) -> str:
+    """Address of a page of the documentation, by its path without ending such as `effects/tls.wobble`, as a file on this machine:
+    of the site where `make docs` has built it, else the text; "" where the documentation is not installed."""
+    pages = _ROOT / "site" / f"{name}.html", _ROOT / "docs" / f"{name}.md"
+    return next((page.as_uri() for page in pages if page.is_file()), "")

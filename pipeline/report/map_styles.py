@@ -1,0 +1,35 @@
+"""The colours of the reports as QGIS styles beside the maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_hex
+from numpy.typing import NDArray
+
+from pipeline.formats.qgis_style import Stop, write_style
+from pipeline.report.figures import COLOURS, SEQUENTIAL
+
+_STEPS = 12
+
+
+def difference_style(raster: Path, limit_m: float) -> None:
+    """Of a map about zero, m: red where rock is missing, colours end at +-`limit_m`, the legend is in mm."""
+    _write(raster, COLOURS, -limit_m, limit_m, lambda value: f"{1e3 * value:+.3g} mm")
+
+
+def quantity_style(raster: Path, values: NDArray[np.floating], unit: str, factor: float = 1.0) -> None:
+    """Of any other map, over the 1 to 99 % quantiles of its `values`; factor: from them to `unit`, in which the legend is."""
+    known = values[np.isfinite(values)]
+    low, high = np.quantile(known, [0.01, 0.99]).tolist() if known.size else (0.0, 1.0)
+    high = high if high > low else low + max(abs(low), 1.0) * 1e-3
+    _write(raster, SEQUENTIAL, low, high, lambda value: f"{factor * value:.4g} {unit}".strip())
+
+
+def _write(raster: Path, colours: Any, low: float, high: float, label: Callable[[float], str]) -> None:
+    places = np.linspace(0.0, 1.0, _STEPS + 1).tolist()
+    values = [low + place * (high - low) for place in places]
+    write_style(raster, [Stop(value, to_hex(colours(place)), label(value)) for place, value in zip(places, values, strict=True)])

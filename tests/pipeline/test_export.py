@@ -1,0 +1,186 @@
+"""`scarpsim export`: what is made of a run or a set shows what is in it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from PIL import Image
+
+from pipeline.change.annotate import BLOCK_CATEGORY, run_length_encoding
+from pipeline.cli.main import main
+from pipeline.config.simulation import SimulationConfig
+from pipeline.export import pictures
+from pipeline.export.perspective import PerspectiveView, draw_wall
+from pipeline.export.yolo import grey_values, outline
+from pipeline.formats.atomic import write_json
+from pipeline.formats.geotiff import write_geotiff
+from pipeline.formats.ply import read_ply
+from pipeline.run.simulation import simulate
+from scene.config import parse
+from scene.grid import Grid
+from scene.mesh import TriangleMesh
+
+SMALL: dict[str, Any] = {
+    "seed": 3,
+    "epochs": 2,
+    "icp": None,
+    "wall": {"style": "glendale", "width_m": 6.0, "height_m": 4.0, "resolution_m": 0.1, "seed": 1},
+    "rockfall": {"count": 2, "size_m": {"kind": "gaussian", "mean": 0.5, "sigma": 0.05, "minimum": 0.3}},
+    "station": {"distance_m": 20.0},
+    "scanner": {"azimuth_step_rad": 0.003, "zenith_step_rad": 0.003},
+    "difference": {"gsd_m": 0.06},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("export") / "run"
+    simulate(parse(SimulationConfig, SMALL, "test"), "tls", out)
+    return out
+
+
+def export(*words: Any) -> int:
+    return main(["export", *map(str, words), "--quiet"])
+
+
+def test_a_place_is_drawn_where_it_projects() -> None:
+    """A plane 10 x 6 m with a square of 60 mm missing rock about (7, 4): the square's colour stands at its projection."""
+    corners = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [10.0, 6.0, 0.0], [0.0, 6.0, 0.0]])
+    plane, grid = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)), Grid(0.0, 6.0, 0.1, 100, 60)
+    difference = np.zeros(grid.shape)
+    difference[15:25, 65:75] = 0.06
+    view = PerspectiveView.on(corners, 400)
+    pixels = draw_wall(view, plane, difference, grid, 0.03)
+    assert pixels.shape == (view.height, 400, 3)
+    (missing, calm), _ = view.project(np.array([[7.0, 4.0, 0.0], [2.0, 2.0, 0.0]]))
+    red, _, blue = pixels[int(missing[1]), int(missing[0])].astype(int)
+    assert red > blue + 50
+    assert np.ptp(pixels[int(calm[1]), int(calm[0])]) < 12
+    at, ahead = view.project(corners)
+    assert (ahead > 0).all()
+    assert (at >= 0).all()
+    assert (at <= [view.width, view.height]).all()
+    assert (pixels[0, 0] == 255).all()
+
+
+def test_a_run_as_picture_and_animations(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "_ANIMATED_PX", 320)
+    monkeypatch.setattr(pictures, "_SCAN_FRAMES", 5)
+    assert export(run, "picture", "--epoch", 2, "--width", 400, "--out", tmp_path / "a.png") == 0
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.width == 400
+    assert export(run, "epochs", "--out", tmp_path / "a.gif") == 0
+    with Image.open(tmp_path / "a.gif") as animation:
+        assert animation.n_frames == 3  # the reference and two epochs
+    assert export(run, "scan", "--out", tmp_path / "b.gif") == 0
+    lit = []
+    with Image.open(tmp_path / "b.gif") as animation:
+        for number in (0, animation.n_frames // 2, animation.n_frames - 1):
+            animation.seek(number)
+            lit.append(int((np.asarray(animation.convert("L")) > 60).sum()))
+    assert lit[0] < lit[1] < lit[2]
+
+
+def test_a_run_as_gltf(run: Path, tmp_path: Path) -> None:
+    """The wall and each niche that the surface shows, together the surface."""
+    assert export(run, "gltf", "--out", tmp_path / "wall.glb") == 0
+    scene = trimesh.load(tmp_path / "wall.glb")
+    surface = read_ply(run / "epoch_001/surface.ply")
+    assert set(scene.geometry) == {"wall", *(f"block_{label}" for label in np.unique(surface.face_block) if label)}
+    assert sum(len(part.faces) for part in scene.geometry.values()) == len(surface.faces)
+    np.testing.assert_allclose(scene.bounds, surface.bounds, atol=1e-5)
+
+
+def test_a_package_lists_every_file_with_its_checksum(run: Path, tmp_path: Path) -> None:
+    assert export(run, "package", "--out", tmp_path / "datapackage.json") == 0
+    made = json.loads((tmp_path / "datapackage.json").read_text())
+    listed = {each["path"]: each for each in made["resources"]}
+    assert set(listed) == {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+    data = (run / "difference_001.tif").read_bytes()
+    assert listed["difference_001.tif"]["hash"] == f"sha256:{hashlib.sha256(data).hexdigest()}"
+    assert listed["difference_001.tif"]["bytes"] == len(data)
+    assert len({each["name"] for each in made["resources"]}) == len(listed)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["epochs", "--epoch", "1"], "--epoch: goes with picture, gltf, scan"),
+        (["picture", "--epoch", "9"], "--epoch: epoch 9 is not there; allowed: 0 to 2"),
+        (["gltf", "--out", "wall.obj"], "--out: got '.obj'; allowed: .glb"),
+        (["movie"], "got 'movie'; allowed: picture"),
+        (["yolo"], "holds no split of a data set"),
+    ],
+)
+def test_what_cannot_be_made_is_told_in_one_line(
+    words: list[str], expected: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert export(run, *words) == 2
+    told = capsys.readouterr().err
+    assert expected in told
+    assert told.count("\n") == 1
+
+
+def masks() -> list[np.ndarray[Any, Any]]:
+    """One part, two parts, one pixel, one with a bay."""
+    blank = np.zeros((30, 40), dtype=bool)
+    whole, parted, single, bay = blank.copy(), blank.copy(), blank.copy(), blank.copy()
+    whole[5:12, 8:20] = True
+    parted[2:9, 3:10] = parted[15:25, 12:30] = True
+    single[7, 9] = True
+    bay[3:20, 3:20] = True
+    bay[8:20, 8:12] = False
+    return [whole, parted, single, bay]
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_an_outline_covers_its_mask(number: int) -> None:
+    mask = masks()[number]
+    points = outline(mask)
+    drawn = np.zeros((300, 400), np.uint8)
+    cv2.fillPoly(drawn, [np.round(10 * points).astype(np.int32)], 1)
+    fine = np.kron(mask, np.ones((10, 10))).astype(bool)
+    overlap = (drawn.astype(bool) & fine).sum() / (drawn.astype(bool) | fine).sum()
+    assert overlap > (0.5 if mask.sum() == 1 else 0.93)
+    rows, columns = np.nonzero(mask)
+    np.testing.assert_allclose(points.min(axis=0), [columns.min(), rows.min()], atol=0.15)
+    np.testing.assert_allclose(points.max(axis=0), [columns.max() + 1, rows.max() + 1], atol=0.15)
+    assert outline(np.zeros((3, 3), dtype=bool)).shape == (0, 2)
+
+
+def test_a_set_as_yolo_reads_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = np.full((30, 40), -0.006, np.float32)
+    values[0, 0] = np.nan
+    mask = masks()[0]
+    values[mask] = 0.4
+    for split in ("train", "val"):
+        write_geotiff(tmp_path / "set" / split / "deep/a.tif", values, Grid(0.0, 3.0, 0.1, 40, 30))
+        image = {"id": 7, "file_name": "deep/a.tif", "width": 40, "height": 30, "noise_sigma_m": 0.002}
+        mask_of = run_length_encoding(mask, 0, 0, mask.shape)
+        block = {"id": 1, "image_id": 7, "category_id": 1, "bbox": [8, 5, 12, 7], "segmentation": mask_of}
+        write_json(
+            tmp_path / "set" / split / "annotations.json",
+            {"images": [image], "annotations": [block], "categories": [BLOCK_CATEGORY]},
+        )
+    assert export(tmp_path / "set", "yolo", "--out", tmp_path / "yolo") == 0
+    assert "train: 1 images, 1 blocks" in capsys.readouterr().out
+    described = yaml.safe_load((tmp_path / "yolo/data.yaml").read_text())
+    assert described == {"train": "images/train", "val": "images/val", "names": {0: "block"}}
+    with Image.open(io.BytesIO((tmp_path / "yolo/images/train/deep_a.png").read_bytes())) as picture:
+        grey = np.asarray(picture)
+    assert (grey[0, 0], grey[1, 1], grey[6, 9]) == (0, 128 - round(127 * 0.006 / 0.012), 255)
+    label = [float(word) for word in (tmp_path / "yolo/labels/train/deep_a.txt").read_text().split()]
+    assert label[0] == 0
+    np.testing.assert_allclose([min(label[1::2]), max(label[1::2])], [8 / 40, 20 / 40], atol=0.15 / 40)
+    np.testing.assert_allclose([min(label[2::2]), max(label[2::2])], [5 / 30, 12 / 30], atol=0.15 / 30)
+    np.testing.assert_array_equal(grey_values(values, ~np.isnan(values), 0.012), grey)
