@@ -66,7 +66,7 @@ def test_a_sine_stays_a_sine() -> None:
 @pytest.mark.parametrize("lines", [3, 4, 5])
 def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) -> None:
     """Facets of 0, 1, -0.6, 0.3 and -0.2 times 0.1 px: no sine of any period has them. Planes of cells as wide as five columns
-    take most of what tells these apart: 0.19 of their scatter is left then, 0.07 of that of three."""
+    take most of what tells these apart: 0.19 of their scatter is left then, 0.04 of that of three."""
     column = PIXELS[:, 0] / STRIDE
     error = 0.1 * np.array([0.0, 1.0, -0.6, 0.3, -0.2])[(column % lines).astype(int)]
     found = residuals(error)
