@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+from matplotlib.figure import Figure
 
 from pipeline.cli.main import main
+from pipeline.comparison.comparison import compare_sensors
+from pipeline.comparison.sensors_compared import Contestant
+from pipeline.config.simulation import SimulationConfig
+from pipeline.formats.atomic import write_text
+from pipeline.formats.camera_files import read_lens
+from pipeline.formats.coco import read_coco
+from pipeline.formats.colmap import read_colmap
 from pipeline.formats.geotiff import read_tiff
 from pipeline.formats.measurement_checks import check_pixels
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.units import check_same_unit
+from pipeline.report.pictures import png
 from pipeline.surface.mesh import SurfaceConfig, mesh_cloud
+from scene.config import parse
 from scene.errors import InputError
 from sensors.camera import Camera
 from sensors.effects.range_intensity_bias import RangeIntensityBias
@@ -81,6 +92,8 @@ def test_a_sensor_stands_on_the_earth(values: dict[str, float]) -> None:
         ("train a --out out --resume", "begin it without --resume"),
         ("detect baseline a.tif a.tif --out out", "is given 2 times"),
         ("gap a --out a.xyz/out", "cannot be a folder to write into"),
+        ("train a --out used --resume", "there is no training"),
+        ("compare a.xyz --epochs=", "--epochs is empty"),
     ],
 )
 def test_a_bad_word_is_answered_at_once(
@@ -97,3 +110,85 @@ def test_a_bad_word_is_answered_at_once(
     assert told.err.count("\n") == 1
     assert said in told.err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_argument_out_of_an_empty_variable_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    """Else it would be the current folder."""
+    assert main(["detect", "baseline", "a.tif", "--out", ""]) == 2
+    assert "an argument is empty" in capsys.readouterr().err
+
+
+LENS = """%YAML 1.2
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 900., 0., 320., 0., 900., 240., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ 0., 0., 0., 0., 0. ]
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("640", ".Inf"), ("640", ".Nan"), ("640", "1e30"), ("640", "0.5"), ("900.", "1e300"), ("320.", "1e12")]
+)
+def test_a_calibration_has_the_bounds_of_our_own(old: str, new: str, tmp_path: Path) -> None:
+    path = tmp_path / "lens.yaml"
+    path.write_text(LENS)
+    assert read_lens(path).width == 640
+    path.write_text(LENS.replace(old, new, 1))
+    with pytest.raises(InputError):
+        read_lens(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("images.txt", "1 1e300 1e300 0 0 1 2 3 1 left.jpg"),
+        ("images.txt", "1 1 0 0 0 1e300 2 3 1 left.jpg"),
+        ("cameras.txt", "1 PINHOLE 1e300 1e300 1000 1000 320 240"),
+        ("cameras.txt", "1 PINHOLE 640.5 480 1000 1000 320 240"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_a_colmap_model_has_the_bounds_of_our_own(name: str, line: str, tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 1000 1000 320 240\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 1 2 3 1 left.jpg\n\n")
+    assert read_colmap(tmp_path)["left.jpg"].height == 480
+    (tmp_path / name).write_text(f"{line}\n\n")
+    with pytest.raises(InputError):
+        read_colmap(tmp_path)
+
+
+def test_what_is_no_character_is_written_as_an_escape(tmp_path: Path) -> None:
+    """A file's name in another encoding, as Python holds it, in a report."""
+    write_text(tmp_path / "report.html", "h\udcf6he")
+    assert (tmp_path / "report.html").read_text() == r"h\udcf6he"
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_figure_takes_any_name() -> None:
+    figure = Figure()
+    figure.suptitle("cost$x_{ \x1b[31m \udcf6 \U0001f9d7\nsecond line")
+    assert png(figure).startswith(b"\x89PNG")
+
+
+def test_maps_measured_twice_are_named(tmp_path: Path) -> None:
+    site = parse(SimulationConfig, {}, "test")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(InputError, match="is given twice"):
+        compare_sensors([Contestant("site", "tls", site)], [tmp_path / "a", tmp_path / "b"])
+
+
+def test_what_is_no_number_in_a_key_of_others_is_left_out(tmp_path: Path) -> None:
+    """`detect` writes the images with all their keys, and JSON knows no NaN."""
+    image = {"id": 1, "file_name": "a.tif", "width": 2, "height": 2, "gsd_m": float("nan"), "more": {"a": [float("inf")]}}
+    (tmp_path / "a.json").write_text(json.dumps({"images": [image], "annotations": [], "categories": []}))
+    assert read_coco(tmp_path / "a.json").images[0] | {"id": 1} == {**image, "gsd_m": None, "more": {"a": [None]}}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import sys
 import tempfile
@@ -136,6 +137,7 @@ def command_parser(prog: str, command: Command) -> Parser:
 def _carry_out(prog: str, command: Command, words: list[str]) -> int:
     """Run one command and print its answer; with --json one document on stdout, of an error too, and all else on stderr."""
     arguments = argparse.Namespace(debug="--debug" in words, kept="")
+    _take_any_character()
     as_document = "--json" in words
     try:
         parser = command_parser(prog, command)
@@ -157,6 +159,13 @@ def _carry_out(prog: str, command: Command, words: list[str]) -> int:
         if as_document:
             print(as_json({"error": message, "exit_status": code}))
         return _complain(message, code)
+
+
+def _take_any_character() -> None:
+    """Print what stdout's encoding lacks, or is no character, as an escape: a file's name can hold any bytes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str, int]:

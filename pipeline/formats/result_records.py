@@ -71,7 +71,7 @@ class _Change(_Record):
 class _Gap(_Record):
     sensor: Literal["stereo", "tls"]
     verdict: str
-    scene_changes: list[_Change] = []
+    scene_changes: list[_Change] = Field([], max_length=10_000)
 
 
 def read_run(path: Path, remedy: str) -> dict[str, Any]:

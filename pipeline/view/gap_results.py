@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.formats.laz import read_laz
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points import check_reach
 from pipeline.formats.result_records import GAP_FILE, read_gap
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, inside
 from scene.errors import InputError
@@ -18,6 +19,8 @@ from scene.mesh import FloatArray
 
 _MM = 1e3
 _POINTS_PER_CELL = 4
+_CHANNELS = ("residual_m", "held_out")
+_FEWEST = 3
 _FAR_M = 1e6
 _QUANTILE = 0.98
 
@@ -36,10 +39,8 @@ class GapResults:
         """Raises InputError where a file of the diagnosis is absent or damaged."""
         self._record = read_gap(folder / GAP_FILE)
         self.title = f"{folder.name}: {INSTRUMENTS[self._record['sensor']]}, verdict: {self._record['verdict'].replace('_', ' ')}"
-        self._clouds = {step: read_laz(folder / f"{step}.laz") for step in self.steps}
+        self._clouds = {step: _cloud(folder / f"{step}.laz") for step in self.steps}
         before = self._clouds["before"].points
-        if len(before) < 3:
-            raise InputError("holds too few points to show", where=str(folder))
         self._frame = _frame(before)
         self._local = {step: self._frame.to_wall(cloud.points) for step, cloud in self._clouds.items()}
         self._limit = float(np.quantile(np.abs(_residual(self._clouds["before"])), _QUANTILE)) or 1.0
@@ -93,6 +94,20 @@ class GapResults:
         x, y = low[0] + (np.arange(width) + 0.5) * side, high[1] - (np.arange(height) + 0.5) * side
         shape = height, width
         return Patch(x, y, z.reshape(shape), mean.reshape(shape), np.zeros(shape, int), 1)
+
+
+def _cloud(path: Path) -> PointCloud:
+    """A file of a diagnosis; raises InputError where it is another cloud."""
+    cloud, remedy = read_laz(path), "run scarpsim gap again"
+    missing = [name for name in _CHANNELS if name not in cloud.extra]
+    if missing:
+        raise InputError(f"has no channel {missing[0]}", where=str(path), allowed="a file of scarpsim gap", remedy=remedy)
+    if not all(np.isfinite(cloud.extra[name]).all() and cloud.extra[name].ndim == 1 for name in _CHANNELS):
+        raise InputError(f"has values in {' or '.join(_CHANNELS)} that are no numbers", where=str(path), remedy=remedy)
+    if len(cloud.points) < _FEWEST:
+        raise InputError(f"holds {len(cloud.points)} points", where=str(path), allowed=f"at least {_FEWEST}", remedy=remedy)
+    check_reach(cloud.points, str(path))
+    return cloud
 
 
 def _residual(cloud: PointCloud) -> FloatArray:
