@@ -23,6 +23,8 @@ _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
 """A wall smaller or larger than this is likely to be in another unit."""
 _FARTHEST_M = 1e8
 """No coordinate system of the earth reaches so far: geocentric coordinates are up to 6.4e6 m, northings up to 1e7 m."""
+_MOST_BYTES = 2_000_000_000
+"""Of a file that trimesh reads, which takes it into memory as a whole, and several times that for its parts."""
 _ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 _COLOURS = ("red", "green", "blue")
 _TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
@@ -111,6 +113,7 @@ def _read(path: Path) -> TriangleMesh:
     check_file(path)
     if kind == "ply" and (plain := _plain_ply(path)) is not None:
         return plain
+    check_file(path, most_bytes=_MOST_BYTES, smaller="export it as a binary PLY of triangles, which can have any size")
     import trimesh
 
     options = {"skip_materials": True} if kind == "obj" else {}
@@ -130,6 +133,9 @@ def _read(path: Path) -> TriangleMesh:
             remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
         )
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
+        raise InputError(problem, where=where, allowed="3 and 3", remedy="export it anew, as triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import tifffile
 from matplotlib.figure import Figure
 
+from benchmarks.bad_inputs.exchange_cases import zlib_bomb
 from pipeline.cli.main import main
 from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.sensors_compared import Contestant
@@ -26,6 +28,7 @@ from pipeline.report.pictures import png
 from pipeline.surface.mesh import SurfaceConfig, mesh_cloud
 from scene.config import parse
 from scene.errors import InputError
+from scene.imported import ImportedWall
 from sensors.camera import Camera
 from sensors.effects.range_intensity_bias import RangeIntensityBias
 from sensors.placement import RigConfig, StationConfig
@@ -48,6 +51,38 @@ def test_a_map_of_no_numbers_is_named(
     with pytest.raises(InputError, match=words):
         read_tiff(tmp_path / "a.tif")
     assert capfd.readouterr().err == ""
+
+
+def test_a_tile_that_becomes_gigabytes_is_refused(tmp_path: Path) -> None:
+    """Before it is unpacked: a compressed tile of a few kilobytes can hold any number of zeros."""
+    path = tmp_path / "bomb.tif"
+    zlib_bomb(path, 0.05)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="becomes more than its 16,384 bytes of pixels"):
+        read_tiff(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
+@pytest.mark.parametrize("compression", ["zlib", "lzma", None])
+def test_maps_of_other_programs_are_read(compression: str | None, tmp_path: Path) -> None:
+    values = np.random.default_rng(1).normal(size=(100, 130)).astype(np.float32)
+    tifffile.imwrite(tmp_path / "a.tif", values, compression=compression, tile=(64, 64))
+    np.testing.assert_array_equal(read_tiff(tmp_path / "a.tif"), values)
+
+
+@pytest.mark.parametrize("name", ["wall.obj", "wall.stl", "wall.ply"])
+def test_a_mesh_of_sixty_gigabytes_is_refused_at_once(name: str, tmp_path: Path) -> None:
+    with (tmp_path / name).open("wb") as file:
+        file.write(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n" if name.endswith("ply") else b"")
+        file.truncate(60_000_000_000)
+    with pytest.raises(InputError, match="has 60,000 MB"):
+        ImportedWall(mesh=tmp_path / name).load()
+
+
+def test_a_mesh_of_two_coordinates_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    with pytest.raises(InputError, match="coordinates"):
+        ImportedWall(mesh=tmp_path / "a.obj").load()
 
 
 def test_pixels_of_another_picture_are_named() -> None:

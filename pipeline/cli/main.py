@@ -12,8 +12,9 @@ import os
 import sys
 import tempfile
 import traceback
-from contextlib import nullcontext, redirect_stdout
+from contextlib import nullcontext, redirect_stdout, suppress
 from importlib import metadata
+from pathlib import Path
 from typing import Protocol
 
 from pipeline.cli import (
@@ -142,6 +143,7 @@ def _carry_out(prog: str, command: Command, words: list[str]) -> int:
     try:
         parser = command_parser(prog, command)
         arguments = parser.parse(words)
+        _check_current_folder()
         as_document = getattr(arguments, "json", False)
         ended = second_interrupt_ends(lambda: arguments.kept or "nothing is kept")
         with redirect_stdout(sys.stderr) if as_document else nullcontext(), ended:
@@ -159,6 +161,14 @@ def _carry_out(prog: str, command: Command, words: list[str]) -> int:
         if as_document:
             print(as_json({"error": message, "exit_status": code}))
         return _complain(message, code)
+
+
+def _check_current_folder() -> None:
+    """Raise InputError where the current folder was removed: libraries in C abort there."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise InputError("the current folder is not there any more", remedy="cd to one that is") from None
 
 
 def _take_any_character() -> None:
@@ -191,7 +201,8 @@ def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    with suppress(OSError):  # nobody reads it, or no room is left
+        print(f"error: {message}", file=sys.stderr, flush=True)
     return code
 
 
