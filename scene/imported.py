@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +19,7 @@ from scene.ply import read_elements
 from scene.regular_file import check_file
 from scene.rounding import check_rounding
 
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it cannot do comes as an exception, or is a texture
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
 """A wall smaller or larger than this is likely to be in another unit."""
@@ -118,7 +120,7 @@ def _read(path: Path) -> TriangleMesh:
 
     options = {"skip_materials": True} if kind == "obj" else {}
     try:
-        loaded = trimesh.load(str(path), file_type=kind, process=False, **options)
+        loaded = trimesh.load(str(path), file_type=kind, process=False, resolver=_beside(path), **options)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the permissions") from None
@@ -139,6 +141,18 @@ def _read(path: Path) -> TriangleMesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
+
+
+def _beside(path: Path) -> Any:
+    """trimesh's way to what a mesh file names, such as its buffers: files of its folder, no pipes and none too large."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Beside(FilePathResolver):
+        def absolute(self, name: str) -> Path:
+            found: Path = super().absolute(name)
+            return check_file(found, most_bytes=_MOST_BYTES) if found.exists() else found
+
+    return Beside(str(path))
 
 
 def _plain_ply(path: Path) -> TriangleMesh | None:

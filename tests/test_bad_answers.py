@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,9 @@ from pipeline.cli.main import main
 from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.sensors_compared import Contestant
 from pipeline.config.simulation import SimulationConfig
+from pipeline.detection.run import detector_folder
+from pipeline.detection.score_files import assess
+from pipeline.detection.weights import check_detector
 from pipeline.formats.atomic import write_text
 from pipeline.formats.camera_files import read_lens
 from pipeline.formats.coco import read_coco
@@ -77,6 +82,14 @@ def test_a_mesh_of_sixty_gigabytes_is_refused_at_once(name: str, tmp_path: Path)
         file.truncate(60_000_000_000)
     with pytest.raises(InputError, match="has 60,000 MB"):
         ImportedWall(mesh=tmp_path / name).load()
+
+
+def test_a_pipe_that_a_mesh_names_is_not_read(tmp_path: Path) -> None:
+    """The reader would wait for ever."""
+    os.mkfifo(tmp_path / "buffer")
+    (tmp_path / "a.gltf").write_text('{"asset": {"version": "2.0"}, "buffers": [{"uri": "buffer"}]}')
+    with pytest.raises(InputError, match="is a pipe"):
+        ImportedWall(mesh=tmp_path / "a.gltf").load()
 
 
 def test_a_mesh_of_two_coordinates_is_named(tmp_path: Path) -> None:
@@ -227,3 +240,36 @@ def test_what_is_no_number_in_a_key_of_others_is_left_out(tmp_path: Path) -> Non
     image = {"id": 1, "file_name": "a.tif", "width": 2, "height": 2, "gsd_m": float("nan"), "more": {"a": [float("inf")]}}
     (tmp_path / "a.json").write_text(json.dumps({"images": [image], "annotations": [], "categories": []}))
     assert read_coco(tmp_path / "a.json").images[0] | {"id": 1} == {**image, "gsd_m": None, "more": {"a": [None]}}
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [("external", "outside of it"), ("soft", "outside of it"), ("storage", "outside of it"), ("claims", "claims 4,00")],
+)
+def test_weights_hold_their_own_numbers(kind: str, said: str, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    folder = tmp_path / "detector"
+    shutil.copytree(detector_folder("default"), folder)
+    check_detector(folder)
+    with h5py.File(folder / "model.weights.h5", "r+") as file:
+        match kind:
+            case "external":
+                file["more"] = h5py.ExternalLink("/etc/passwd", "/a")
+            case "soft":
+                file["more"] = h5py.SoftLink("/none")
+            case "storage":
+                file.create_dataset("more", (10,), "f4", external=[("/etc/passwd", 0, 40)])
+            case "claims":
+                file.create_dataset("more", (10**9,), "f4", chunks=(1000,))
+    with pytest.raises(InputError, match=said):
+        check_detector(folder)
+
+
+def test_more_pairs_than_memory_has_room_for_are_named(tmp_path: Path) -> None:
+    image = {"id": 1, "file_name": "a.tif", "width": 20, "height": 20}
+    block = {"image_id": 1, "category_id": 1, "bbox": [1, 1, 2, 2], "score": 0.9}
+    entries = [{**block, "id": number} for number in range(1, 6000)]
+    content = {"images": [image], "annotations": entries, "categories": [{"id": 1}]}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="5,999 detections in image 1, where the truth has 5,999 blocks"):
+        assess(tmp_path / "a.json", tmp_path / "a.json", kinds=("bbox",))
