@@ -1,7 +1,7 @@
 """Every reader and every command with 500 damaged files, odd values or odd words of each kind, in place of the 25 of the tests.
 
     python benchmarks/fuzz.py [EXAMPLES]
-    python benchmarks/fuzz.py --through [--commands evaluate detect ...] [EXAMPLES]
+    python benchmarks/fuzz.py [EXAMPLES] --through [--commands evaluate detect ...]
 
 Ends with the exit status of pytest: 0 where each was read, or refused with one line. --through: the commands alone, each case a
 process of its own that goes on to its end, with bounds on time and memory; prints those that are answered badly.
@@ -27,7 +27,7 @@ def through(commands: list[str], examples: int) -> int:
     from hypothesis import HealthCheck, Phase, given, settings
     from hypothesis import strategies as st
 
-    from benchmarks.bad_inputs.case import tried
+    from benchmarks.bad_inputs.case import Outcome, tried
     from benchmarks.bad_inputs.drawn_cases import drawn
     from benchmarks.bad_inputs.materials import make_small
     from benchmarks.bad_inputs.preloaded import Preloaded
@@ -47,21 +47,25 @@ def through(commands: list[str], examples: int) -> int:
         folder = Path(name)
         make_small(folder / "materials")
         forked_from = Preloaded(rooms=True)
-        for command in commands:
+
+        def badly(command: str) -> int:
+            found: list[Outcome] = []
 
             @same
             @given(data=st.data())
-            def answered(data: st.DataObject, command: str = command) -> None:
-                nonlocal bad
+            def answered(data: st.DataObject) -> None:
                 case = drawn(data.draw, command, folder / "materials")
-                outcome = tried(case, folder / "materials", folder / str(next(numbers)), forked_from)
-                if outcome.problems:
-                    bad += 1
-                    print(said(outcome), case.words, flush=True)
+                found.append(tried(case, folder / "materials", folder / str(next(numbers)), forked_from))
+                if found[-1].problems:
+                    print(said(found[-1]), case.words, flush=True)
 
-            before = bad
             answered()
-            print(f"{command}: {examples} drawn, {bad - before} answered badly", flush=True)
+            return sum(1 for each in found if each.problems)
+
+        for command in commands:
+            count_of_bad = badly(command)
+            bad += count_of_bad
+            print(f"{command}: {examples} drawn, {count_of_bad} answered badly", flush=True)
         forked_from.close()
     return bad
 

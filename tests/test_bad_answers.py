@@ -28,6 +28,7 @@ from pipeline.formats.colmap import read_colmap
 from pipeline.formats.geotiff import read_tiff
 from pipeline.formats.measurement_checks import check_pixels
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.result_records import read_run
 from pipeline.measurement.units import check_same_unit
 from pipeline.report.pictures import png
 from pipeline.surface.mesh import SurfaceConfig, mesh_cloud
@@ -273,3 +274,13 @@ def test_more_pairs_than_memory_has_room_for_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="5,999 detections in image 1, where the truth has 5,999 blocks"):
         assess(tmp_path / "a.json", tmp_path / "a.json", kinds=("bbox",))
+
+
+@pytest.mark.parametrize("rotation", [np.zeros((3, 3)), 2 * np.eye(3), 1e300 * np.eye(3), np.diag([1.0, 1.0, -1.0])])
+@pytest.mark.filterwarnings("error")
+def test_a_registration_in_a_record_is_a_rigid_motion(rotation: np.ndarray, tmp_path: Path) -> None:
+    motion = {"rotation": rotation.tolist(), "translation_m": [0.0, 0.0, 0.0]}
+    record = {"sensor": "tls", "config": {}, "epochs": [{"epoch": 1, "registration": motion}]}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"registration\.rotation"):
+        read_run(tmp_path / "run.json", "run it again")
