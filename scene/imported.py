@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,11 +19,14 @@ from scene.ply import read_elements
 from scene.regular_file import check_file
 from scene.rounding import check_rounding
 
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it cannot do comes as an exception, or is a texture
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
 """A wall smaller or larger than this is likely to be in another unit."""
 _FARTHEST_M = 1e8
 """No coordinate system of the earth reaches so far: geocentric coordinates are up to 6.4e6 m, northings up to 1e7 m."""
+_MOST_BYTES = 2_000_000_000
+"""Of a file that trimesh reads, which takes it into memory as a whole, and several times that for its parts."""
 _ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 _COLOURS = ("red", "green", "blue")
 _TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
@@ -111,11 +115,12 @@ def _read(path: Path) -> TriangleMesh:
     check_file(path)
     if kind == "ply" and (plain := _plain_ply(path)) is not None:
         return plain
+    check_file(path, most_bytes=_MOST_BYTES, smaller="export it as a binary PLY of triangles, which can have any size")
     import trimesh
 
     options = {"skip_materials": True} if kind == "obj" else {}
     try:
-        loaded = trimesh.load(str(path), file_type=kind, process=False, **options)
+        loaded = trimesh.load(str(path), file_type=kind, process=False, resolver=_beside(path), **options)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the permissions") from None
@@ -130,9 +135,24 @@ def _read(path: Path) -> TriangleMesh:
             remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
         )
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
+        raise InputError(problem, where=where, allowed="3 and 3", remedy="export it anew, as triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
+
+
+def _beside(path: Path) -> Any:
+    """trimesh's way to what a mesh file names, such as its buffers: files of its folder, no pipes and none too large."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Beside(FilePathResolver):
+        def absolute(self, name: str) -> Path:
+            found: Path = super().absolute(name)
+            return check_file(found, most_bytes=_MOST_BYTES) if found.exists() else found
+
+    return Beside(str(path))
 
 
 def _plain_ply(path: Path) -> TriangleMesh | None:

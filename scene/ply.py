@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.errors import InputError
-from scene.regular_file import check_file
+from scene.regular_file import bounded_lines, check_file
 
 _LONGEST_HEADER = 65536
 _TYPES = {
@@ -127,7 +127,7 @@ def _fields(element: _Element, order: str, lengths: Mapping[str, int]) -> list[A
 
 
 def _ascii_rows(file: BinaryIO, element: _Element) -> NDArray[Any]:
-    table = np.loadtxt(itertools.islice(file, element.count), ndmin=2, comments=None, encoding="ascii")
+    table = np.loadtxt(bounded_lines(file, element.count), ndmin=2, comments=None, encoding="ascii")
     if len(table) < element.count:
         raise ValueError(f"{len(table):,} of {element.count:,} {element.name} lines")
     lengths, column = {}, 0

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import stat
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, AnyStr
 
 from scene.errors import InputError
 
@@ -58,3 +59,14 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
     except (ValueError, RecursionError) as error:
         problem = " ".join(str(error).split()) or "nested too deeply"
         raise InputError(f"is not JSON ({problem})", where=str(path), remedy=remedy) from None
+
+
+def bounded_lines(file: IO[AnyStr], count: int, longest: int = 65_536) -> Iterator[AnyStr]:
+    """At most `count` lines of an open file; raises ValueError for a longer one, which would be taken into memory as a whole."""
+    for _ in range(count):
+        line = file.readline(longest)
+        if len(line) == longest:
+            raise ValueError(f"a line of more than {longest:,} bytes")
+        if not line:
+            return
+        yield line

@@ -12,6 +12,7 @@ The equations use arithmetic only, so they serve NumPy arrays and Dr.Jit arrays 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
@@ -19,7 +20,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from scene.backend import dr, mi
-from scene.config import Config
+from scene.config import Config, parse
 from scene.errors import InputError
 from scene.frame import WallFrame
 from scene.mesh import FloatArray
@@ -30,6 +31,8 @@ Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 Pixels = Annotated[float, Field(ge=-100_000, le=100_000)]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
+Pose = tuple[FloatArray, FloatArray]
+"""Position (3,), m, and rotation (3, 3), camera to the frame of the position."""
 Side = Literal["left", "right", "both"]
 
 NEWTON_STEPS = 6
@@ -70,6 +73,16 @@ class CameraConfig(Config):
         camera = Camera(self.width, self.height, **interior, position=position, rotation=rotation)
         camera.check_invertible()
         return camera
+
+
+def checked_camera(where: str, size: tuple[float, float], interior: Mapping[str, float], pose: Pose) -> Camera:
+    """A camera out of another program's file, held to the same bounds as our own files (`CameraConfig`).
+
+    size: width and height, px; interior: by the names of INTERIOR, those that are left out are 0; where: what errors call it.
+    """
+    position, rotation = (np.asarray(part, dtype=float).tolist() for part in pose)
+    values = {"width": size[0], "height": size[1], **interior, "position_m": position, "rotation": rotation}
+    return parse(CameraConfig, values, where).camera()
 
 
 def check_rotation(rotation: Matrix3) -> Matrix3:

@@ -7,6 +7,7 @@ A good answer is exit status 0 or 2, no traceback, one line of error after a 2, 
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import signal
@@ -94,13 +95,22 @@ def _problems(case: Case, code: int, seconds: float, gigabytes: float, out: str,
         problems.append("a traceback or a warning")
     if code == 2 and (len(lines) != 1 or not lines[0].startswith("error: ") or len(lines[0]) > _LONGEST_LINE):
         problems.append(f"{len(lines)} lines of error")
-    if code == 2 and out.strip():
+    if code == 2 and "--json" in case.words:
+        problems += [] if _is_error_document(out) else ["no JSON document of the error"]
+    elif code == 2 and out.strip():
         problems.append("output beside an error")
     if seconds > MOST_SECONDS:
         problems.append(f"{seconds:.0f} s")
     if gigabytes > MOST_GB:
         problems.append(f"{gigabytes:.1f} GB")
     return problems
+
+
+def _is_error_document(out: str) -> bool:
+    try:
+        return set(json.loads(out)) == {"error", "exit_status"}
+    except ValueError:
+        return False
 
 
 def _files(folder: Path) -> dict[str, tuple[int, int, int]]:

@@ -7,14 +7,20 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
 from pipeline.config.bundled import configs_folder
+from pipeline.detection.events import Event, write_events
+from pipeline.formats.atomic import write_json
+from pipeline.formats.laz import write_laz
 from pipeline.formats.ply import read_ply, write_ply
-from scene.mesh import TriangleMesh
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points import read_points
+from scene.mesh import FloatArray, TriangleMesh
 
 SITE: dict[str, Any] = {
     "seed": 3,
@@ -64,6 +70,37 @@ def make_materials(folder: Path, *, diagnosed: bool = True) -> None:
         _called("gap", str(folder / "measurement"), "--out", str(folder / "diagnosis"))
 
 
+def make_small(folder: Path) -> None:
+    """The same of a few hundred pixels and points, in seconds, with diagnosis/ and events/ written as their commands would."""
+    folder.mkdir(parents=True)
+    site = {**SITE, "epochs": 1, "wall": {**SITE["wall"], "width_m": 4.0, "height_m": 3.0, "resolution_m": 0.2}}
+    site |= {"scanner": {"azimuth_step_rad": 0.01, "zenith_step_rad": 0.01}, "rockfall": {"count": 2, "size_m": 0.5}}
+    wall = {key: value for key, value in site.items() if key not in ("seed", "epochs", "calibration")}
+    part = {**SET["parts"][0], "train": 1, "val": 1, "test": 0}
+    small = {**SET, "walls": {"ledge": wall}, "tiles": {**SET["tiles"], "size_px": 16}, "parts": [part], "validation_region": 0.0}
+    (folder / "site.yaml").write_text(yaml.safe_dump(site))
+    (folder / "set.yaml").write_text(yaml.safe_dump(small))
+    _coco(folder)
+    shutil.copytree(configs_folder() / "detectors/default", folder / "detector")
+    for name, sensor in (("measurement", "tls"), ("pair", "stereo")):
+        make(Case(0, (7, 1), "one", sensor, (), 400, 400), folder / name, folder / f"{name}_truth.json")
+    _raw(folder)
+    _called("simulate", "--sensor", "tls", "--config", str(folder / "site.yaml"), "--out", str(folder / "run"))
+    _called("dataset", str(folder / "set.yaml"), "--out", str(folder / "set"))
+    _diagnosis(folder / "diagnosis", read_points(folder / "raw/scan.ply").points)
+    event = Event("difference_001.tif", 1, 1.0, 1.0, 0.5, 0.5, 0.2, 0.1, 0.05, 0.01, 0.97)
+    write_events([event], folder / "events/events_0.9.csv")
+
+
+def _diagnosis(folder: Path, points: FloatArray) -> None:
+    """What `view` reads of a diagnosis."""
+    extra = {"residual_m": points[:, 0] * 1e-4, "held_out": np.arange(len(points), dtype=np.uint8) % 2}
+    for name in ("before", "after"):
+        write_laz(folder / f"{name}.laz", PointCloud(points, extra=extra))
+    change = {"bbox_m": [*points[0], *(points[0] + 1)], "volume_m3": 0.12}
+    write_json(folder / "gap.json", {"schema": 1, "sensor": "tls", "verdict": "named", "scene_changes": [change]})
+
+
 def _called(*words: str) -> None:
     if main([*words, "--quiet"]):
         raise RuntimeError(f"a good input fails: scarpsim {' '.join(words)}")
@@ -71,8 +108,6 @@ def _called(*words: str) -> None:
 
 def _raw(folder: Path) -> None:
     """raw/: the points of measurement/ and its wall, both in the scanner's frame."""
-    import numpy as np
-
     given = yaml.safe_load((folder / "measurement/measurement.yaml").read_text())["scanner"]
     position, rotation = np.array(given["position_m"]), np.array(given["rotation"])
     (folder / "raw").mkdir()
@@ -84,8 +119,6 @@ def _raw(folder: Path) -> None:
 
 def _coco(folder: Path) -> None:
     """truth.json, of two images with two blocks each, and found.json, the same with scores."""
-    import numpy as np
-
     images = [
         {"id": 1 + number, "file_name": f"{number}.tif", "width": WIDTH, "height": HEIGHT, "noise": "low"} for number in range(2)
     ]

@@ -27,6 +27,7 @@ from benchmarks.bad_inputs.spoil import (
 )
 from pipeline.formats.laz import write_laz
 from pipeline.formats.ply import read_ply
+from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 
 YAML, MODEL, WALL, SCAN = "measurement/measurement.yaml", "measurement/model.yaml", "measurement/wall.ply", "measurement/scan.ply"
@@ -41,7 +42,7 @@ def _channels(**channels: Callable[[int], Any]) -> Change:
         count = len(cloud.points)
         given: dict[str, Any] = {name: np.asarray(make(count)) for name, make in channels.items()}
         own = {name: given.pop(name) for name in ("intensity", "gps_time") if name in given}
-        write_laz(folder / "measurement/scan.laz", cloud.points, extra=given, **own)
+        write_laz(folder / "measurement/scan.laz", PointCloud(cloud.points, extra=given, **own))
         put(YAML, points="scan.laz")(folder)
 
     return change

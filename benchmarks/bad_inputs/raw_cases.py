@@ -50,7 +50,7 @@ def _as(suffix: str, move: object = None, values: object = None) -> Change:
         intensity = None if values is None else np.full(len(points), values, dtype=np.float64)
         cloud = PointCloud(points, intensity)
         if suffix in (".las", ".laz"):
-            write_laz(path, points, intensity=intensity)
+            write_laz(path, cloud)
         elif suffix == ".e57":
             write_e57(path, [E57Scan("one", cloud, np.zeros(3), np.eye(3))])
         elif suffix == ".ptx":

@@ -21,7 +21,19 @@ from queue import Queue
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks.bad_inputs import coco_cases, dataset_cases, further_cases, gap_cases, measurement_cases, raw_cases, site_cases
+from benchmarks.bad_inputs import (
+    camera_cases,
+    coco_cases,
+    dataset_cases,
+    exchange_cases,
+    further_cases,
+    gap_cases,
+    measurement_cases,
+    odd_results_cases,
+    odd_words_cases,
+    raw_cases,
+    site_cases,
+)
 from benchmarks.bad_inputs.case import Case, Outcome, tried
 from benchmarks.bad_inputs.materials import make_materials
 from benchmarks.bad_inputs.preloaded import Preloaded
@@ -38,6 +50,10 @@ def all_cases() -> list[Case]:
         *raw_cases.cases(),
         *measurement_cases.cases(),
         *further_cases.cases(),
+        *exchange_cases.cases(),
+        *camera_cases.cases(),
+        *odd_results_cases.cases(),
+        *odd_words_cases.cases(),
     ]
 
 

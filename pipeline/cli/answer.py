@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from pipeline.formats.plain_json import without_nan
 
 _BULKY = ("config", "versions")
 """What the records in result folders hold to make them again; too long for a script's standard input."""
@@ -24,17 +25,7 @@ class Answer:
 
 def as_json(document: dict[str, Any]) -> str:
     """The document as JSON; NaN and infinity, which JSON does not know, become null, paths text."""
-    return json.dumps(_without_nan(document), indent=2, allow_nan=False, default=str)
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if hasattr(value, "tolist"):  # NumPy's
-        return _without_nan(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.dumps(without_nan(document), indent=2, allow_nan=False, default=str)
 
 
 def recorded(report: Path, record: str) -> Callable[[], dict[str, Any]]:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import sys
 import tempfile
 import traceback
-from contextlib import nullcontext, redirect_stdout
+from contextlib import nullcontext, redirect_stdout, suppress
 from importlib import metadata
+from pathlib import Path
 from typing import Protocol
 
 from pipeline.cli import (
@@ -138,10 +140,12 @@ def command_parser(prog: str, command: Command) -> Parser:
 def _carry_out(prog: str, command: Command, words: list[str]) -> int:
     """Run one command and print its answer; with --json one document on stdout, of an error too, and all else on stderr."""
     arguments = argparse.Namespace(debug="--debug" in words, kept="")
+    _take_any_character()
     as_document = "--json" in words
     try:
         parser = command_parser(prog, command)
         arguments = parser.parse(words)
+        _check_current_folder()
         as_document = getattr(arguments, "json", False)
         ended = second_interrupt_ends(lambda: arguments.kept or "nothing is kept")
         with redirect_stdout(sys.stderr) if as_document else nullcontext(), ended:
@@ -159,6 +163,21 @@ def _carry_out(prog: str, command: Command, words: list[str]) -> int:
         if as_document:
             print(as_json({"error": message, "exit_status": code}))
         return _complain(message, code)
+
+
+def _check_current_folder() -> None:
+    """Raise InputError where the current folder was removed: libraries in C abort there."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise InputError("the current folder is not there any more", remedy="cd to one that is") from None
+
+
+def _take_any_character() -> None:
+    """Print what stdout's encoding lacks, or is no character, as an escape: a file's name can hold any bytes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str, int]:
@@ -184,7 +203,8 @@ def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    with suppress(OSError):  # nobody reads it, or no room is left
+        print(f"error: {message}", file=sys.stderr, flush=True)
     return code
 
 

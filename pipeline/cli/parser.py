@@ -29,6 +29,9 @@ class Parser(argparse.ArgumentParser):
             flag = word.partition("=")[0]
             if flag.startswith("--") and flag not in flags:
                 raise InputError(f"unknown option '{flag}'", where=self.prog, remedy=nearest(flag, flags) or self._see_help)
+            if word == "" or (flag.startswith("--") and word == f"{flag}="):
+                problem = f"{flag} is empty" if flag else "an argument is empty"
+                raise InputError(problem, where=self.prog, remedy="check the variable that it was to come from")
         arguments, unknown = self.parse_known_args(words)
         if unknown:
             raise InputError(f"unexpected argument '{unknown[0]}'", where=self.prog, remedy=self._see_help)

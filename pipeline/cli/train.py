@@ -42,8 +42,7 @@ def run(arguments: argparse.Namespace) -> Answer:
 
     if arguments.resume:
         check_place(arguments.out)
-        if not arguments.out.is_dir() or not any(arguments.out.iterdir()):
-            raise InputError("there is no training", where=f"--resume, --out {arguments.out}", remedy="begin it without --resume")
+        _check_training(arguments.out)
     else:
         empty_folder(arguments.out, "add --resume to go on with a training in it, or choose another --out")
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
@@ -62,6 +61,15 @@ def run(arguments: argparse.Namespace) -> Answer:
     told = f"{count} epoch{'s' if count > 1 else ''}, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
     document = {"folder": str(arguments.out), "model": str(model), "epochs": count}
     return Answer(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})
+
+
+def _check_training(out: Path) -> None:
+    """Raise InputError where a folder holds nothing of a training."""
+    from pipeline.detection.config import BEST, CHECKPOINT, CURVES, EVENTS
+
+    if not any((out / name).exists() for name in (CHECKPOINT, BEST, EVENTS, CURVES)):
+        remedy = "begin it without --resume, in a new folder"
+        raise InputError("there is no training", where=f"--resume, --out {out}", remedy=remedy)
 
 
 def load_keras(*, quiet: bool) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,9 @@ def compare_sensors(
     progress.plan({"figures": _FIGURES_S * len(sensors)})
     config = sensors[0].config
     random = KeyedRandom(config.seed)
+    _check_given_once(measured)
     maps = [read_measured(folder, config.difference, config.icp, random.child("measured", folder.name)) for folder in measured]
+    maps = [replace(each, name=name) for each, name in zip(maps, _own_names([each.name for each in maps]), strict=True)]
     trial = compare(sensors, epochs, sizes_m, progress)
     found = []
     with progress.stage("figures"):
@@ -62,3 +65,17 @@ def compare_sensors(
             found.append(assess(trial, seen, random))
         beside = [(each, assess_measured(each, random)) for each in maps]
     return ComparedSensors(trial, found, beside, config.model_dump(mode="json"))
+
+
+def _check_given_once(folders: Sequence[Path]) -> None:
+    seen: set[str] = set()
+    for folder in folders:
+        place = os.path.realpath(folder)  # Path.resolve raises at a loop
+        if place in seen:
+            raise InputError("is given twice", where=f"--measured {folder}", remedy="name each folder once")
+        seen.add(place)
+
+
+def _own_names(names: Sequence[str]) -> list[str]:
+    """The names, numbered where several folders have one."""
+    return [name if names.count(name) == 1 else f"{name} {names[: at + 1].count(name)}" for at, name in enumerate(names)]

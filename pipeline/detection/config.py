@@ -11,6 +11,8 @@ from pydantic import Field, model_validator
 from pipeline.config.overrides import apply_overrides
 from scene.config import Config, load_yaml, parse
 
+CHECKPOINT, BEST, EVENTS, CURVES = "checkpoint", "best", "events", "losses.png"
+"""What a training writes into its folder."""
 Loss = Literal["proposal_class", "proposal_box", "class", "box", "mask"]
 
 

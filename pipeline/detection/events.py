@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from pipeline.change.annotate import BLOCK_CATEGORY
 from pipeline.detection.detections import Detection
 from pipeline.formats.atomic import write_json, write_text
+from scene.errors import InputError
 from scene.grid import Grid
+from scene.regular_file import read_text
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,12 @@ class Event:
     world_x_m: float = float("nan")
     world_y_m: float = float("nan")
     world_z_m: float = float("nan")
+    __pydantic_config__ = ConfigDict(allow_inf_nan=False)
+
+
+_ROW = TypeAdapter(Event)
+_PLACE = ("world_x_m", "world_y_m", "world_z_m")
+"""Columns that older tables lack, and that are empty where the place is not known."""
 
 
 def event(item: Detection, number: int, image: str, difference: NDArray[np.float32], grid: Grid) -> Event:
@@ -83,10 +92,24 @@ def _written(value: Any) -> Any:
 
 
 def read_events(path: Path) -> list[Event]:
-    """A table that `write_events` wrote."""
-    types = {field.name: {"str": str, "int": int}.get(str(field.type), float) for field in fields(Event)}
-    with path.open(encoding="utf-8", newline="") as file:
-        return [Event(**{name: types[name](value) for name, value in row.items() if value}) for row in csv.DictReader(file)]
+    """A table that `write_events` wrote; raises InputError for a file that is none, naming the line."""
+    remedy = "run scarpsim detect again"
+    table = csv.DictReader(io.StringIO(read_text(path, remedy=remedy)))
+    names = [field.name for field in fields(Event)]
+    found: list[Event] = []
+    try:
+        for row in table:
+            if list(row) not in (names, [name for name in names if name not in _PLACE]):
+                raise InputError("is no table of events", where=str(path), allowed=f"columns {', '.join(names)}", remedy=remedy)
+            found.append(_ROW.validate_python({name: value for name, value in row.items() if value or name not in _PLACE}))
+    except csv.Error as error:
+        raise InputError(f"is no table of events ({error})", where=str(path), remedy=remedy) from None
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        problem = f"'{wrong['loc'][0]}' is {wrong['input']!r:.80}"
+        allowed = "finite numbers, and an image's name"
+        raise InputError(problem, where=f"{path}, line {table.line_num}", allowed=allowed, remedy=remedy) from None
+    return found
 
 
 def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -29,8 +29,11 @@ def keras_ready() -> None:
 
 def check_installed() -> str:
     """The library that Keras computes with; raises InputError where it, or Keras, is not installed."""
-    backend = os.environ.setdefault("KERAS_BACKEND", "tensorflow")
-    missing = [name for name in ("keras", _MODULES.get(backend, backend)) if importlib.util.find_spec(name) is None]
+    backend = os.environ.get("KERAS_BACKEND") or "tensorflow"
+    os.environ["KERAS_BACKEND"] = backend
+    if backend not in _MODULES:
+        raise InputError(f"is '{backend}'", where="KERAS_BACKEND", allowed=", ".join(_MODULES), remedy="set it to one of them")
+    missing = [name for name in ("keras", _MODULES[backend]) if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(
             f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not installed",

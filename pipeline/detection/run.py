@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -78,10 +79,24 @@ def find_inputs(places: Sequence[Path]) -> list[Input]:
     for path, count in Counter(item.path for item in result).items():
         if count > 1:
             raise InputError(f"is given {count} times", where=str(path), remedy="name each map once")
+    result = _told_apart(result)
     own = [item.image.get("id") for item in result]
     if len(set(own)) < len(own) or None in own:
         result = [Input(item.path, item.name, {**item.image, "id": number}) for number, item in enumerate(result, start=1)]
     return result
+
+
+def _told_apart(inputs: Sequence[Input]) -> list[Input]:
+    """Maps of one file name, as those of two runs, with their folder before it, or with all of their path."""
+    inputs = list(inputs)
+    for longer in (lambda item: f"{item.path.parent.name}/{item.path.name}", lambda item: item.path.as_posix()):
+        count = Counter(item.name for item in inputs)
+        inputs = [item if count[item.name] == 1 else _renamed(item, longer(item)) for item in inputs]
+    return inputs
+
+
+def _renamed(item: Input, name: str) -> Input:
+    return Input(item.path, name, {**item.image, "file_name": name})
 
 
 def detect(
@@ -109,8 +124,9 @@ def detect(
             progress.advance(number / len(inputs))
     with progress.stage("results"):
         _write(results, confidences, out)
-        for number, result in enumerate(results if pictures else [], start=1):
-            _write_pictures(result, min(confidences), out)
+        stems = _stems(results)
+        for number, (result, stem) in enumerate(zip(results, stems, strict=True) if pictures else [], start=1):
+            _write_pictures(result, min(confidences), out, stem)
             progress.advance(number / len(results))
     return [event for result in results for event in result.events]
 
@@ -146,10 +162,19 @@ def _write(results: Sequence[_Result], confidences: Sequence[float], out: Path) 
         events.write_events([each for each in told if each.score >= confidence], out / f"events_{confidence:g}.csv")
 
 
-def _write_pictures(result: _Result, lowest: float, out: Path) -> None:
+def _stems(results: Sequence[_Result]) -> list[str]:
+    """A file name for each map's pictures, its own where a file can have it, numbered where two would be alike."""
+    stems: dict[str, None] = {}
+    for result in results:
+        stem = re.sub(r"[^\w.-]+", "_", result.item.name.rsplit(".", 1)[0])
+        names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+        stems[next(name for name in names if name not in stems)] = None
+    return list(stems)
+
+
+def _write_pictures(result: _Result, lowest: float, out: Path, stem: str) -> None:
     """The raster of masks and the overlay of a map, which is read again: all maps together may not fit the memory."""
     difference, grid = read_geotiff(result.item.path)
     sure = [each for each in result.found if each.score >= lowest]
-    stem = re.sub(r"[^\w.-]+", "_", result.item.name.rsplit(".", 1)[0])
     write_geotiff(out / f"{stem}_masks.tif", events.label_raster(sure, difference.shape), grid)
     write_overlay(difference, grid, sure, out / f"{stem}_detections.png")

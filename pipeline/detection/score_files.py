@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from pipeline.formats.atomic import write_json, write_text
 from pipeline.formats.coco import read_coco, read_detections
 from scene.errors import InputError, nearest
 
+_MOST_PAIRS = 25_000_000
+"""Of annotations and detections of one image, whose overlaps take 200 MB."""
 _KINDS: dict[Overlap, str] = {"segm": "masks", "bbox": "boxes"}
 
 
@@ -51,9 +54,20 @@ def assess(
     path = truth / "annotations.json" if truth.is_dir() else truth
     reference = read_coco(path, masks="segm" in kinds)
     found = read_detections(predictions, reference, masks="segm" in kinds)
+    _check_pairs(reference.annotations, found, str(predictions))
     groups = _groups(reference.images, keys, str(path))
     scores = [score for kind in kinds for score in evaluate(reference.to_dict(), found, groups, confidences, kind=kind)]
     return Assessment(scores, coco_metrics(reference.to_dict(), found, kinds[0]))
+
+
+def _check_pairs(truth: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]], where: str) -> None:
+    """Raise InputError where an image has so many annotations and detections that their overlaps take gigabytes."""
+    annotated, detected = (Counter(each["image_id"] for each in entries) for entries in (truth, found))
+    for image, count in detected.items():
+        if count * annotated[image] > _MOST_PAIRS:
+            problem = f"has {count:,} detections in image {image}, where the truth has {annotated[image]:,} blocks"
+            allowed, remedy = f"{_MOST_PAIRS:,} pairs of both", "cut the image into tiles, or leave the lowest scores out"
+            raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
 
 
 def as_text(assessment: Assessment) -> str:

@@ -11,7 +11,7 @@ import keras
 import numpy as np
 
 from pipeline.detection import weights
-from pipeline.detection.config import TrainConfig
+from pipeline.detection.config import BEST, CHECKPOINT, CURVES, EVENTS, TrainConfig
 from pipeline.detection.data import CocoFolder, batches
 from pipeline.detection.figures import write_loss_figure
 from pipeline.detection.model import LOSSES, MaskRCNN, total_loss
@@ -24,7 +24,6 @@ from scene.config import Config, parse
 from scene.errors import InputError
 from scene.regular_file import read_json
 
-CHECKPOINT, BEST = "checkpoint", "best"
 _STATE, _OPTIMIZER = "state.json", "optimizer.npz"
 
 
@@ -71,7 +70,7 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
         model.optimizer.build(model.trainable_variables)
         history = _begun(out, config, model, resume=resume)
     steps = -(-len(folders[0]) // training.batch)
-    logged = _EventLog(out / "events")
+    logged = _EventLog(out / EVENTS)
     epochs = {f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)}
     progress.plan({**epochs, "scores": 0.3})
     for epoch in range(len(history.training), training.epochs):
@@ -82,7 +81,7 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
             history.validation.append(_validate(model, folders[1], config))
             logged.add(epoch, history)
             _save(out, config, model, history)
-            write_loss_figure(history.training, history.validation, out / "losses.png")
+            write_loss_figure(history.training, history.validation, out / CURVES)
     with progress.stage("scores"):
         set_operating_point(out / BEST, folders[1])
     return history

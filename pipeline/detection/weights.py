@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import warnings
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from scene.errors import InputError
 from scene.regular_file import check_file
 
 CONFIG, WEIGHTS = "detector.yaml", "model.weights.h5"
+_REMEDY = "train again, or copy the whole folder"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -50,10 +52,38 @@ def load_config(folder: Path) -> DetectorConfig:
 def check_detector(folder: Path) -> None:
     """Raise InputError where a folder holds no detector, as far as it can be told without the network."""
     load_config(folder)
-    remedy = "train again, or copy the whole folder"
-    with check_file(folder / WEIGHTS, remedy=remedy).open("rb") as file:
+    with check_file(folder / WEIGHTS, remedy=_REMEDY).open("rb") as file:
         if file.read(len(_HDF5)) != _HDF5:
-            raise InputError("is no HDF5 file", where=str(folder / WEIGHTS), remedy=remedy)
+            raise InputError("is no HDF5 file", where=str(folder / WEIGHTS), remedy=_REMEDY)
+    _check_contents(folder / WEIGHTS)
+
+
+def _check_contents(path: Path) -> None:
+    """Raise InputError for numbers that are not in the file itself: in another one, or as many as are claimed and never written.
+
+    Without h5py there is no Keras either, which is said later.
+    """
+    if importlib.util.find_spec("h5py") is None:
+        return
+    import h5py  # type: ignore[import-untyped]
+
+    links: list[tuple[str, Any]] = []
+    size, claimed = path.stat().st_size, 0
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems_links(lambda name, link: links.append((name, link)))
+            outside = [name for name, link in links if not isinstance(link, h5py.HardLink)]
+            for item in (file[name] for name, _ in links if name not in outside):
+                if isinstance(item, h5py.Dataset):
+                    claimed += item.nbytes
+                    outside += [str(item.name)] if item.external else []
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        problem = f"is not a whole HDF5 file ({' '.join(str(error).split())[:200]})"
+        raise InputError(problem, where=str(path), remedy=_REMEDY) from None
+    if outside:
+        raise InputError(f"names data outside of it ('{outside[0]:.80}')", where=str(path), remedy=_REMEDY)
+    if claimed > size:
+        raise InputError(f"claims {claimed:,} bytes of weights in {size:,} bytes", where=str(path), remedy=_REMEDY)
 
 
 def load(folder: Path, *, image_px: int | None = None) -> Any:

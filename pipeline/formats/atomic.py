@@ -193,8 +193,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 with the line ends it has, whole or not at all."""
-    write_bytes(path, text.encode())
+    """Write `text` as UTF-8 with the line ends it has, whole or not at all; what is no character, such as the bytes of a file's
+    name in another encoding, is written as \\udcf6."""
+    write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -8,10 +8,12 @@ from pathlib import Path
 from scene.errors import InputError
 from scene.regular_file import check_file
 
+_MOST_BYTES = 16_000_000_000
+
 
 def sha256(path: Path) -> str:
-    """The checksum of a file, in hexadecimal; raises InputError where it cannot be read."""
-    check_file(path)
+    """The checksum of a file, in hexadecimal; raises InputError where it cannot be read, or is of a size that takes minutes."""
+    check_file(path, most_bytes=_MOST_BYTES, smaller="cut it to the scene")
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

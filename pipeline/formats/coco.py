@@ -16,6 +16,7 @@ from pydantic import ConfigDict, Field
 
 from pipeline.formats.coco_masks import BEYOND_PX, FORMS, run_lengths
 from pipeline.formats.geotiff import MOST_PIXELS
+from pipeline.formats.plain_json import without_nan
 from scene.config import Config, parse
 from scene.errors import InputError
 from scene.regular_file import read_json
@@ -170,7 +171,10 @@ def _no_coco(path: Path, problem: str) -> InputError:
 
 
 def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) -> Iterable[tuple[Entry, str]]:
-    """Each entry, of the right types and with an id of its own, and what it is called in a message."""
+    """Each entry, of the right types and with an id of its own, and what it is called in a message.
+
+    NaN and infinity in keys that are not COCO's become null: they have no place in what is written.
+    """
     seen: set[int] = set()
     for number, entry in enumerate(entries):
         own = entry.get("id") if isinstance(entry, Mapping) else None
@@ -186,7 +190,8 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
             raise InputError("its id is there twice", where=where, allowed="one of its own", remedy="number them anew")
         if own is not None:
             seen.add(own)
-        yield dict(entry), where
+        others = {key: without_nan(value) for key, value in entry.items() if key not in model.model_fields}
+        yield {**entry, **others}, where
 
 
 def _allowed(model: type[_Entry]) -> str:

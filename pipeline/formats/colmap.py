@@ -20,7 +20,7 @@ from pipeline.formats.opencv import OpencvInterior, shared_distortion
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.regular_file import read_text
-from sensors.camera import Camera
+from sensors.camera import Camera, Pose
 
 MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -32,6 +32,8 @@ MODELS = {
 }
 """Parameters of COLMAP's models that ours covers (where k4, k5 and k6 are zero), in the order of cameras.txt."""
 _PLACE = ("f", "fx", "fy", "cx", "cy")
+_LARGEST = 1e12
+"""No coordinate, pixel or lens parameter is larger; squares and products of such numbers stay finite."""
 _MAP_HEADER = re.compile(rb"(\d+)&(\d+)&(\d+)&")
 
 
@@ -48,7 +50,7 @@ def read_colmap(folder: Path) -> dict[str, Camera]:
         if words[8] not in interiors:
             raise InputError(f"names the camera {words[8]}, which cameras.txt does not hold", where=where)
         quaternion, translation = np.split(_numbers(words[1:8], where), [4])
-        if np.linalg.norm(quaternion) < 1e-9:
+        if np.abs(quaternion).max() < 1e-9:
             raise InputError("the quaternion is zero", where=where)
         rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix().T
         cameras[" ".join(words[9:])] = _camera(*interiors[words[8]], (-rotation @ translation, rotation))
@@ -116,7 +118,7 @@ def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]
     return records
 
 
-def _camera(words: list[str], where: str, pose: tuple[FloatArray, FloatArray]) -> Camera:
+def _camera(words: list[str], where: str, pose: Pose) -> Camera:
     model = words[1]
     if model not in MODELS:
         raise InputError(f"the camera model {model} is not covered by ours", where=where, allowed=", ".join(MODELS))
@@ -126,7 +128,7 @@ def _camera(words: list[str], where: str, pose: tuple[FloatArray, FloatArray]) -
     named = dict(zip(MODELS[model], values[2:].tolist(), strict=True))
     distortion = shared_distortion({name: value for name, value in named.items() if name not in _PLACE}, where)
     fx, fy = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
-    return OpencvInterior(fx, fy, named["cx"], named["cy"], **distortion).camera(int(values[0]), int(values[1]), pose)
+    return OpencvInterior(fx, fy, named["cx"], named["cy"], **distortion).camera(values[0], values[1], where, pose)
 
 
 def _interior(camera: Camera, where: str) -> str:
@@ -154,6 +156,6 @@ def _numbers(words: list[str], where: str) -> FloatArray:
         values = np.array([float(word) for word in words])
     except ValueError:
         values = np.array([np.nan])
-    if not np.isfinite(values).all():
-        raise InputError(f"expected numbers, got '{' '.join(words)[:60]}'", where=where)
+    if not (np.abs(values) <= _LARGEST).all():
+        raise InputError(f"expected numbers, got '{' '.join(words)[:60]}'", where=where, allowed=f"up to {_LARGEST:g}")
     return values

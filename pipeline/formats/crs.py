@@ -17,7 +17,7 @@ def wkt_of(name: str, where: str) -> str:
         raise InputError("needs pyproj, which is not installed", where=where, remedy="pip install 'scarpsim[crs]'") from None
     try:
         crs = CRS.from_user_input(name)
-    except CRSError as error:
+    except (CRSError, UnicodeError) as error:
         problem = f"is not understood: {name!r:.60} ({' '.join(str(error).split())[:100]})"
         raise InputError(problem, where=where, allowed="an EPSG code such as EPSG:28356, or WKT") from None
     if any(axis.unit_conversion_factor != 1 or "degree" in axis.unit_name for axis in crs.axis_info):

@@ -70,7 +70,7 @@ class Projection:
             ) from None
         try:
             crs = CRS.from_user_input(self.text)
-        except CRSError as error:
+        except (CRSError, UnicodeError) as error:
             problem = f"names a coordinate system that is not understood ({' '.join(str(error).split())[:100]})"
             raise InputError(problem, where=self.where, remedy=_REMEDY) from None
         self._check(crs)

@@ -6,8 +6,11 @@ Uncompressed: on a noisy difference map deflate saves a fifth and takes forty ti
 from __future__ import annotations
 
 import logging
+import lzma
 import math
 import struct
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +31,24 @@ _MASK_PAGE = 4
 MOST_PIXELS = 250_000_000
 """Of an image that is read, 1 GB as float32: a small compressed file can claim any size."""
 _LARGEST = 1e9
+_SIDES_M, _FARTHEST_M = (1e-6, 1e6), 1e8
+"""Of pixels, and how far from its origin any coordinate system of a survey reaches."""
+_DAMAGE = (
+    ValueError,
+    IndexError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ZeroDivisionError,
+    OverflowError,
+    RuntimeError,
+    MemoryError,
+)
+"""What tifffile raises where tags are none, do not fit one another, or ask for what is not installed."""
+_DECOMPRESSORS: dict[int, Callable[[], Any]] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+"""Of the kinds of compression by which some bytes become gigabytes."""
+_SLACK = 65_536
+"""Bytes that a compressed part of an image may be larger than a plain one."""
 _CITATION = "wall frame: x along the wall, y up the wall, z towards the sensors, metres"
 _MODEL_TYPE, _RASTER_TYPE, _CITATION_KEY, _LINEAR_UNITS = 1024, 1025, 1026, 3076
 _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
@@ -68,9 +89,10 @@ def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
     if scale is None or tie is None or len(tie) != 6 or not np.isclose(scale[0], scale[1], rtol=1e-9, atol=0):
         raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
     gsd = float(scale[0])
-    if not (0 < gsd < np.inf and np.isfinite(tie).all()):
+    if not (_SIDES_M[0] <= gsd <= _SIDES_M[1] and (np.abs(tie) <= _FARTHEST_M).all()):
         place = f"a pixel of {gsd:g} m with the tie point {', '.join(f'{value:g}' for value in tie)}"
-        raise InputError(f"has {place}", where=str(path), allowed="a positive side of finite pixels at a finite place")
+        allowed = f"sides of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m, numbers of up to {_FARTHEST_M:g} as a place"
+        raise InputError(f"has {place}", where=str(path), allowed=allowed, remedy="export it again, in metres")
     height, width = raster.shape
     return raster, Grid(float(tie[3] - tie[0] * gsd), float(tie[4] + tie[1] * gsd), gsd, width, height)
 
@@ -121,13 +143,14 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
             _check_size(page, path)
+            _check_parts(file, page)
             tags = {tag.code: tag.value for tag in page.tags}
             raster = page.asarray()
     except InputError:
         raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
-    except (tifffile.TiffFileError, ValueError, IndexError, KeyError, struct.error, MemoryError, TypeError) as error:
+    except (*_DAMAGE, tifffile.TiffFileError, zlib.error, lzma.LZMAError, struct.error) as error:
         problem = " ".join(str(error).split())
         raise InputError(f"is not a whole TIFF file ({problem})", where=str(path), remedy="export it again") from None
     if raster.ndim != 2 or raster.dtype.kind not in "fiub":
@@ -172,3 +195,17 @@ def _check_size(page: tifffile.TiffPage, path: Path) -> None:
             allowed=f"at most {MOST_PIXELS:,} px",
             remedy="cut it into parts, or export it with larger pixels",
         )
+
+
+def _check_parts(file: tifffile.TiffFile, page: tifffile.TiffPage) -> None:
+    """Raise ValueError for tiles or strips that hold more than their pixels, before any memory is taken for it."""
+    most = math.prod(page.chunks) * (page.dtype.itemsize if page.dtype else 1)
+    begin = _DECOMPRESSORS.get(int(page.compression))
+    for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False):
+        if count > 1.1 * most + _SLACK:
+            raise ValueError(f"a part of {count:,} bytes for {most:,} bytes of pixels")
+        if begin is None:
+            continue
+        file.filehandle.seek(offset)
+        if len(begin().decompress(file.filehandle.read(count), most + _SLACK)) == most + _SLACK:
+            raise ValueError(f"a part that becomes more than its {most:,} bytes of pixels")

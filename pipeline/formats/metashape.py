@@ -21,9 +21,11 @@ from pipeline.formats.geocentric import Projection, is_geocentric
 from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.regular_file import MOST_TEXT_BYTES, check_file
-from sensors.camera import Camera
+from sensors.camera import Camera, checked_camera
 
 _TAGS = {"f": "f_px", "cx": "cx_px", "cy": "cy_px"} | {name: name for name in ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")}
+_LARGEST = 1e12
+"""No coordinate, pixel or lens parameter is larger; products of such numbers stay finite."""
 
 
 @dataclass(frozen=True)
@@ -176,10 +178,7 @@ def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: Float
     left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation: takes out the similarity's scale
     if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:
         raise InputError("a camera's transform is no rotation with one scale", where=where)
-    width, height = size
-    camera = Camera(width, height, **interior, position=pose[:3, 3], rotation=left @ right)
-    camera.check_invertible()
-    return camera
+    return checked_camera(where, size, interior, (pose[:3, 3], left @ right))
 
 
 def _write_interior(element: ElementTree.Element, camera: Camera) -> None:
@@ -211,6 +210,6 @@ def _numbers(text: str, count: int, where: str) -> FloatArray:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.empty(0)
-    if len(values) != count or not np.isfinite(values).all():
+    if len(values) != count or not (np.abs(values) <= _LARGEST).all():
         raise InputError(f"expected {count} numbers, got '{' '.join(text.split())[:60]}'", where=where)
     return values

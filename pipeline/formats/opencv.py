@@ -20,11 +20,13 @@ import numpy as np
 from pipeline.formats.atomic import writing
 from scene.errors import InputError
 from scene.mesh import FloatArray
-from scene.regular_file import check_file
-from sensors.camera import INTERIOR, Camera
+from scene.regular_file import check_file, read_text
+from sensors.camera import INTERIOR, Camera, Pose, checked_camera
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """OpenCV's distortion coefficients in their order; a file may end after 4, 5, 8, 12 or 14 of them."""
+_MOST_BYTES = 4_000_000
+"""Of a calibration, which has some thousand."""
 _LENGTHS = (4, 5, 8, 12, 14)
 _SHARED = ("k1", "k2", "k3", "p1", "p2")
 _NAMES = {
@@ -63,14 +65,11 @@ class OpencvInterior:
         radial = camera.k1, camera.k2
         return cls(camera.f_px + camera.b1, camera.f_px, *principal, *radial, camera.p2, camera.p1, camera.k3)
 
-    def camera(self, width: int, height: int, pose: tuple[FloatArray, FloatArray] | None = None) -> Camera:
-        """The camera of this interior orientation; pose: (3,) position and (3, 3) camera to world, else at the origin."""
-        position, rotation = pose or (np.zeros(3), np.eye(3))
+    def camera(self, width: float, height: float, where: str, pose: Pose | None = None) -> Camera:
+        """The camera of this interior orientation; pose: in the world, else at the origin; where: what errors call it."""
         interior = dict.fromkeys(INTERIOR, 0.0) | {"f_px": self.fy, "b1": self.fx - self.fy, "p1": self.p2, "p2": self.p1}
         interior |= {"cx_px": self.cx - width / 2, "cy_px": self.cy - height / 2, "k1": self.k1, "k2": self.k2, "k3": self.k3}
-        camera = Camera(width, height, **interior, position=position, rotation=rotation)
-        camera.check_invertible()
-        return camera
+        return checked_camera(where, (width, height), interior, pose or (np.zeros(3), np.eye(3)))
 
 
 def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
@@ -87,8 +86,7 @@ def read_opencv(path: Path) -> Camera:
 
     Raises InputError for a file that is not OpenCV's, lacks a part or holds a coefficient that our model does not have.
     """
-    if not path.is_file():
-        raise InputError("is not there", where=str(path), remedy="check the path")
+    check_file(path, most_bytes=_MOST_BYTES)
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         parts = {part: _first(storage, names) for part, names in _NAMES.items()}
@@ -100,8 +98,9 @@ def read_opencv(path: Path) -> Camera:
             raise InputError(f"has no {part}", where=str(path), allowed=", ".join(_NAMES[part]))
     if np.ndim(parts["width"]) or np.ndim(parts["height"]):
         raise InputError("width and height are no numbers", where=str(path))
-    size = int(parts["width"]), int(parts["height"])
-    return _camera(size, np.asarray(parts["matrix"], float), np.ravel(parts["distortion"]), str(path))
+    return _camera(
+        (parts["width"], parts["height"]), np.asarray(parts["matrix"], float), np.ravel(parts["distortion"]), str(path)
+    )
 
 
 def write_opencv(path: Path, camera: Camera) -> None:
@@ -122,18 +121,16 @@ def write_opencv(path: Path, camera: Camera) -> None:
 
 def read_opencv_text(path: Path) -> Camera:
     """Read width, height, the nine elements of the camera matrix by rows and 4 to 14 distortion coefficients as plain numbers."""
-    check_file(path)
+    words = read_text(path, most_bytes=_MOST_BYTES).split()
     try:
-        values = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
+        values = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(f"holds something that is no number ({error})", where=str(path)) from None
     if len(values) < 15:
         raise InputError(
             f"holds {len(values)} numbers", where=str(path), allowed="2 (size), 9 (camera matrix), 4 to 14 (distortion)"
         )
-    return _camera((int(values[0]), int(values[1])), values[2:11].reshape(3, 3), values[11:], str(path))
+    return _camera((values[0], values[1]), values[2:11].reshape(3, 3), values[11:], str(path))
 
 
 def _first(storage: Any, names: tuple[str, ...]) -> Any:
@@ -145,7 +142,7 @@ def _first(storage: Any, names: tuple[str, ...]) -> Any:
     return node.real() if node.isReal() or node.isInt() else node.mat()
 
 
-def _camera(size: tuple[int, int], matrix: FloatArray, distortion: FloatArray, where: str) -> Camera:
+def _camera(size: tuple[float, float], matrix: FloatArray, distortion: FloatArray, where: str) -> Camera:
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(size) <= 0 or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise InputError("holds no camera matrix with positive fx, fy and frame size", where=where)
     if matrix[0, 1] != 0:
@@ -154,4 +151,4 @@ def _camera(size: tuple[int, int], matrix: FloatArray, distortion: FloatArray, w
         raise InputError(f"holds {len(distortion)} distortion coefficients", where=where, allowed="4, 5, 8, 12 or 14")
     coefficients = dict(zip(DISTORTION, distortion.astype(float).tolist(), strict=False))
     fx, fy, cx, cy = (float(value) for value in matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
-    return OpencvInterior(fx, fy, cx + 0.5, cy + 0.5, **shared_distortion(coefficients, where)).camera(*size)
+    return OpencvInterior(fx, fy, cx + 0.5, cy + 0.5, **shared_distortion(coefficients, where)).camera(*size, where)

@@ -6,7 +6,6 @@ left: world = [x y z 1] M) and a line `x y z intensity [r g b]` for each cell, c
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import FloatArray
-from scene.regular_file import check_file
+from scene.regular_file import bounded_lines, check_file
 
 _LINES_BEFORE_POINTS = 10
 _LONGEST_LINE = 4096
@@ -63,7 +62,7 @@ def _scans(file: TextIO) -> Iterator[PtxScan]:
 
 
 def _table(file: TextIO, count: int) -> FloatArray:
-    table = np.loadtxt(itertools.islice(file, count), ndmin=2)
+    table = np.loadtxt(bounded_lines(file, count), ndmin=2)
     if len(table) < count or table.shape[1] < 4:
         raise ValueError(f"{len(table):,} lines of {table.shape[1]} numbers, for {count:,} cells of x y z intensity")
     return np.asarray(table, dtype=np.float64)

@@ -5,14 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
 
 from scene.config import parse
 from scene.regular_file import read_json
 
 RUN_FILE, GAP_FILE = "run.json", "gap.json"
-_Box = Annotated[list[float], Field(min_length=6, max_length=6)]
-_Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+_FARTHEST_M, _FEW_DIGITS = 1e8, 1e-6
+"""No coordinate system of a survey reaches farther; and how far a rotation may be from orthonormal."""
+_Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+_Box = Annotated[list[_Coordinate], Field(min_length=6, max_length=6)]
+_Vector = Annotated[list[_Coordinate], Field(min_length=3, max_length=3)]
 
 
 class _Record(BaseModel):
@@ -25,9 +29,17 @@ class _Registration(_Record):
     rotation: Annotated[list[_Vector], Field(min_length=3, max_length=3)]
     translation_m: _Vector
 
+    @field_validator("rotation")
+    @classmethod
+    def _orthonormal(cls, rotation: list[list[float]]) -> list[list[float]]:
+        rows = np.array(rotation)
+        if np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS or np.linalg.det(rows) < 0:
+            raise ValueError("is no rotation matrix")
+        return rotation
+
 
 class _Statistics(_Record):
-    sigma_m: float = Field(gt=0)
+    sigma_m: float = Field(gt=0, le=_FARTHEST_M)
 
 
 class _Block(_Record):
@@ -75,8 +87,8 @@ class _Effect(_Record):
 class _Gap(_Record):
     sensor: Literal["stereo", "tls"]
     verdict: str
-    scene_changes: list[_Change] = []
-    effects: list[_Effect] = []
+    scene_changes: list[_Change] = Field([], max_length=10_000)
+    effects: list[_Effect] = Field([], max_length=100)
 
 
 def read_run(path: Path, remedy: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,10 +17,15 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @contextmanager
 def plain_text(figure: Figure) -> Iterator[None]:
-    """Draw a figure inside: none of its texts is taken for Matplotlib's mathematics; a logarithmic axis needs plain labels."""
-    with rc_context({"text.parse_math": False}):  # for the ticks, whose texts are made while drawing
+    """Draw a figure inside: none of its texts is taken for Matplotlib's mathematics; a logarithmic axis needs plain labels.
+
+    Control characters, halves of characters and what the font lacks become boxes.
+    """
+    with rc_context({"text.parse_math": False}), warnings.catch_warnings():  # for the ticks, whose texts are made while drawing
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
         for text in figure.findobj(Text):
             text.set_parse_math(False)
+            text.set_text("".join(each if each.isprintable() or each == "\n" else "\ufffd" for each in text.get_text()))
         yield
 
 

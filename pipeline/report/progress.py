@@ -130,9 +130,9 @@ class LineProgress(Progress):
 
 
 def shown_progress(*, quiet: bool = False, stream: TextIO | None = None) -> Progress:
-    """The progress for a command: a bar on a terminal, plain lines elsewhere, nothing where `quiet`; on stderr."""
+    """The progress for a command: a bar on a terminal, plain lines elsewhere, nothing where `quiet`; on stderr, if it is open."""
     stream = stream or sys.stderr
-    if quiet:
+    if quiet or stream is None:
         return Progress()
     if not stream.isatty():
         return LineProgress(stream)

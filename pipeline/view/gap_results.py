@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.formats.laz import read_laz
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points import check_reach
 from pipeline.formats.result_records import GAP_FILE, read_gap
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, inside
 from scene.errors import InputError
@@ -20,7 +21,11 @@ from scene.mesh import FloatArray
 
 _MM = 1e3
 _POINTS_PER_CELL = 4
+_CHANNELS = ("residual_m", "held_out")
+_FEWEST = 3
 _FAR_M = 1e6
+_MOST_TOGETHER = 4
+"""Effects of which every choice can be shown; of more each by itself."""
 _QUANTILE = 0.98
 
 
@@ -37,13 +42,11 @@ class GapResults:
         """Raises InputError where a file of the diagnosis is absent or damaged."""
         self._record = read_gap(folder / GAP_FILE)
         self.title = f"{folder.name}: {INSTRUMENTS[self._record['sensor']]}, verdict: {self._record['verdict'].replace('_', ' ')}"
-        self._clouds = {step: read_laz(folder / f"{step}.laz") for step in ("before", "after")}
+        self._clouds = {step: _cloud(folder / f"{step}.laz") for step in ("before", "after")}
         names = [each["name"] for each in self._record.get("effects", [])]
         self._clouds |= _in_part(self._clouds["before"], names)
         self.steps = {step: _in_words(step, names) for step in ("before", *list(self._clouds)[2:], "after")}
         before = self._clouds["before"].points
-        if len(before) < 3:
-            raise InputError("holds too few points to show", where=str(folder))
         self._frame = _frame(before)
         self._local = {step: self._frame.to_wall(cloud.points) for step, cloud in self._clouds.items()}
         self._limit = float(np.quantile(np.abs(_residual(self._clouds["before"])), _QUANTILE)) or 1.0
@@ -100,7 +103,7 @@ class GapResults:
 
 
 def _in_part(before: PointCloud, names: list[str]) -> dict[str, PointCloud]:
-    """The points with the residuals that are left with some of several effects in the model, by the effects' numbers: "1", "13".
+    """The points with the residuals that are left with some of several effects in the model, by the effects' numbers: "1", "1 3".
 
     Empty where before.laz does not say what each effect takes away.
     """
@@ -108,11 +111,12 @@ def _in_part(before: PointCloud, names: list[str]) -> dict[str, PointCloud]:
     if len(parts) < 2 or any(part is None for part in parts):
         return {}
     numbers = range(1, len(names) + 1)
-    some = [chosen for size in range(1, len(names)) for chosen in combinations(numbers, size)]
+    sizes = range(1, len(names)) if len(names) <= _MOST_TOGETHER else (1,)
+    some = [chosen for size in sizes for chosen in combinations(numbers, size)]
     clouds = {}
     for chosen in some:
         left = before.extra["residual_m"] - sum(np.asarray(parts[number - 1]) for number in chosen)
-        clouds["".join(map(str, chosen))] = replace(before, extra={**before.extra, "residual_m": left})
+        clouds[" ".join(map(str, chosen))] = replace(before, extra={**before.extra, "residual_m": left})
     return clouds
 
 
@@ -120,8 +124,24 @@ def _in_words(step: str, names: list[str]) -> str:
     if step == "before":
         return "before: model as it was"
     return (
-        "after: with what was named" if step == "after" else f"with {' and '.join(names[int(each) - 1] for each in step)} alone"
+        "after: with what was named"
+        if step == "after"
+        else f"with {' and '.join(names[int(each) - 1] for each in step.split())} alone"
     )
+
+
+def _cloud(path: Path) -> PointCloud:
+    """A file of a diagnosis; raises InputError where it is another cloud."""
+    cloud, remedy = read_laz(path), "run scarpsim gap again"
+    missing = [name for name in _CHANNELS if name not in cloud.extra]
+    if missing:
+        raise InputError(f"has no channel {missing[0]}", where=str(path), allowed="a file of scarpsim gap", remedy=remedy)
+    if not all(np.isfinite(cloud.extra[name]).all() and cloud.extra[name].ndim == 1 for name in _CHANNELS):
+        raise InputError(f"has values in {' or '.join(_CHANNELS)} that are no numbers", where=str(path), remedy=remedy)
+    if len(cloud.points) < _FEWEST:
+        raise InputError(f"holds {len(cloud.points)} points", where=str(path), allowed=f"at least {_FEWEST}", remedy=remedy)
+    check_reach(cloud.points, str(path))
+    return cloud
 
 
 def _residual(cloud: PointCloud) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.difference import SurfaceRaster, surface_raster
+from pipeline.detection.events import Event, read_events
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.laz import read_laz
 from pipeline.formats.ply import read_ply
@@ -117,12 +117,13 @@ def _thinned(index: NDArray[np.integer], budget: int) -> NDArray[np.integer]:
 
 def _block(block: dict[str, Any]) -> Item:
     x0, y0, z0, x1, y1, z1 = block["bbox_m"]
+    depth = block["measured_mean_depth_m"]
     facts = {
         "shape": block["shape"],
         "size": " x ".join(f"{side:.2f}" for side in block["size_m"]) + " m",
         "volume": f"{block['volume_m3']:.4g} m³",
         "measured volume": f"{block['measured_volume_m3']:.4g} m³" if block["measured_area_m2"] else "not seen",
-        "measured depth": f"{block['measured_mean_depth_m'] * _MM:.0f} mm" if block["measured_area_m2"] else "not seen",
+        "measured depth": "not seen" if depth is None else f"{depth * _MM:.0f} mm",
         "position": ", ".join(f"{value:.2f}" for value in block["position_m"]) + " m",
     }
     return Item("block", f"block {block['label']}", (x0, x1, y0, y1, z0, z1), facts)
@@ -130,24 +131,34 @@ def _block(block: dict[str, Any]) -> Item:
 
 def _detections(folder: Path) -> dict[str, list[Item]]:
     """The events of `scarpsim detect` at its lowest confidence, by epoch."""
-    tables = sorted(folder.glob("events_*.csv"), key=lambda path: float(path.stem.removeprefix("events_")))
+    tables = sorted((_confidence(path), path) for path in folder.glob("events_*.csv"))
     if not tables:
         raise InputError("holds no events_*.csv", where=str(folder), remedy="give the folder that scarpsim detect filled")
     found: dict[str, list[Item]] = {}
-    with tables[0].open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            number = re.search(r"difference_(\d+)", row["image"])
-            if number:
-                found.setdefault(str(int(number[1])), []).append(_detection(row))
+    for event in read_events(tables[0][1]):
+        number = re.search(r"difference_(\d{1,9})", event.image)
+        if number:
+            found.setdefault(str(int(number[1])), []).append(_detection(event))
     return found
 
 
-def _detection(row: dict[str, str]) -> Item:
-    x, y, width, height = (float(row[name]) for name in ("x_m", "y_m", "width_m", "height_m"))
+def _confidence(path: Path) -> float:
+    """The confidence in the name of a table of events."""
+    try:
+        value = float(path.stem.removeprefix("events_"))
+    except ValueError:
+        value = np.nan
+    if not 0 <= value <= 1:
+        raise InputError("is no name of a table of events", where=str(path), allowed="such as events_0.9.csv")
+    return value
+
+
+def _detection(event: Event) -> Item:
     facts = {
-        "score": f"{float(row['score']):.3f}",
-        "volume": f"{float(row['volume_m3']):.4g} m³",
-        "largest depth": f"{float(row['depth_m']) * _MM:.0f} mm",
+        "score": f"{event.score:.3f}",
+        "volume": f"{event.volume_m3:.4g} m³",
+        "largest depth": f"{event.depth_m * _MM:.0f} mm",
     }
-    box = (x - width / 2, x + width / 2, y - height / 2, y + height / 2, np.nan, np.nan)
-    return Item("detection", f"detection {row['number']}", box, facts)
+    half_width, half_height = event.width_m / 2, event.height_m / 2
+    box = (event.x_m - half_width, event.x_m + half_width, event.y_m - half_height, event.y_m + half_height, np.nan, np.nan)
+    return Item("detection", f"detection {event.number}", box, facts)

@@ -23,7 +23,7 @@ from pipeline.view.page import layout, register_callbacks
 from pipeline.view.results import Results
 from pipeline.view.run_results import RunResults
 from pipeline.view.tile_results import TileResults
-from scene.errors import InputError
+from scene.errors import InputError, one_line
 
 HOST = "127.0.0.1"
 _NO_TOKEN = "Take the whole address that scarpsim view said, with its token."
@@ -67,6 +67,7 @@ def make_app(results: Results, token: str, other: Results | None = None) -> dash
         title=html.escape(f"scarpsim: {results.title}"),  # Dash puts it into the page as it is
         update_title="",
         assets_folder=str(Path(__file__).parent / "assets"),
+        on_error=_tell,
     )
     app.layout = layout(results, other)
     register_callbacks(app, results, threading.Lock(), other)
@@ -110,6 +111,12 @@ def serve(folder: Path, second: Path | None, detections: Path | None, port: int,
         return
     finally:
         server.server_close()
+
+
+def _tell(error: Exception) -> None:
+    """Say on the page what is wrong with a file that it was to show; the pictures stay as they are."""
+    fault = "" if isinstance(error, InputError) else f"unexpected fault of the program, {type(error).__name__}: "
+    dash.set_props("note", {"children": f"{fault}{one_line(str(error))}"})
 
 
 def _refuse_other_names() -> Any:

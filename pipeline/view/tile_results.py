@@ -33,7 +33,7 @@ class TileResults:
         self._map = lru_cache(8)(read_geotiff)
 
     def layers(self, step: str) -> list[Layer]:
-        sigma = self._images[step].get("noise_sigma_m", _SIGMA_M)
+        sigma = _number(self._images[step].get("noise_sigma_m")) or _SIGMA_M
         return [
             Layer(
                 "difference",
@@ -60,15 +60,20 @@ class TileResults:
         return [_block(each, grid.x_min, grid.y_max, grid.gsd) for each in found]
 
 
+def _number(value: Any) -> float | None:
+    """What a key of another program may hold, if it is a finite number of at least 0, as all that is shown here."""
+    return value if isinstance(value, int | float) and 0 <= value < np.inf else None
+
+
 def _block(annotation: dict[str, Any], x_min: float, y_max: float, gsd: float) -> Item:
     column, row, width, height = annotation["bbox"]
     x0, y1 = x_min + column * gsd, y_max - row * gsd
     known = {"volume_m3": "m³", "measured_volume_m3": "m³", "depth_m": "m", "share_in_tile": ""}
     facts = {
-        key.removesuffix("_m3").removesuffix("_m").replace("_", " "): f"{annotation[key]:.4g} {unit}".strip()
+        key.removesuffix("_m3").removesuffix("_m").replace("_", " "): f"{value:.4g} {unit}".strip()
         for key, unit in known.items()
-        if annotation.get(key) is not None
+        if (value := _number(annotation.get(key))) is not None
     }
-    facts |= {"shape": annotation["shape"]} if "shape" in annotation else {}
+    facts |= {"shape": str(annotation["shape"])} if "shape" in annotation else {}
     box = (x0, x0 + width * gsd, y1 - height * gsd, y1, np.nan, np.nan)
     return Item("block", f"block {annotation.get('block', annotation['id'])}", box, facts)

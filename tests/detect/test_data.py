@@ -25,6 +25,7 @@ from pipeline.detection.keras_backend import stderr_dropped
 from pipeline.detection.normalisation import denormalised, nmad, normalised
 from pipeline.detection.run import detect, find_inputs
 from pipeline.detection.schedule import has_settled, learning_rate
+from pipeline.formats.geotiff import write_geotiff
 from scene.errors import InputError
 from scene.grid import Grid
 
@@ -258,3 +259,16 @@ def test_what_libraries_write_is_dropped_unless_they_fail(capfd):
     with pytest.raises(ImportError), stderr_dropped():
         failing()
     assert capfd.readouterr().err == "between the reason"
+
+
+def test_maps_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    """Two runs: each map has its own name in the tables, and its own pictures."""
+    values = np.where(np.arange(900).reshape(30, 30) % 31 == 0, 0.5, 0.0).astype(np.float32)
+    for name in ("a/difference_001.tif", "b/difference_001.tif", "b/x y.tif", "b/x_y.tif"):
+        write_geotiff(tmp_path / name, values, Grid(0.0, 3.0, 0.1, 30, 30))
+    places = [tmp_path / "a", tmp_path / "b", tmp_path / "b/x y.tif", tmp_path / "b/x_y.tif"]
+    assert [item.name for item in find_inputs(places)] == ["a/difference_001.tif", "b/difference_001.tif", "x y.tif", "x_y.tif"]
+    assert [item.image["file_name"] for item in find_inputs(places)][:2] == ["a/difference_001.tif", "b/difference_001.tif"]
+    detect("baseline", places, tmp_path / "out")
+    stems = ("a_difference_001", "b_difference_001", "x_y", "x_y_2")
+    assert {path.name for path in (tmp_path / "out").glob("*_masks.tif")} == {f"{stem}_masks.tif" for stem in stems}

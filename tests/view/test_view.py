@@ -151,6 +151,71 @@ def test_detections_lie_where_they_were_found(run: Path, tmp_path: Path) -> None
         open_results(run, tmp_path / "other")
 
 
+ROW = {"image": "difference_001.tif", "number": "1", "x_m": "3", "y_m": "2", "width_m": "1", "height_m": "0.4", "area_m2": "0.3"}
+ROW |= {"depth_m": "0.1", "mean_depth_m": "0.05", "volume_m3": "0.015", "score": "0.9"}
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "said"),
+    [
+        ("events_all.csv", ROW, "no name of a table"),
+        ("events_nan.csv", ROW, "no name of a table"),
+        ("events_0.9.csv", {**ROW, "x_m": "left"}, "line 2: 'x_m' is 'left'"),
+        ("events_0.9.csv", {**ROW, "x_m": "nan"}, "finite numbers"),
+        ("events_0.9.csv", {"image": "a.tif"}, "is no table of events"),
+        ("events_0.9.csv", {**ROW, "more": "1"}, "is no table of events"),
+    ],
+)
+def test_tables_of_events_that_are_none_are_told(name: str, row: dict[str, str], said: str, run: Path, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(f"{','.join(row)}\n{','.join(row.values())}\n")
+    with pytest.raises(InputError, match=re.escape(said)):
+        open_results(run, tmp_path)
+    (tmp_path / name).unlink()
+    (tmp_path / "events_0.9.csv").write_text(f"{','.join(ROW)}\n{','.join(ROW.values())}\n")
+    assert open_results(run, tmp_path).items("1")[-1].box[:4] == (2.5, 3.5, 1.8, 2.2)
+
+
+def test_clouds_that_are_of_no_diagnosis_are_told(gap: Path, tmp_path: Path) -> None:
+    cloud = read_laz(gap / "before.laz")
+    for extra, points, said in (
+        ({}, cloud.points, "no channel residual_m"),
+        ({"residual_m": cloud.extra["residual_m"]}, cloud.points, "no channel held_out"),
+        ({**cloud.extra, "residual_m": cloud.extra["residual_m"] * np.nan}, cloud.points, "no numbers"),
+        ({key: value[:2] for key, value in cloud.extra.items()}, cloud.points[:2], "holds 2 points"),
+    ):
+        shutil.copytree(gap, tmp_path / said)
+        write_laz(tmp_path / said / "after.laz", PointCloud(points, extra=extra))
+        with pytest.raises(InputError, match=said):
+            open_results(tmp_path / said)
+
+
+def test_keys_of_others_in_a_tile_are_shown_as_far_as_they_are_numbers(tiles: Path, tmp_path: Path) -> None:
+    shutil.copytree(tiles, tmp_path / "test")
+    path = tmp_path / "test/annotations.json"
+    content = json.loads(path.read_text())
+    content["images"][0]["noise_sigma_m"] = "low"
+    content["annotations"][0] |= {"volume_m3": "much", "depth_m": 0.5, "shape": ["cube"]}
+    path.write_text(json.dumps(content))
+    results = open_results(tmp_path / "test")
+    assert results.layers("7")[0].limit > 0
+    assert results.items("7")[0].facts == {"depth": "0.5 m", "shape": "['cube']"}
+
+
+def test_a_file_that_breaks_under_the_page_is_told_on_it(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    client = make_app(open_results(tmp_path / "run"), TOKEN).server.test_client()
+    (tmp_path / "run/difference_001.tif").write_bytes(b"II*\0")
+    client.get(f"/?token={TOKEN}", headers={"Host": "127.0.0.1"})
+    values = {"step": "1", "layer": "difference", "surface": "surface", "shown": ["surface"], "item": None, "window": None}
+    inputs = [{"id": name, "property": "data" if name == "window" else "value", "value": value} for name, value in values.items()]
+    outputs = [{"id": "wall", "property": "figure"}, {"id": "map", "property": "figure"}, {"id": "note", "property": "children"}]
+    asked = {"output": "..wall.figure...map.figure...note.children..", "outputs": outputs, "inputs": inputs}
+    body = {**asked, "changedPropIds": ["step.value"], "parsedChangedPropsIds": ["step.value"]}
+    answer = client.post("/_dash-update-component", json=body, headers={"Host": "127.0.0.1"})
+    assert answer.status_code == 200
+    assert "difference_001.tif" in answer.get_json()["sideUpdate"]["note"]["children"]
+
+
 def test_a_diagnosis_in_the_wall_s_own_frame(gap: Path) -> None:
     """The wall is 20 x 10 m in its own plane, x runs along it, and the residual grows with x: 0 to 20 mm."""
     results = open_results(gap)
