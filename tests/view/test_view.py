@@ -29,9 +29,8 @@ from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.run.simulation import simulate
 from pipeline.view.beside import Pair, beside, border
-from pipeline.view.figures import map_figure, wall_figure
-from pipeline.view.page import clicked, following, pictures, zoom
-from pipeline.view.results import Item, Layer, Patch, ViewWindow, cut
+from pipeline.view.page import following, pictures
+from pipeline.view.results import Item, Patch, ViewWindow, cut
 from pipeline.view.server import cookie_name, make_app, make_page_server, open_results, open_second
 from scene.config import parse
 from scene.errors import InputError
@@ -207,6 +206,7 @@ def test_a_file_that_breaks_under_the_page_is_told_on_it(run: Path, tmp_path: Pa
     (tmp_path / "run/difference_001.tif").write_bytes(b"II*\0")
     client.get(f"/?token={TOKEN}", headers={"Host": "127.0.0.1"})
     values = {"step": "1", "layer": "difference", "surface": "surface", "shown": ["surface"], "item": None, "window": None}
+    values |= {"beside": "", "border": 50}
     inputs = [{"id": name, "property": "data" if name == "window" else "value", "value": value} for name, value in values.items()]
     outputs = [{"id": "wall", "property": "figure"}, {"id": "map", "property": "figure"}, {"id": "note", "property": "children"}]
     asked = {"output": "..wall.figure...map.figure...note.children..", "outputs": outputs, "inputs": inputs}
@@ -318,39 +318,6 @@ def test_windows_beyond_the_raster_keep_a_pixel() -> None:
         rows, columns, factor = cut(grid, window, 100)
         assert (rows.stop > rows.start, columns.stop > columns.start, factor) == (True, True, 1)
     assert cut(grid, None, 2)[2] == 10
-
-
-def patch_of(values: np.ndarray) -> Patch:
-    height, width = values.shape
-    return Patch(
-        np.arange(width, dtype=float), np.arange(height)[::-1].astype(float), 0 * values, values, (values > 5).astype(int), 1
-    )
-
-
-def test_the_figures_are_about_zero_and_name_their_items() -> None:
-    layer = Layer("difference", "reference minus epoch", "mm", 1e3, diverging=True, limit=6.0)
-    block = Item("block", "block 1", (1, 2, 1, 2, -0.1, 0.1), {"volume": "1 m³"})
-    items = [block, Item("detection", "detection 1", (2, 3, 0, 1, np.nan, np.nan))]
-    far = Item("block", "block 9", (90, 92, 1, 2, 0, 1))
-    patch = patch_of(np.arange(20.0).reshape(4, 5))
-    wall = wall_figure(patch, None, [*items, far], layer, ["surface", "block", "detection"], 0)
-    surface = wall.data[0]
-    assert (surface.cmin, surface.cmax) == (-6, 6)
-    assert surface.colorscale[0][1] != surface.colorscale[-1][1]
-    handles = [trace for trace in wall.data[1:] if trace.mode == "markers"]
-    assert [list(map(list, trace.customdata)) for trace in handles] == [[[0]], [[1]]]  # block 9 is not in the window
-    assert handles[0].text[0] == "<b>block 1</b><br>volume: 1 m³"
-    flat = map_figure(patch, items, layer, ["surface"], None)
-    assert [trace.type for trace in flat.data] == ["heatmap"]
-
-
-def test_clicks_and_zooms() -> None:
-    assert clicked({"points": [{"customdata": [3], "text": "block"}]}) == 3
-    assert clicked({"points": [{"customdata": 3.5, "text": ""}]}) is None
-    assert clicked(None) is None
-    ranges = {"xaxis.range[0]": 1, "xaxis.range[1]": 2, "yaxis.range[0]": 3, "yaxis.range[1]": 4}
-    assert zoom(ranges, None) == [1, 2, 3, 4]
-    assert zoom({"xaxis.autorange": True}, [1, 2, 3, 4]) is None
 
 
 @pytest.mark.parametrize(
@@ -469,26 +436,6 @@ def open_results_of_nothing() -> Any:
             return []
 
     return Nothing()
-
-
-@pytest.mark.parametrize(("width", "height"), [(24.0, 15.0), (100.0, 30.0), (3.0, 3.0), (5.0, 20.0)])
-def test_the_first_view_holds_the_whole_wall(width: float, height: float) -> None:
-    """Plotly's camera: 45 degrees up and down, at the eye, towards the middle; units in which the extents' product is 1."""
-    x, y = np.linspace(0, width, 9), np.linspace(0, height, 7)
-    relief = np.add.outer(np.sin(y), np.sin(x))
-    patch = Patch(x, y, relief, relief, np.zeros((7, 9), dtype=int), 1)
-    figure = wall_figure(patch, None, [], Layer("difference", "difference", "mm", 10.0), {"surface"})
-    eye = np.array([figure.layout.scene.camera.eye[axis] for axis in "xyz"])
-    extent = np.array([width, height, np.ptp(relief)])
-    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, 8).T * extent / np.cbrt(extent.prod())
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    seen = corners - eye
-    tangent = np.abs(seen @ np.stack([right, np.cross(right, forward)], axis=1)) / (seen @ forward)[:, None]
-    assert tangent[:, 1].max() < np.tan(np.radians(22.5))
-    assert tangent[:, 0].max() < 1.5 * np.tan(np.radians(22.5))
-    assert tangent.max() > 0.6 * np.tan(np.radians(22.5))  # and is no speck in it
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; the server's answers are tested above")
