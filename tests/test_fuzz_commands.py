@@ -37,6 +37,7 @@ DOORS = (
     "pipeline.gap.survey.identifiability:identifiability",
     "pipeline.detection.run:_write",
     "pipeline.surface.from_cloud:surface_of_cloud",
+    "pipeline.view.server:make_server",
 )
 """Where work begins after all files are read; there the commands end here as for wrong input."""
 _MOST_BYTES = 2e9

@@ -81,7 +81,8 @@ def tried(case: Case, materials: Path, folder: Path, forked_from: Preloaded | No
 @contextmanager
 def _port_in_use() -> Iterator[None]:
     with socket.socket() as held:
-        with suppress(OSError):  # is held already, by another case
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)  # other cases hold it too, and let go earlier
+        with suppress(OSError):
             held.bind(("127.0.0.1", PORT_IN_USE))
             held.listen()
         yield
