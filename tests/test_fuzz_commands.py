@@ -36,6 +36,7 @@ DOORS = (
     "pipeline.gap.naming.workflow:diagnose",
     "pipeline.gap.survey.identifiability:identifiability",
     "pipeline.detection.run:_write",
+    "pipeline.export.pictures:save_picture",
     "pipeline.surface.from_cloud:surface_of_cloud",
     "pipeline.view.server:make_server",
 )

@@ -52,6 +52,7 @@ _PAIR = ("measurement.yaml", "model.yaml", "cameras.yaml", "surface.xyz", "wall.
 _SURFACES = tuple(f"run/epoch_{number:03d}/{name}.ply" for number in (0, 1) for name in ("surface", "truth"))
 _RAW = ("raw/scan.ply", "raw/wall.ply")
 _RAW_WORDS = ("raw/scan.ply", "--reference", "raw/wall.ply", "--scanner", "riegl_vz400i", "--position", "0,0,0")
+_OUT_PNG = ("--out", "out.png", "--quiet")
 _VIEW = ("--no-browser", "--port", str(PORT_IN_USE))
 _ANNOTATIONS = ("set/train/annotations.json", "set/val/annotations.json")
 _WHOLE_SET = ("set/dataset.json", "set/checksums.sha256", *_ANNOTATIONS)
@@ -105,6 +106,12 @@ SET_UPS: dict[str, tuple[SetUp, ...]] = {
         SetUp(("run", "--detections", "events", *_VIEW), ("run", "events"), (RUN, "events/events_0.9.csv")),
         SetUp(("diagnosis", *_VIEW), ("diagnosis",), ("diagnosis/gap.json", "diagnosis/before.laz", "diagnosis/after.laz")),
         SetUp(("set/train", *_VIEW), ("set",), _ANNOTATIONS[:1]),
+    ),
+    "export": (
+        SetUp(("run", "picture", *_OUT_PNG), ("run",), (RUN, MAP)),
+        SetUp(("run", "gltf", "--out", "out.glb", "--quiet"), ("run",), (RUN, MAP, *_SURFACES)),
+        SetUp(("set", "yolo", *_OUT), ("set",), _WHOLE_SET),
+        SetUp(("run", "package", "--out", "out.json", "--quiet"), ("run",), (RUN, MAP)),
     ),
     "surface": (SetUp(("raw/scan.ply", "--seen-from", "0", "0", "0", "--out", "out.ply", "--quiet"), ("raw",), _RAW[:1]),),
     "init": (SetUp(("--mesh", "raw/wall.ply", "--out", "new.yaml"), ("raw",), _RAW[1:]),),
