@@ -49,6 +49,8 @@ def _held(path: Path) -> TextIO:
     """The open lock file, locked and empty."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not path.is_file():
+            raise InputError("is no file", where=str(path), allowed="a lock file or none", remedy="remove it")
         try:
             file = path.open("a+", encoding="utf-8")
         except FileNotFoundError:  # the last holder has just removed the folder that it made

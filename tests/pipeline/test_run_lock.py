@@ -63,6 +63,14 @@ def test_a_run_is_not_resumed_while_it_goes_on(tmp_path: Path, monkeypatch: pyte
     assert not list(out.rglob(".*"))
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_stands_where_the_lock_should_is_refused_and_stays(make: Callable[[Path], None], tmp_path: Path) -> None:
+    make(tmp_path / LOCK)
+    with pytest.raises(InputError, match="is no file"), locked(tmp_path):
+        pass
+    assert (tmp_path / LOCK).exists()
+
+
 def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
     """kill -9 leaves the lock's file, and nobody holds it."""
     program = (
