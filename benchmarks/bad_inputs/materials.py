@@ -56,40 +56,36 @@ WIDTH, HEIGHT = 48, 32
 def make_materials(folder: Path, *, diagnosed: bool = True) -> None:
     """site.yaml, set.yaml; run/, set/, measurement/, raw/, pair/, detector/, diagnosis/; truth.json, found.json. diagnosed:
     whether diagnosis/, which takes longest, is among them. Raises RuntimeError where a command fails on them."""
-    folder.mkdir(parents=True)
-    (folder / "site.yaml").write_text(yaml.safe_dump(SITE))
-    (folder / "set.yaml").write_text(yaml.safe_dump(SET))
-    _coco(folder)
-    shutil.copytree(configs_folder() / "detectors/default", folder / "detector")
-    for name, sensor in (("measurement", "tls"), ("pair", "stereo")):
-        make(Case(0, (7, 1), "one", sensor, (), 4_000, 4_000), folder / name, folder / f"{name}_truth.json")
-    _raw(folder)
-    _called("simulate", "--sensor", "tls", "--config", str(folder / "site.yaml"), "--out", str(folder / "run"))
-    _called("dataset", str(folder / "set.yaml"), "--out", str(folder / "set"))
+    _make_all(folder, SITE, SET, 4_000)
     if diagnosed:
         _called("gap", str(folder / "measurement"), "--out", str(folder / "diagnosis"))
 
 
 def make_small(folder: Path) -> None:
     """The same of a few hundred pixels and points, in seconds, with diagnosis/ and events/ written as their commands would."""
-    folder.mkdir(parents=True)
     site = {**SITE, "epochs": 1, "wall": {**SITE["wall"], "width_m": 4.0, "height_m": 3.0, "resolution_m": 0.2}}
     site |= {"scanner": {"azimuth_step_rad": 0.01, "zenith_step_rad": 0.01}, "rockfall": {"count": 2, "size_m": 0.5}}
     wall = {key: value for key, value in site.items() if key not in ("seed", "epochs", "calibration")}
     part = {**SET["parts"][0], "train": 1, "val": 1, "test": 0}
     small = {**SET, "walls": {"ledge": wall}, "tiles": {**SET["tiles"], "size_px": 16}, "parts": [part], "validation_region": 0.0}
-    (folder / "site.yaml").write_text(yaml.safe_dump(site))
-    (folder / "set.yaml").write_text(yaml.safe_dump(small))
-    _coco(folder)
-    shutil.copytree(configs_folder() / "detectors/default", folder / "detector")
-    for name, sensor in (("measurement", "tls"), ("pair", "stereo")):
-        make(Case(0, (7, 1), "one", sensor, (), 400, 400), folder / name, folder / f"{name}_truth.json")
-    _raw(folder)
-    _called("simulate", "--sensor", "tls", "--config", str(folder / "site.yaml"), "--out", str(folder / "run"))
-    _called("dataset", str(folder / "set.yaml"), "--out", str(folder / "set"))
+    _make_all(folder, site, small, 400)
     _diagnosis(folder / "diagnosis", read_points(folder / "raw/scan.ply").points)
     event = Event("difference_001.tif", 1, 1.0, 1.0, 0.5, 0.5, 0.2, 0.1, 0.05, 0.01, 0.97)
     write_events([event], folder / "events/events_0.9.csv")
+
+
+def _make_all(folder: Path, site: dict[str, Any], matrix: dict[str, Any], points: int) -> None:
+    """All but diagnosis/ and events/, of a site's config and a set's; points: of each measurement."""
+    folder.mkdir(parents=True)
+    (folder / "site.yaml").write_text(yaml.safe_dump(site))
+    (folder / "set.yaml").write_text(yaml.safe_dump(matrix))
+    _coco(folder)
+    shutil.copytree(configs_folder() / "detectors/default", folder / "detector")
+    for name, sensor in (("measurement", "tls"), ("pair", "stereo")):
+        make(Case(0, (7, 1), "one", sensor, (), points, points), folder / name, folder / f"{name}_truth.json")
+    _raw(folder)
+    _called("simulate", "--sensor", "tls", "--config", str(folder / "site.yaml"), "--out", str(folder / "run"))
+    _called("dataset", str(folder / "set.yaml"), "--out", str(folder / "set"))
 
 
 def _diagnosis(folder: Path, points: FloatArray) -> None:

@@ -79,7 +79,7 @@ class MeanModel:
         offsets = (at[self.rows] - cells.centre[self._cell]).T / cells.side_m
         self._planes = self._orthonormal([] if field.weights.shape[1] else list(offsets))
         self._across = sparse.csr_array(self._planes.T)
-        self.noise = WithinNoise.of(field, self.root, self._planes, len(cells))
+        self.noise = WithinNoise.of(field, self.root, self._planes[: len(cells)])
         variance = self.noise.of_means()
         self._root = cholesky(variance, lower=True)
         self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))

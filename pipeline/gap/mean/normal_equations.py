@@ -40,12 +40,11 @@ class Waves:
         for grid in grids:
             for _, columns in grid.chunks(model.root):
                 planes = model.planes(columns)
+                means = planes[: model.cells]
                 products = columns.T @ beside
-                on_nodes = model.noise.on_nodes(columns, planes)
+                on_nodes = model.noise.on_nodes(columns, means)
                 own = (_squares(columns) - _squares(planes) - _squares(model.noise.halved(on_nodes))) / model.noise.white
-                parts.append(
-                    (products, own, noise.products(model.within(columns, planes, noise.rows), on_nodes), planes[: model.cells].T)
-                )
+                parts.append((products, own, noise.products(model.within(columns, planes, noise.rows), on_nodes), means.T))
         count = fixed.within.shape[1]
         if not parts:
             empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
@@ -68,7 +67,7 @@ class NoiseDraws:
         rows = slice(None, None, max(len(model) // most_rows, 1))
         few = len(model.root[rows])
         white = random.generator().standard_normal((few, count)) * np.sqrt(len(model) / few)
-        on_nodes = model.noise.drawn(white, rows, model.planes(white, rows), random.child("nodes"))
+        on_nodes = model.noise.drawn(white, rows, model.planes(white, rows)[: model.cells], random.child("nodes"))
         return cls(rows, white / np.sqrt(model.noise.white), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """Noise of the deviations within cells: white, and what neighbours share of it.
 
 In units of the predicted spread the deviations have the covariance R = w I + Z C Z', w the white share, C the covariance of
-random numbers on q nodes and Z (n, q) what those do, less its plane in each cell. By Woodbury's identity
+random numbers on q nodes and Z (n, q) what those do, less its mean in each cell. By Woodbury's identity
 R^-1 = (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z, so that products with R^-1 need q by q matrices only.
 """
 
@@ -23,31 +23,30 @@ _LEAST_WHITE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class WithinNoise:
-    """white: w; nodes: (n, q) before the cells' planes are taken off; planes: (3 m, q) of the cells, means and slopes over the
-    standard deviations that white noise gives them; cells: m; prior, root: (q, q) lower Cholesky factors of C and of K."""
+    """white: w; nodes: (n, q) before the cells' means are taken off; means: (m, q) of the cells, over the standard deviation that
+    white noise gives them; prior, root: (q, q) lower Cholesky factors of C and of K."""
 
     white: float
     nodes: sparse.csr_array
-    planes: FloatArray
-    cells: int
+    means: FloatArray
     prior: FloatArray
     root: FloatArray
 
     @classmethod
-    def of(cls, field: NodeField, inverse_sigma: FloatArray, gathered: sparse.csr_array, cells: int) -> WithinNoise:
-        """inverse_sigma: (n,) of the points; gathered: (3 m, n) from columns over sigma to the planes of m cells."""
+    def of(cls, field: NodeField, inverse_sigma: FloatArray, gathered: sparse.csr_array) -> WithinNoise:
+        """inverse_sigma: (n,) of the points; gathered: (m, n) from columns over sigma to the cells' means."""
         nodes = sparse.csr_array(field.weights.multiply(inverse_sigma[:, None]))
-        planes = (gathered @ nodes).toarray()
+        means = (gathered @ nodes).toarray()
         if not nodes.shape[1]:
-            return cls(1.0, nodes, planes, cells, field.covariance, field.covariance)
+            return cls(1.0, nodes, means, field.covariance, field.covariance)
         white = max(1 - field.variance * float(np.mean(inverse_sigma**2)), _LEAST_WHITE)
         prior = cholesky(field.covariance, lower=True)
-        matrix = (nodes.T @ nodes).toarray() - planes.T @ planes + white * cho_solve((prior, True), np.eye(len(prior)))
-        return cls(white, nodes, planes, cells, prior, cholesky(matrix, lower=True))
+        matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * cho_solve((prior, True), np.eye(len(prior)))
+        return cls(white, nodes, means, prior, cholesky(matrix, lower=True))
 
     def of_means(self) -> FloatArray:
         """(m, m) covariance of the cells' means."""
-        shared = self.planes[: self.cells] @ self.prior
+        shared = self.means @ self.prior
         return np.asarray(self.white * np.eye(len(shared)) + shared @ shared.T)
 
     @property
@@ -55,10 +54,10 @@ class WithinNoise:
         """Whether neighbours share nothing."""
         return self.nodes.shape[1] == 0
 
-    def on_nodes(self, columns: FloatArray, planes: FloatArray | None = None) -> FloatArray:
-        """(q, k) Z' of columns (n, k); planes: (3 m, k) of their cells, None where they are deviations already."""
+    def on_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
+        """(q, k) Z' of columns (n, k); means: (m, k) of their cells, None where they are deviations already."""
         found = np.asarray(self.nodes.T @ columns)
-        return found if planes is None else found - self.planes.T @ planes
+        return found if means is None else found - self.means.T @ means
 
     def solved(self, on_nodes: FloatArray) -> FloatArray:
         """(q, k) K^-1 of columns on the nodes."""
@@ -71,11 +70,11 @@ class WithinNoise:
     def drawn(self, white: FloatArray, rows: slice, spread: FloatArray, random: KeyedRandom) -> FloatArray:
         """(q, d) what draws of the noise add to the products of columns on the nodes, beside `white` / root w with themselves.
 
-        white: (n', d) draws of white noise on some `rows`; spread: (3 m, d) as `planes`. For noise
+        white: (n', d) draws of white noise on some `rows`; spread: (m, d) their sums over cells, as `means`. For noise
         r = root w e + Z n, c' R^-1 r = c' e / root w + (Z' c)' K^-1 (C^-1 n - Z' e / root w).
         """
         own = random.generator().standard_normal((len(self.root), white.shape[1]))
         if not self.is_white:
             own = solve_triangular(self.prior, own, lower=True, trans="T")
-        shared = self.nodes[rows].T @ white - self.planes.T @ spread
+        shared = self.nodes[rows].T @ white - self.means.T @ spread
         return self.solved(own - shared / np.sqrt(self.white))
