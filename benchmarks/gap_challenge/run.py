@@ -24,11 +24,13 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from benchmarks.gap_challenge.cases import Case, make, plan
 from benchmarks.gap_challenge.score import score
 from benchmarks.gap_challenge.table import markdown
 
-TIME_LIMIT_S = 300.0
+TIME_LIMIT_S = 480.0  # of processor time, so that other work on the machine makes no difference
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
@@ -88,11 +90,22 @@ class _Worker:
         self._process = _CONTEXT.Process(target=_serve, args=(there, str(hidden)), daemon=True)
         self._process.start()
         self.case: Case | None = None
-        self.since = 0.0
+        self._before_s = 0.0
 
     def give(self, case: Case, folder: Path, result: Path) -> None:
-        self.case, self.since = case, time.monotonic()
+        self.case, self._before_s = case, self._processor_s()
         self.here.send((str(folder), str(result)))
+
+    def spent_s(self) -> float:
+        """Processor time since the case was given."""
+        return self._processor_s() - self._before_s
+
+    def _processor_s(self) -> float:
+        try:
+            times = psutil.Process(self._process.pid).cpu_times()
+        except psutil.NoSuchProcess:
+            return 0.0
+        return float(times.user + times.system)
 
     def stop(self) -> None:
         self._process.kill()
@@ -107,8 +120,8 @@ def _diagnose_all(cases: list[Case], out: Path, jobs: int, limit_s: float, keep:
             reply: dict[str, Any] | None = None
             if worker.case and worker.here.poll():
                 reply = _received(worker)
-            elif worker.case and time.monotonic() - worker.since > limit_s:
-                reply = {"error": f"no answer within {limit_s:.0f} s"}
+            elif worker.case and worker.spent_s() > limit_s:
+                reply = {"error": f"no answer within {limit_s:.0f} s of processor time"}
             if reply is not None and worker.case is not None:
                 done += 1
                 _keep_answer(out, worker.case, reply, keep)
