@@ -2,13 +2,15 @@
 
     python benchmarks/gap_thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/gap_thresholds.md
 
-Small cases, hours of them: a case is diagnosed again only with thresholds that its first diagnosis asked for.
-Interrupted, it goes on where it was; `--minutes` ends it with the table of what there is.
+The first diagnosis of a case carries each threshold's other values along and notes which of them would have decided
+otherwise; only with those it is diagnosed again. Interrupted, it goes on where it was; `--minutes` ends it with the table of
+what there is; `--all` diagnoses again with those that make no difference too, and fails where one does.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import time
 from collections import Counter
@@ -20,6 +22,7 @@ from pydantic import ValidationError
 
 from benchmarks.gap_challenge.cases import Case, make, plan
 from benchmarks.gap_challenge.score import score
+from benchmarks.varied import Setting, Varied
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.decisions import Decisions
 from pipeline.gap.naming.workflow import diagnose
@@ -30,20 +33,29 @@ FACTORS = (0.7, 1.4)
 WRONGS = ("false alarm", "wrong name", "missed", "not answered unknown", "called unknown", "no answer")
 
 
-class _Asked:
-    """Decisions that note which of them are asked for, as group.key."""
+class _Watched:
+    """Decisions whose values are `Varied`: which were asked for, and which would have decided otherwise."""
 
-    def __init__(self, values: Any, prefix: str, asked: set[str]) -> None:
-        self._values, self._prefix, self._asked = values, prefix, asked
+    def __init__(self, values: Any, prefix: str, asked: set[str], matters: set[Setting]) -> None:
+        self._values, self._prefix, self._asked, self._matters = values, prefix, asked, matters
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._values, name)
         if name.startswith("model_"):
             return found
         if not self._prefix:
-            return _Asked(found, f"{name}.", self._asked)
-        self._asked.add(f"{self._prefix}{name}")
-        return found
+            return _Watched(found, f"{name}.", self._asked, self._matters)
+        key = f"{self._prefix}{name}"
+        self._asked.add(key)
+        return Varied(found, _others(key), self._matters)
+
+
+@functools.cache
+def _others(key: str) -> dict[Setting, Any]:
+    """A threshold's other values; none for a factor that it cannot have."""
+    group, name = key.split(".")
+    found = {factor: scaled(key, factor) for factor in FACTORS}
+    return {(key, factor): getattr(getattr(by, group), name) for factor, by in found.items() if by is not None}
 
 
 def keys() -> list[str]:
@@ -73,41 +85,66 @@ def answer(folder: Path, decisions: Any) -> Json:
         return {"error": repr(error)}
 
 
-def jobs(cases: list[Case], out: Path) -> Iterator[tuple[Case, str, float]]:
-    """What is to be diagnosed: each case as usual, and then with each threshold that it asked for."""
+def jobs(cases: list[Case], out: Path, *, everything: bool) -> Iterator[tuple[Case, str, float]]:
+    """What is to be diagnosed: each case as usual, and then with each threshold that makes a difference (or is asked for)."""
     for case in cases:
         yield case, "usual", 1.0
-    turns = [(place, key, case) for case in cases for place, key in _asked_of(case, cases, out)]
-    for _, key, case in sorted(turns, key=lambda turn: turn[:2]):
-        for factor in FACTORS:
-            yield case, key, factor
+    turns: Counter[Setting] = Counter()
+    found = []
+    for case in cases:
+        for key, factor in _asked(out, case, everything=everything):
+            turns[key, factor] += 1
+            found.append((turns[key, factor], key, factor, case))
+    for _, key, factor, case in sorted(found, key=lambda each: each[:3]):
+        yield case, key, factor
 
 
-def _asked_of(case: Case, cases: list[Case], out: Path) -> list[tuple[int, str]]:
-    """The thresholds that a case asked for, each with how many cases before it did: none waits for all the others."""
-    asked = {each.name: set(json.loads((out / each.name / "asked.json").read_text())) for each in cases}
-    before = cases[: cases.index(case)]
-    return [(sum(key in asked[each.name] for each in before), key) for key in asked[case.name]]
+def _asked(out: Path, case: Case, *, everything: bool) -> list[Setting]:
+    """Thresholds and factors that a case asked for, or only those that would have decided something in it otherwise."""
+    noted = json.loads((out / case.name / "asked.json").read_text())
+    some = [(key, factor) for key in noted["asked"] for _, factor in _others(key)]
+    return some if everything else [each for each in some if list(each) in noted["matters"]]
 
 
-def work(cases: list[Case], out: Path, minutes: float) -> None:
+def work(cases: list[Case], out: Path, minutes: float, *, everything: bool = False) -> None:
     """Diagnose what has no answer yet, until the time is up; the usual answers in any case."""
     end = time.monotonic() + 60 * minutes
-    for case, key, factor in jobs(cases, out):
+    for case, key, factor in jobs(cases, out, everything=everything):
         folder = out / case.name
         path = folder / f"{key}@{factor:g}.json"
         if path.exists() or (key != "usual" and time.monotonic() > end):
             continue
         if not (folder / "truth.json").exists():
             make(case, folder / "case", folder / "truth.json")
-        asked: set[str] = set()
-        decisions = _Asked(Decisions(), "", asked) if key == "usual" else scaled(key, factor)
-        if decisions is not None:
-            found = answer(folder / "case", decisions)
-            if key == "usual":
-                (folder / "asked.json").write_text(json.dumps(sorted(asked)))
-            path.write_text(json.dumps(found))
-            print(f"{case.name} {key} x {factor:g}: {found.get('verdict', 'error')}", flush=True)
+        found = answer(folder / "case", scaled(key, factor)) if key != "usual" else _usual(folder)
+        path.write_text(json.dumps(found))
+        print(f"{case.name} {key} x {factor:g}: {found.get('verdict', found)}", flush=True)
+
+
+def _usual(folder: Path) -> Json:
+    """gap.json with the usual decisions, watched: which were asked for and which make a difference is noted beside it."""
+    asked: set[str] = set()
+    matters: set[Setting] = set()
+    measurement = read_measurement(folder / "case")
+    watched: Any = _Watched(Decisions(), "", asked, matters)
+    found = to_dict(diagnose(measurement, decisions=watched), measurement)
+    (folder / "asked.json").write_text(json.dumps({"asked": sorted(asked), "matters": sorted(matters)}))
+    return found
+
+
+def _check_followed(cases: list[Case], out: Path) -> None:
+    """Raise ValueError where a threshold that was noted to make no difference makes one."""
+    for case in cases:
+        usual = json.loads((out / case.name / "usual@1.json").read_text())
+        for key, factor in set(_asked(out, case, everything=True)) - set(_asked(out, case, everything=False)):
+            path = out / case.name / f"{key}@{factor:g}.json"
+            if path.exists() and _bare(json.loads(path.read_text())) != _bare(usual):
+                raise ValueError(f"{path} differs from usual@1.json, and was said not to")
+
+
+def _bare(found: Json) -> Json:
+    """Of an answer what may not depend on a threshold that decides nothing."""
+    return {key: value for key, value in found.items() if key not in ("seconds", "timings", "decisions")}
 
 
 def _row(truth: Json, folder: Path, name: str) -> Json | None:
@@ -122,35 +159,28 @@ def table(cases: list[Case], out: Path) -> str:
         folder = out / case.name
         truth = json.loads((folder / "truth.json").read_text())
         usual = _row(truth, folder, "usual@1")
-        for key in json.loads((folder / "asked.json").read_text()):
-            for factor in FACTORS:
-                row = _row(truth, folder, f"{key}@{factor:g}")
-                if row is not None and usual is not None:
-                    cells.setdefault(key, {}).setdefault(factor, []).append((usual, row))
-    lines = [
-        "| threshold | value | cases "
-        + "".join(f"| x {factor:g}: changed | became wrong | became right " for factor in FACTORS)
-        + "|",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+        mattering = _asked(out, case, everything=False)
+        for key, factor in _asked(out, case, everything=True):
+            other = _row(truth, folder, f"{key}@{factor:g}") if (key, factor) in mattering else usual
+            if other is not None and usual is not None:
+                cells.setdefault(key, {}).setdefault(factor, []).append((usual, other))
+    sides = "".join(f"| x {factor:g}: cases | changed | became wrong | became right " for factor in FACTORS)
+    lines = [f"| threshold | value {sides}|", "| --- | --- " + "| --- | --- | --- | --- " * len(FACTORS) + "|"]
     for key in keys():
-        if key not in cells:
-            continue
-        group, name = key.split(".")
-        value = getattr(getattr(Decisions(), group), name)
-        sides = " | ".join(_side(cells[key].get(factor, [])) for factor in FACTORS)
-        count = max(len(pairs) for pairs in cells[key].values())
-        lines.append(f"| `{key}` | {value:g} | {count} | {sides} |")
+        if key in cells:
+            group, name = key.split(".")
+            value = getattr(getattr(Decisions(), group), name)
+            lines.append(f"| `{key}` | {value:g} | " + " | ".join(_side(cells[key].get(factor, [])) for factor in FACTORS) + " |")
     return "\n".join(lines)
 
 
 def _side(pairs: list[tuple[Json, Json]]) -> str:
     if not pairs:
-        return "- | - | -"
+        return "- | - | - | -"
     changed = sum(_said(usual) != _said(row) for usual, row in pairs)
     worse = Counter(row["wrong"] for usual, row in pairs if row["wrong"] and row["wrong"] != usual["wrong"])
     better = Counter(usual["wrong"] for usual, row in pairs if usual["wrong"] and row["wrong"] != usual["wrong"])
-    return f"{changed} | {_counted(worse)} | {_counted(better)}"
+    return f"{len(pairs)} | {changed} | {_counted(worse)} | {_counted(better)}"
 
 
 def _said(row: Json) -> tuple[str, tuple[str, ...]]:
@@ -167,13 +197,16 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=24)
     parser.add_argument("--seed", type=int, default=3100)
     parser.add_argument("--minutes", type=float, default=60.0, help="for the changed thresholds")
+    parser.add_argument("--all", action="store_true", help="with thresholds that make no difference too; fails where one does")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--table", type=Path)
     arguments = parser.parse_args()
     cases = plan(arguments.cases, arguments.seed, small=True)
     for case in cases:
         (arguments.out / case.name).mkdir(parents=True, exist_ok=True)
-    work(cases, arguments.out, arguments.minutes)
+    work(cases, arguments.out, arguments.minutes, everything=arguments.all)
+    if arguments.all:
+        _check_followed(cases, arguments.out)
     found = table(cases, arguments.out)
     print(found)
     if arguments.table:

@@ -1,0 +1,105 @@
+"""A number that is carried along beside what it would be if a setting were another, and that notes where that makes a difference.
+
+What is computed with it is computed with each of its other values too; what compares it, compares them too. As long as no
+comparison comes out otherwise and nothing else looks at its value, the same program with the other setting would do the same.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+Setting = tuple[str, float]
+
+
+class Varied:
+    """A value, what it would be with other settings, and the set in which those that make a difference are noted."""
+
+    def __init__(self, value: Any, others: dict[Setting, Any], matters: set[Setting]) -> None:
+        self.value, self.others, self.matters = value, others, matters
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        function = getattr(ufunc, method)
+        return _applied(lambda *values: function(*values, **options), inputs)
+
+    def __getattr__(self, name: str) -> Any:
+        """Anything else that is asked of the value is beyond what can be followed."""
+        if name.startswith("__array_"):
+            raise AttributeError(name)
+        return getattr(self._seen(), name)
+
+    def _seen(self) -> Any:
+        self.matters.update(self.others)
+        return self.value
+
+    def __array__(self, *arguments: Any, **options: Any) -> Any:
+        return np.array(self._seen(), *arguments, **options)
+
+    def __float__(self) -> float:
+        return float(self._seen())
+
+    def __int__(self) -> int:
+        return int(self._seen())
+
+    def __index__(self) -> int:
+        return operator.index(self._seen())
+
+    def __bool__(self) -> bool:
+        return bool(_applied(bool, (self,)))
+
+    def __hash__(self) -> int:
+        return hash(self._seen())
+
+    def __len__(self) -> int:
+        return len(self._seen())
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._seen())
+
+    def __getitem__(self, key: Any) -> Any:
+        return _applied(lambda value: value[key], (self,))
+
+    def __format__(self, how: str) -> str:
+        return format(self._seen(), how)
+
+    def __str__(self) -> str:
+        return str(self._seen())
+
+
+def _applied(function: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
+    """The function of the values and of the others. Where it decides (true or false), those that decide otherwise are noted."""
+    varied = [each for each in inputs if isinstance(each, Varied)]
+    matters = varied[0].matters
+    value = function(*(each.value if isinstance(each, Varied) else each for each in inputs))
+    settings = {setting for each in varied for setting in each.others}
+    others = {
+        setting: function(*(each.others.get(setting, each.value) if isinstance(each, Varied) else each for each in inputs))
+        for setting in settings
+    }
+    if isinstance(value, bool) or getattr(value, "dtype", None) is np.dtype(bool):
+        matters.update(setting for setting, other in others.items() if np.any(other != value))
+        return value
+    return Varied(value, others, matters)
+
+
+def _infix(name: str) -> None:
+    plain: Callable[..., Any] = getattr(operator, name)
+    special = f"__{name.strip('_')}__"
+    setattr(Varied, special, lambda self, other: _applied(plain, (self, other)))
+    if name not in _COMPARISONS:
+        setattr(Varied, f"__r{special[2:]}", lambda self, other: _applied(plain, (other, self)))
+
+
+def _prefix(name: str) -> None:
+    plain: Callable[..., Any] = getattr(operator, name)
+    setattr(Varied, f"__{name}__", lambda self: _applied(plain, (self,)))
+
+
+_COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
+for _name in (*_COMPARISONS, "add", "sub", "mul", "truediv", "floordiv", "mod", "pow"):
+    _infix(_name)
+for _name in ("neg", "pos", "abs"):
+    _prefix(_name)
