@@ -18,6 +18,7 @@ _KNOTS = 5
 _STEPS = 13
 """Places at which a step in a covariate is tried: quantiles of it."""
 _MOST_CYCLES = 12.0
+_MOST_CYCLES_OF_A_CIRCLE = 40.0
 _CHUNK = 32
 PLACE = "place along"
 HARMONICS, FOLDED, SURFACE = "harmonics", "folded", "surface"
@@ -60,7 +61,8 @@ class Candidate:
 
     names: the parameters that the coefficients stand for; fixed: searched or chosen values that belong to this variant, such as
     the camera; form: of an empirical one; wave: of a searched sine, whose period is `period` (that of harmonics too);
-    precision: (k,) inverse variance of the coefficients by what is typical of the effect, None where nothing is known.
+    precision: (k,) inverse variance of the coefficients by what is typical of the effect, None where nothing is known;
+    angle: the recorded angle of which an empirical one is the error, "" for the observable itself.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Candidate:
     wave: Wave | None = None
     period: float = 0.0
     precision: FloatArray | None = None
+    angle: str = ""
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -96,12 +99,13 @@ class Candidate:
     @property
     def family(self) -> str:
         """Variants of one family differ in searched or chosen values only."""
-        return f"free {self.name} {self.form}" if self.empirical else self.name
+        return f"free {self.name} {self.form} {self.angle}" if self.empirical else self.name
 
 
 @dataclass(frozen=True, eq=False)
 class SineGrid:
-    """A sine of which evenly spaced frequencies are tried. amplitude: name of the parameter; fixed: values of all variants."""
+    """A sine of which evenly spaced frequencies are tried. amplitude: name of the parameter; fixed: values of all variants;
+    angle: as of a `Candidate`."""
 
     name: str
     amplitude: str
@@ -109,6 +113,7 @@ class SineGrid:
     frequencies: FloatArray
     fixed: Mapping[str, float | str] = field(default_factory=dict)
     empirical: bool = False
+    angle: str = ""
 
     def candidate(self, index: int) -> Candidate:
         """The variant at one of the frequencies."""
@@ -125,7 +130,7 @@ class SineGrid:
         names = (amplitude, "phase_rad", key)
         form = "wave" if self.empirical else ""
         fixed = {**self.fixed, key: period}
-        return Candidate(self.name, None, parameters, names, fixed, self.empirical, form, self.wave, period)
+        return Candidate(self.name, None, parameters, names, fixed, self.empirical, form, self.wave, period, angle=self.angle)
 
     def chunks(self, rows: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
         """Some frequencies at a time, with their columns (n, 2 f) times `rows` (n,): sine and cosine of each, one after another.
@@ -175,31 +180,58 @@ def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> l
 
     highest: frequency from which on a wave is an effect of the catalogue.
     """
-    x = (values - values.mean()) / (float(values.std()) or 1.0)
-    knots = np.quantile(x, np.linspace(0, 1, _KNOTS)[1:-1])
-    columns = [x, x**2, x**3, *(np.maximum(x - knot, 0) ** 3 for knot in knots)]
-    smooth = np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
+    x = _standardised(values)
+    smooth = _smooth(x)
     steps = np.unique(np.quantile(x, np.linspace(0, 1, _STEPS + 2)[1:-1]))
-    found: list[Candidate | SineGrid] = [
+    waves = _waves(x, _MOST_CYCLES, highest * float(values.std()))
+    return [
         _free(covariate, "line", smooth[:, :1]),
         _free(covariate, "parabola", smooth[:, :2]),
         _free(covariate, "smooth", smooth),
         *(_free(covariate, "step", (x > place).astype(np.float64)[:, None]) for place in steps),
+        *(SineGrid(covariate, "amplitude", Wave("period", np.ones_like(x), x), tried, {}, True) for tried in waves),
     ]
+
+
+def angle_forms(angle: str, covariate: str, values: FloatArray, lever: FloatArray) -> list[Candidate | SineGrid]:
+    """Forms of an error of a recorded angle along a covariate; lever: (n,) what the observable changes by per radian of it.
+
+    A circle that is divided unevenly may have many cycles in a field of view. Waves of the zenith along the azimuth are left out:
+    they are a wobble.
+    """
+    x = _standardised(values)
+    smooth = _smooth(x) * lever[:, None]
+    forms = [_free(covariate, "line", smooth[:, :1]), _free(covariate, "smooth", smooth)]
+    waves = _waves(x, _MOST_CYCLES_OF_A_CIRCLE) if angle == covariate else []
+    found = [SineGrid(covariate, "amplitude", Wave("period", lever, x), tried, {}, True, angle) for tried in waves]
+    return [*(replace(form, angle=angle) for form in forms), *found]
+
+
+def _standardised(values: FloatArray) -> FloatArray:
+    return np.asarray((values - values.mean()) / (float(values.std()) or 1.0))
+
+
+def _smooth(x: FloatArray) -> FloatArray:
+    """(n, k) columns of a cubic spline."""
+    knots = np.quantile(x, np.linspace(0, 1, _KNOTS)[1:-1])
+    columns = [x, x**2, x**3, *(np.maximum(x - knot, 0) ** 3 for knot in knots)]
+    return np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
+
+
+def _waves(x: FloatArray, most_cycles: float, highest: float = np.inf) -> list[FloatArray]:
+    """Frequencies to try, as one list; none where there are fewer than two."""
     reach = float(np.ptp(np.quantile(x, [0.005, 0.995])))
-    if reach > 0:
-        tried = frequencies(0.8 / reach, _MOST_CYCLES / reach, 0.5 / reach)
-        tried = tried[tried < highest * float(values.std())]
-        if len(tried) > 1:
-            found.append(SineGrid(covariate, "amplitude", Wave("period", np.ones_like(x), x), tried, {}, True))
-    return found
+    if reach <= 0:
+        return []
+    tried = frequencies(0.8 / reach, most_cycles / reach, 0.5 / reach)
+    tried = tried[tried < highest]
+    return [tried] if len(tried) > 1 else []
 
 
 def moved_to(candidate: Candidate, period: float) -> Candidate:
     """The same sine with another period."""
-    return SineGrid(candidate.name, candidate.names[0], candidate.sine, np.empty(0), candidate.fixed, candidate.empirical).at(
-        period
-    )
+    sine, fixed = candidate.sine, candidate.fixed
+    return SineGrid(candidate.name, candidate.names[0], sine, np.empty(0), fixed, candidate.empirical, candidate.angle).at(period)
 
 
 def precision_of(candidate: Candidate, width: int) -> FloatArray:
@@ -210,7 +242,7 @@ def precision_of(candidate: Candidate, width: int) -> FloatArray:
 def harmonics(covariate: str, sine: Candidate) -> Candidate:
     """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the fifth."""
     columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
-    return replace(_free(covariate, HARMONICS, columns), period=sine.period)
+    return replace(_free(covariate, HARMONICS, columns), period=sine.period, angle=sine.angle)
 
 
 def repeated(covariate: str, number: FloatArray, step: float) -> list[Candidate]:
@@ -230,7 +262,7 @@ def repeated(covariate: str, number: FloatArray, step: float) -> list[Candidate]
 
 def surface_form(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:
     """A polynomial of two covariates (n,) together, which stands for no effect."""
-    s, t = ((values - values.mean()) / (float(values.std()) or 1.0) for values in (x, y))
+    s, t = _standardised(x), _standardised(y)
     powers = [(a, degree - a) for degree in range(1, _DEGREE + 1) for a in range(degree + 1)]
     columns = np.stack([s**a * t**b for a, b in powers], axis=1)
     return _free(f"{first} and {second}", SURFACE, columns / columns.std(axis=0))

@@ -100,12 +100,25 @@ class MeanSearch:
         """
         if form.candidate.form.startswith(REPEATED):
             return self._of_fewest_lines(members, form)
+        if form.candidate.form == "smooth":
+            form = self._as_wave(members, form)
         return self._with_overtones(members, form) if form.candidate.form == "wave" else form
 
     def _of_fewest_lines(self, members: Members, form: Tried) -> Tried:
         alike = [each for each in self.tried(members) if each.candidate.form.startswith(REPEATED) and each.name == form.name]
         good = [each for each in alike if each.score > form.score - decided().mean.free_margin]
         return min(good, key=lambda each: each.candidate.period)
+
+    def _as_wave(self, members: Members, form: Tried) -> Tried:
+        """The wave of the same covariate where that, at the top of its period, says it as well as a curve does."""
+        alike = [each for each in self.tried(members) if each.candidate.form == "wave" and _of_one_kind(each, form)]
+        if not alike:
+            return form
+        wave, others = alike[0], [member.candidate for member in members]
+        (sine, *_), fit = self.design.refined([wave.candidate, *others])
+        gain = wave.gain + fit.log_likelihood - self.design.fit([wave.candidate, *others]).log_likelihood
+        score = gain - (wave.gain - wave.score)
+        return replace(wave, candidate=sine, gain=gain, score=score) if score > form.score else form
 
     def _with_overtones(self, members: Members, form: Tried) -> Tried:
         (sine, *others), fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
@@ -147,3 +160,7 @@ class MeanSearch:
         best = next(item for item in self.tried(()) if item.name == candidate.name and not item.empirical)
         item = replace(best, candidate=candidate)
         return Choice(self).chosen((item,), item)
+
+
+def _of_one_kind(one: Tried, other: Tried) -> bool:
+    return one.name == other.name and one.candidate.angle == other.candidate.angle

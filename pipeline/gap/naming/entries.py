@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,9 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.config import parse
 from scene.errors import InputError
 from scene.mesh import FloatArray
+from sensors.curve import Axis, surface_on_host
 from sensors.effects import effect_of
+from sensors.effects.angle_empirical import AngleEmpirical
 from sensors.effects.base import Effect, ShowsIn
 from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.disparity_empirical import DisparityEmpirical
@@ -37,8 +39,8 @@ from sensors.model import StereoModel, TlsModel
 
 PLANES = {"tls": ("azimuth", "zenith"), "stereo": ("image_x", "image_y")}
 """The two covariates by sensor that an error may depend on together."""
-_NODES, _GRID, _MOST_POINTS = 65, 17, 20_000
-"""Of the curve of an empirical term, and of each side of a surface."""
+_NODES, _GRID, _JOINED, _MOST_POINTS = 65, 17, 257, 20_000
+"""Of the curve of an empirical term, of each side of a surface, and of a sum of curves."""
 _FITTED = 1.1
 """How much more the parameters scatter than the covariance says: that of the reference's error is itself fitted.
 By development cases, of whose 61 intervals of 90 % without it 52 held the truth."""
@@ -231,20 +233,58 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
 def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:
     """A free form by values: over one cycle of a periodic one, else over all of its covariate that occurs."""
     error = candidate.columns @ values[: candidate.columns.shape[1]]
+    if candidate.angle and isinstance(part, TlsResiduals):
+        return _of_an_angle(candidate, error, item, part)
     unit, name = ("m", RangeEmpirical.tag()) if part.sensor == "tls" else ("px", DisparityEmpirical.tag())
     found = _surface(candidate, error, part) if candidate.form == SURFACE else _curve(candidate, error, part)
-    rows = [[float(f"{value:.6g}") for value in row] for row in found.pop("values")]
+    rows = _rows(found.pop("values"))
     entry = {"name": name, **found, f"values_{unit}": rows}
     return Named(f"{part.sensor}.{name}", "empirical", entry, {}, (), item.p_value, item.gain)
 
 
-def _curve(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
+def _of_an_angle(candidate: Candidate, error: FloatArray, item: Chosen, part: TlsResiduals) -> Named:
+    """Its curve is found back from the ranges where the surface slants more than at half of the points."""
+    levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
+    lever = -levers[candidate.angle]
+    steep = np.abs(lever) > np.median(np.abs(lever))
+    found = _curve(candidate, np.divide(error, lever, out=np.zeros_like(error), where=steep), part, steep)
+    rows = _rows(found.pop("values"))
+    entry = {"name": AngleEmpirical.tag(), "angle": candidate.angle, **found, "values_rad": rows}
+    return Named(f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
+
+
+def with_corrections(angles: list[Named], later: list[Named], part: Residuals) -> tuple[list[Named], list[Named]]:
+    """Curves of an angle's error with those that were found beside them along the same angle, as one; and what remains of those."""
+    joined, others = [], list(later)
+    for term in angles:
+        alike = [item for item in others if all(item.entry[key] == term.entry[key] for key in ("angle", "covariate"))]
+        others = [item for item in others if item not in alike]
+        joined.append(_joined(term, alike, part) if alike else term)
+    return joined, others
+
+
+def _joined(term: Named, later: list[Named], part: Residuals) -> Named:
+    """The sum of curves, over all of the angle that occurs."""
+    x = part.covariates[term.entry["covariate"]]
+    low, high = float(x.min()), float(x.max())
+    nodes = np.linspace(low, high, _JOINED)
+    curves = ((Axis(**item.entry["along"]), item.entry["values_rad"]) for item in (term, *later))
+    total = sum(surface_on_host(nodes, nodes, along, Axis(), values) for along, values in curves)
+    return replace(term, entry={**term.entry, "along": {"low": low, "high": high}, "values_rad": _rows([total])})
+
+
+def _rows(values: Any) -> list[list[float]]:
+    return [[float(f"{value:.6g}") for value in row] for row in values]
+
+
+def _curve(candidate: Candidate, error: FloatArray, part: Residuals, rows: Any = slice(None)) -> dict[str, Any]:
+    """rows: those whose error (n,) is known."""
     x = part.covariates[candidate.name]
     cycle = candidate.period * ((float(x.std()) or 1.0) if candidate.form == "wave" else 1.0)
     x = x + _shift(candidate.name, part)  # as the sensor counts it, before it is folded
-    turned = np.mod(x, cycle) if cycle else x
-    order = np.argsort(turned)
     low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))
+    turned, error = (np.mod(x, cycle) if cycle else x)[rows], error[rows]
+    order = np.argsort(turned)
     curve = np.interp(np.linspace(low, high, _NODES), turned[order], error[order], period=cycle or None)
     return {"covariate": candidate.name, "along": {"low": low, "high": high, "period": cycle}, "values": [curve]}
 

@@ -8,11 +8,12 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import Candidate, SineGrid, free_forms, places, repeated, surface_form
+from pipeline.gap.mean.candidates import Candidate, SineGrid, angle_forms, free_forms, places, repeated, surface_form
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.naming.entries import PLANES
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from sensors.effects import EFFECTS, effect_of
 
 PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
@@ -35,9 +36,18 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
         if name not in _NOT_FREE and np.ptp(values) > 0
         for form in free_forms(name, values, highest=lowest.get(name, np.inf))
     ]
+    free += _of_angles(part) if isinstance(part, TlsResiduals) else []
     first, second = PLANES[part.sensor]
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
     return [*map(_with_precision, named), *free, both, *_repeated(part), *places(part.at)]
+
+
+def _of_angles(part: TlsResiduals) -> list[Candidate | SineGrid]:
+    """Free forms of the errors of both angles: an error of an angle changes the range by the slope of the surface."""
+    angles = {"azimuth": part.geometry.azimuth, "zenith": part.geometry.zenith}
+    levers = {"azimuth": -part.geometry.by_azimuth, "zenith": -part.geometry.by_zenith}
+    along = [(angle, name, values) for angle in levers for name, values in angles.items() if np.ptp(values) > 0]
+    return [form for angle, name, values in along for form in angle_forms(angle, name, values, levers[angle])]
 
 
 def _repeated(part: Residuals) -> list[Candidate]:

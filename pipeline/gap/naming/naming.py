@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import PLACE, REPEATED
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Tried
-from pipeline.gap.naming.entries import Estimate, Named, from_comb, from_locking, from_mean, from_spread, within_bounds
+from pipeline.gap.naming.entries import (
+    Estimate,
+    Named,
+    from_comb,
+    from_locking,
+    from_mean,
+    from_spread,
+    settled_with,
+    with_corrections,
+    within_bounds,
+)
 from pipeline.gap.naming.families import believes, families_of
-from pipeline.gap.naming.relinearised import SearchedPoints, beyond, followed_up, noisier, undone, weighed
+from pipeline.gap.naming.relinearised import SearchedPoints, at_points, beyond, followed_up, noisier, undone, weighed
 from pipeline.gap.other.locking import find_locking
 from pipeline.gap.other.quantization import find_comb
 from pipeline.gap.other.spread import SpreadFound, SpreadTried, find_spread, share_of_spread
@@ -24,6 +34,7 @@ from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from sensors.effects.angle_empirical import AngleEmpirical
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -131,7 +142,33 @@ def name_effects(
     tried = found.chosen[0].tried if found.chosen else found.tried
     shown = tuple(item for item in tried if not item.name.startswith(PLACE))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
-    return named, Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma)
+    naming = Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma)
+    angles = [each for each in moving if each.effect is AngleEmpirical]
+    if angles and not believes(measurement, AngleEmpirical.tag()):
+        return _with_angles(measurement, whole, angles, naming, random, left_out)
+    return named, naming
+
+
+def _with_angles(
+    measurement: Measurement,
+    whole: Residuals,
+    angles: list[Named],
+    first: Naming,
+    random: KeyedRandom,
+    left_out: frozenset[tuple[str, bool]],
+) -> tuple[list[Named], Naming]:
+    """All is named again with the free forms of errors of an angle in the model: slopes miss where a ray goes that turns far.
+
+    What the second search finds of the same form is added to the first's curve.
+    """
+    there, found, _ = settled_with(measurement, angles, whole.index)
+    at = at_points(found, whole)
+    named, naming = name_effects(there, at, registered(at)[2], random.child("angles"), left_out)
+    joined, others = with_corrections(angles, [item for item in named if item.effect is AngleEmpirical], whole)
+    rest = [item for item in named if item.effect is not AngleEmpirical]
+    moving = naming.moving | {item.name for item in angles}
+    again = replace(naming, tried=first.tried, moving=moving, p_alone=first.p_alone, identifiability=first.identifiability)
+    return [*joined, *others, *rest], again
 
 
 def _repeats(estimates: list[Estimate]) -> list[str]:

@@ -86,9 +86,7 @@ class _Alone:
         if kept.mean() < decided().points.kept:
             return None
         value[kept] = np.where(found.smooth, np.clip(rough, -largest, largest), 0.0)
-        return cls(
-            chosen, estimate, _at_points(found, points.part), there, first.design.log_likelihood(value, estimate.candidate)
-        )
+        return cls(chosen, estimate, at_points(found, points.part), there, first.design.log_likelihood(value, estimate.candidate))
 
     def better(self, points: SearchedPoints, first: MeanSearch) -> _Alone | None:
         """With its values moved by the slopes here."""
@@ -212,7 +210,7 @@ def _again(
     """
     part, noise = points.part, points.noise
     there, found, _ = _with(points, had)
-    at = noisier(_at_points(found, part), noise[1])
+    at = noisier(at_points(found, part), noise[1])
     renewed = families_of(there, at)
     allowed = {(family.name, family.empirical) for family in points.families}
     names = {each.candidate.name for each in had}
@@ -256,7 +254,7 @@ def _without_sines(estimates: list[Estimate]) -> list[Estimate]:
     return found
 
 
-def _at_points(found: Residuals, part: Residuals) -> Residuals:
+def at_points(found: Residuals, part: Residuals) -> Residuals:
     """What was found at the points of a part, where the surface is smooth there too and they are no outliers."""
     rough, _, scale = registered(found)
     good = found.smooth & (np.abs(rough) < decided().points.outlier * scale * found.sigma)
