@@ -145,6 +145,22 @@ def test_a_range_effect_adds_its_equation(entry: dict[str, Any], error: Callable
             lambda oracle: 0.0,
             lambda oracle: 2e-4 * np.sin(2 * np.pi * oracle.line / 33.0 + 0.4),
         ),
+        (
+            {"name": "angle_empirical", "along": {"low": -4.0, "high": 4.0}, "values_rad": [[-8e-4, 8e-4]]},
+            lambda oracle: 2e-4 * oracle.azimuth,
+            lambda oracle: 0.0,
+        ),
+        (
+            {
+                "name": "angle_empirical",
+                "angle": "zenith",
+                "covariate": "zenith",
+                "along": {"low": -4.0, "high": 4.0},
+                "values_rad": [[-8e-4, 8e-4]],
+            },
+            lambda oracle: 0.0,
+            lambda oracle: 2e-4 * oracle.zenith,
+        ),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else "",
 )

@@ -254,7 +254,7 @@ def _of_an_angle(candidate: Candidate, error: FloatArray, item: Chosen, part: Tl
 
 
 def with_corrections(angles: list[Named], later: list[Named], part: Residuals) -> tuple[list[Named], list[Named]]:
-    """Curves of an angle's error with those that were found beside them along the same angle, as one; and what remains of those."""
+    """Curves of an angle's error with those that were found beside them along the same angle, as one; what remains of those."""
     joined, others = [], list(later)
     for term in angles:
         alike = [item for item in others if all(item.entry[key] == term.entry[key] for key in ("angle", "covariate"))]

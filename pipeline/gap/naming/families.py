@@ -14,11 +14,15 @@ from pipeline.gap.naming.entries import PLANES
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from scene.mesh import FloatArray
 from sensors.effects import EFFECTS, effect_of
+from sensors.effects.angle_empirical import AngleEmpirical
 
 PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
 """Sines, and along what: an error that repeats but is no sine is not theirs."""
 _NOT_FREE = ("edge_step", "line", "disparity_fraction")
+_MOST_POINTS = 5_000
+"""By which one sees whether one form holds another."""
 
 
 def believes(measurement: Measurement, name: str) -> bool:
@@ -36,7 +40,9 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
         if name not in _NOT_FREE and np.ptp(values) > 0
         for form in free_forms(name, values, highest=lowest.get(name, np.inf))
     ]
-    free += _of_angles(part) if isinstance(part, TlsResiduals) else []
+    if isinstance(part, TlsResiduals):
+        angles = _of_angles(part)
+        named, free = _not_held(named, angles, measurement, part), [*free, *angles]
     first, second = PLANES[part.sensor]
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
     return [*map(_with_precision, named), *free, both, *_repeated(part), *places(part.at)]
@@ -48,6 +54,24 @@ def _of_angles(part: TlsResiduals) -> list[Candidate | SineGrid]:
     levers = {"azimuth": -part.geometry.by_azimuth, "zenith": -part.geometry.by_zenith}
     along = [(angle, name, values) for angle in levers for name, values in angles.items() if np.ptp(values) > 0]
     return [form for angle, name, values in along for form in angle_forms(angle, name, values, levers[angle])]
+
+
+def _not_held(
+    named: list[Candidate | SineGrid], angles: list[Candidate | SineGrid], measurement: Measurement, part: TlsResiduals
+) -> list[Candidate | SineGrid]:
+    """Without the effects that a curve of an angle's error, where the model has one, holds too, but for its values."""
+    curves = {(each.angle, each.covariate) for each in measurement.model.effects if isinstance(each, AngleEmpirical)}
+    held = [each.columns for each in angles if isinstance(each, Candidate) and (each.angle, each.name) in curves]
+    if not held:
+        return named
+    rows = slice(None, None, max(len(part) // _MOST_POINTS, 1))
+    basis = np.linalg.qr(np.concatenate([part.pose[rows], *(columns[rows] for columns in held)], axis=1))[0]
+
+    def left(columns: FloatArray) -> float:
+        return float(np.sum((columns - basis @ (basis.T @ columns)) ** 2) / np.sum(columns**2))
+
+    least = decided().mean.undone_share
+    return [each for each in named if isinstance(each, SineGrid) or left(each.columns[rows]) > least]
 
 
 def _repeated(part: Residuals) -> list[Candidate]:
