@@ -80,9 +80,8 @@ def drop_doubled(mesh: TriangleMesh) -> Mended:
 
 def part_edges(mesh: TriangleMesh) -> Mended:
     """Where more than two triangles share an edge, keep the two largest."""
-    edges = undirected_edges(mesh)
-    order = np.argsort(edges, kind="stable")
-    ordered = edges[order]
+    edges = mesh.edges
+    ordered = edges[mesh.edge_order]
     crowded = np.zeros(len(edges), bool)
     crowded[2:] = ordered[2:] == ordered[:-2]
     if not crowded.any():
@@ -188,13 +187,6 @@ def _squared(vectors: FloatArray) -> FloatArray:
     return np.einsum("ki,ki->k", vectors, vectors)
 
 
-def undirected_edges(mesh: TriangleMesh) -> Index:
-    """(3 m,) a number per edge, the same for both directions: edges 01 of all triangles, then 12, then 20."""
-    faces = mesh.faces.astype(np.int64)
-    start, stop = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
-    return np.minimum(start, stop) * len(mesh.vertices) + np.maximum(start, stop)
-
-
 def unique_rows(rows: NDArray[np.generic]) -> tuple[Index, Index]:
     """Index of the first of each group of equal rows, in order of appearance, and the group of every row.
 
@@ -251,10 +243,10 @@ def groups(pairs: NDArray[np.integer], count: int) -> Index:
     return (np.cumsum(smallest == np.arange(count)) - 1)[smallest]
 
 
-def _twins(edges: Index) -> tuple[Index, Index]:
-    """The two places of each number that stands twice, and no oftener, in `edges`."""
-    order = np.argsort(edges, kind="stable")
-    again = np.concatenate([[False], edges[order[1:]] == edges[order[:-1]], [False]])
+def _twins(mesh: TriangleMesh) -> tuple[Index, Index]:
+    """The two places of each edge that stands twice, and no oftener, in `mesh.edges`."""
+    order, ordered = mesh.edge_order, mesh.edges[mesh.edge_order]
+    again = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])
     twin = np.flatnonzero(again[1:-1] & ~again[:-2] & ~again[2:])
     return order[twin], order[twin + 1]
 
@@ -262,14 +254,14 @@ def _twins(edges: Index) -> tuple[Index, Index]:
 def _neighbours(mesh: TriangleMesh) -> tuple[Index, NDArray[np.bool_]]:
     """(k, 2) triangles that share an edge, and whether both run along it in the same direction (a winding that disagrees)."""
     start = mesh.faces.T.ravel()
-    one, other = _twins(undirected_edges(mesh))
+    one, other = _twins(mesh)
     return np.stack([one, other], axis=1) % len(mesh.faces), start[one] == start[other]
 
 
 def _pinched(mesh: TriangleMesh) -> NDArray[np.bool_]:
     """(n,) vertices whose triangles are not one fan: a walk about the vertex, edge by edge, does not meet them all."""
     count, corners = len(mesh.faces), mesh.faces.T.ravel()  # half-edge k m + f leaves corner k of triangle f
-    one, other = _twins(undirected_edges(mesh))
+    one, other = _twins(mesh)
     twin = np.full(3 * count, -1)
     twin[one], twin[other] = other, one
     rim = np.flatnonzero(twin < 0)
@@ -292,7 +284,7 @@ def _lesser_fans(mesh: TriangleMesh, pinched: NDArray[np.bool_]) -> NDArray[np.b
     near = np.flatnonzero(pinched[mesh.faces].any(axis=1))
     patch = replace(mesh, faces=mesh.faces[near])
     corners, count = patch.faces.T.ravel(), len(near)
-    one, other = _twins(undirected_edges(patch))  # wound alike, so that one leaves where the other arrives
+    one, other = _twins(patch)  # wound alike, so that one leaves where the other arrives
     links = np.concatenate([np.stack([one, (other + count) % (3 * count)], 1), np.stack([(one + count) % (3 * count), other], 1)])
     fan = groups(links, 3 * count)
     first, size = np.unique(fan, return_index=True, return_counts=True)[1:]

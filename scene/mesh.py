@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,17 @@ class TriangleMesh:
     def bounds(self) -> FloatArray:
         """(2, 3) smallest and largest coordinates, m."""
         return np.array([[column.min() for column in self.vertices.T], [column.max() for column in self.vertices.T]])
+
+    @cached_property
+    def edges(self) -> NDArray[np.int64]:
+        """(3 m,) a number per edge, the same for both directions: edges 01 of all triangles, then 12, then 20."""
+        start, stop = self.faces.T.ravel(), self.faces[:, [1, 2, 0]].T.ravel()
+        return np.minimum(start, stop).astype(np.int64) * len(self.vertices) + np.maximum(start, stop)
+
+    @cached_property
+    def edge_order(self) -> NDArray[np.int64]:
+        """(3 m,) what sorts `edges`, those alike in their order."""
+        return np.argsort(self.edges, kind="stable")
 
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
         """The same triangles over moved vertices."""

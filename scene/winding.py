@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.cleaning import Mended, flipped, groups, undirected_edges, weld, wound_otherwise
+from scene.cleaning import Mended, flipped, groups, weld, wound_otherwise
 from scene.errors import InputError
 from scene.mesh import FloatArray, TriangleMesh, signed_volumes
 from scene.raycast import RayCaster
@@ -18,17 +18,20 @@ _GEOCENTRIC_M = 6.3e6, 6.5e6
 """How far from the earth's centre sensors on its surface stand."""
 
 
-def facing(mesh: TriangleMesh, viewpoints: list[FloatArray], where: str) -> Mended:
+def facing(mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, cleaned: bool = False) -> Mended:
     """The mesh wound one way in each connected piece, and counter-clockwise seen from the sensors; and what was turned, in words.
 
     viewpoints: (3,) each, the mesh's frame, near its origin. A piece that shows most of its back is turned, unless it is closed
-    and wound right: then the sensors stand in it. Vertices stay. Raises InputError for a surface with one side.
+    and wound right: then the sensors stand in it. Vertices stay. cleaned: it is welded and its pieces are wound one way, as
+    `clean` leaves them. Raises InputError for a surface with one side.
     """
-    welded = weld(mesh)[0]
-    odd = wound_otherwise(welded, where)
-    mesh, welded = flipped(mesh, odd), flipped(welded, odd)
+    welded, words = mesh, []
+    if not cleaned:
+        welded = weld(mesh)[0]
+        odd = wound_otherwise(welded, where)
+        mesh, welded = flipped(mesh, odd), flipped(welded, odd)
+        words = [f"{int(odd.sum())} triangles wound the other way round"] if odd.any() else []
     backs = _pieces_seen_from_behind(mesh, welded, viewpoints)
-    words = [f"{int(odd.sum())} triangles wound the other way round"] if odd.any() else []
     if backs.any():
         mesh = flipped(mesh, backs)
         part = "all" if backs.all() else "a piece of"
@@ -66,12 +69,14 @@ def _pieces_seen_from_behind(mesh: TriangleMesh, welded: TriangleMesh, viewpoint
     piece = groups(welded.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(welded.vertices))[welded.faces[:, 0]]
     count = int(piece.max()) + 1
     backs = np.bincount(piece[face], np.where(behind, 1, -1), count) > 0
+    if not backs.any():
+        return np.zeros(len(mesh.faces), bool)
     return (backs & ~_is_whole(welded, piece, count))[piece]
 
 
 def _is_whole(mesh: TriangleMesh, piece: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
     """(count,) pieces that are closed and wound counter-clockwise seen from outside: their signed volume is above 0."""
-    _, inverse, uses = np.unique(undirected_edges(mesh), return_inverse=True, return_counts=True)
+    _, inverse, uses = np.unique(mesh.edges, return_inverse=True, return_counts=True)
     rim = np.bincount(np.tile(piece, 3), uses[inverse] == 1, count)
     volume = signed_volumes(mesh.corners() - mesh.vertices.mean(axis=0))
     return (rim == 0) & (np.bincount(piece, volume, count) > 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from pipeline.config.simulation import SensorName, SimulationConfig
 from scene.frame import WallFrame
@@ -18,6 +19,9 @@ from sensors.placement import Target
 from sensors.stereo import StereoPair
 from sensors.stereo_matched import MatchedStereoPair
 from sensors.tls import LaserScanner
+
+Origin = Literal["rule", "file", "given"]
+"""Where a wall comes from: made here, read and cleaned here, or handed in as it is."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +48,13 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
     Raises InputError for a wall that cannot be used and a sensor that cannot be placed.
     """
     wall = given or build_wall(config.wall, random.child("wall"))
-    foreign = given is not None or isinstance(config.wall, ImportedWall)
+    origin: Origin = "given" if given is not None else "file" if isinstance(config.wall, ImportedWall) else "rule"
     target = Target(wall.mesh)
     if sensor == "stereo":
         cameras = config.camera_pair(target)
         frame = WallFrame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
         positions = {f"cameras, {side}": getattr(cameras, side).position for side in ("left", "right")}
-        mesh, repairs = _faced(wall, frame, positions, foreign=foreign)
+        mesh, repairs = _faced(wall, frame, positions, origin)
         pair = _stereo(config, cameras, frame, random)
         eyes = {name: frame.to_wall(position) for name, position in positions.items()}
         return SensorSite(wall.name, repairs, mesh, frame, pair, eyes)
@@ -59,7 +63,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
     frame = WallFrame.fit(wall.mesh.vertices, poses[0][0])
     positions = {f"station, number {number}": position for number, (position, _) in enumerate(poses, start=1)}
     positions = positions if len(poses) > 1 else {"station": poses[0][0]}
-    mesh, repairs = _faced(wall, frame, positions, foreign=foreign)
+    mesh, repairs = _faced(wall, frame, positions, origin)
     instrument = config.scanner, config.tls_model(), config.products.truth_channels
     scanners = [
         LaserScanner.aimed(pose, frame, mesh.vertices, *instrument, station.pose_sigma)
@@ -70,17 +74,18 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
 
 
 def _faced(
-    wall: Wall, frame: WallFrame, positions: Mapping[str, FloatArray], *, foreign: bool
+    wall: Wall, frame: WallFrame, positions: Mapping[str, FloatArray], origin: Origin
 ) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """The wall in its frame, one that others made (foreign) wound as the sensors see it, and what was mended in it.
+    """The wall in its frame, one that others made wound as the sensors see it, and what was mended in it.
 
     positions: world frame.
     """
     check_near(wall.mesh.vertices, positions, wall.name)
     mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
-    if not foreign:
+    if origin == "rule":
         return mesh, wall.repairs
-    mesh, words = facing(mesh, [frame.to_wall(position) for position in positions.values()], wall.file or wall.name)
+    eyes = [frame.to_wall(position) for position in positions.values()]
+    mesh, words = facing(mesh, eyes, wall.file or wall.name, cleaned=origin == "file")
     return mesh, (*wall.repairs, *([words] if words else []))
 
 
