@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import resource
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+import drjit
 
 from scene.backend import dr, mi
 from scene.raycast import RayCaster
 
 ROUNDS = 7
+_SET_TARGET = "_Z19jit_llvm_set_targetPKcS0_j"
+"""Of libdrjit-core: jit_llvm_set_target(processor, features, lanes), which Python has no word for."""
+
+
+def narrow_vectors() -> bool:
+    """Whether `--avx2` asks for vectors of 8 lanes and no AVX-512, as most desktops have them; compiled so from here on.
+
+    Embree may still use its own instructions of the processor for them.
+    """
+    asked = "--avx2" in sys.argv
+    if asked:
+        library = ctypes.CDLL(str(Path(drjit.__file__).with_name("libdrjit-core.so")))
+        set_target = getattr(library, _SET_TARGET)
+        set_target.argtypes = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32]
+        set_target(b"haswell", None, 8)
+    return asked
 
 
 def seconds(work: Callable[[], object]) -> float:

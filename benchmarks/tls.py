@@ -1,5 +1,7 @@
 """One TLS observation of 5 M pulses on 1.3 M triangles against the bare cast of the same rays and against Open3D's cast_rays.
 
+    python benchmarks/tls.py [--avx2]           (as on a processor without AVX-512)
+
 To reach: at least 0.5 of the bare rate, and at least Open3D's.
 """
 
@@ -10,7 +12,7 @@ import sys
 
 import numpy as np
 import open3d as o3d
-from measure import bare_cast, empty_kernel_cache, medians, peak_memory_gb, seconds
+from measure import bare_cast, empty_kernel_cache, medians, narrow_vectors, peak_memory_gb, seconds
 
 from scene.backend import VARIANT, dr, mi
 from scene.frame import WallFrame
@@ -43,6 +45,7 @@ def prepared() -> tuple[LaserScanner, RayCaster, KeyedRandom]:
 
 def cold() -> None:
     """The first observation of a process that finds no compiled kernel, and the second."""
+    narrow_vectors()
     scanner, caster, random = prepared()
     first, second = (seconds(lambda: scanner.observe(caster, random)) for _ in range(2))
     print(f"first observation, empty kernel cache {first:6.3f} s   (the second {second:.3f} s)", flush=True)
@@ -50,7 +53,8 @@ def cold() -> None:
 
 def main() -> None:
     with empty_kernel_cache() as environment:
-        subprocess.run([sys.executable, __file__, "--cold"], check=True, env=environment)
+        subprocess.run([sys.executable, __file__, "--cold", *sys.argv[1:]], check=True, env=environment)
+    lanes = ", 8 lanes" if narrow_vectors() else ""
     scanner, caster, random = prepared()
     mesh, count = caster.mesh, scanner.pattern.lines * scanner.pattern.pulses
 
@@ -67,7 +71,7 @@ def main() -> None:
     rays = o3d.core.Tensor(rays)
 
     ours, cast, open3d = medians(lambda: scanner.observe(caster, random), bare, lambda: peer.cast_rays(rays))
-    print(f"{VARIANT}, {dr.thread_count()} threads, {len(mesh.faces):,} triangles, {count:,} pulses")
+    print(f"{VARIANT}{lanes}, {dr.thread_count()} threads, {len(mesh.faces):,} triangles, {count:,} pulses")
     print(f"bare ray_intersect_preliminary        {cast:6.3f} s   {count / cast / 1e6:5.1f} M/s")
     print(f"Open3D cast_rays                      {open3d:6.3f} s   {count / open3d / 1e6:5.1f} M/s")
     print(f"observation: noise, float64, points   {ours:6.3f} s   {count / ours / 1e6:5.1f} M/s")

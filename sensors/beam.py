@@ -96,10 +96,10 @@ class Beam:
         """Unit vectors of sub-rays by `number` (n,), 3 x (n,), about the axis and with the two unit vectors across it."""
         if self.sub_rays == 1:
             return axis
-        divergence = dr.opaque(mi.Float64, self.divergence_rad)
-        first, second = (divergence * vectors for vectors in across)
-        x, y = (dr.gather(mi.Float64, on_device(mi.Float64, each), number) for each in unit_offsets(self.sub_rays).T)
-        return dr.normalize(axis + x * first + y * second)
+        aside = self.divergence_rad * unit_offsets(self.sub_rays)
+        weights = np.column_stack([np.ones(len(aside)), aside]) / np.sqrt(1 + np.sum(aside**2, axis=1, keepdims=True))
+        along, first, second = dr.gather(mi.Array3f64, on_device(mi.Float64, weights), number)
+        return along * axis + first * across[0] + second * across[1]
 
     def received(self, rays: SubRays) -> Echo:
         """The recorded return of every pulse, from the echoes of its sub-rays."""

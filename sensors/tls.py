@@ -255,13 +255,20 @@ class LaserScanner:
         """
         ray, many = dr.arange(mi.UInt32, count * beam.sub_rays), dr.opaque(mi.UInt32, beam.sub_rays)
         own = ray // many
-        pulse = own + dr.opaque(mi.UInt32, start)
-        azimuth, zenith = (dr.gather(mi.Float64, angle, pulse) for angle in (pulses.aim_azimuth, pulses.aim_zenith))
-        axis = rotated(self.rotation, direction(azimuth, zenith))
-        across = [rotated(self.rotation, vectors) for vectors in tangents(azimuth, zenith)]
+        axis, *across = self._axes(pulses, start, count)
+        if beam.sub_rays > 1:
+            dr.eval(axis, across)
+            axis, *across = (dr.gather(mi.Array3f64, vectors, own) for vectors in (axis, *across))
         echoes = self._traced(scene, beam.sub_ray(axis, across, ray - own * many))
         dr.eval(echoes)
         return SubRays(echoes, beam.sub_rays)
+
+    def _axes(self, pulses: Pulses, start: int, count: int) -> tuple[mi.Array3f64, ...]:
+        """Unit vectors along the beams of `count` pulses from the number `start` on, and two across each, wall frame."""
+        pulse = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        azimuth, zenith = (dr.gather(mi.Float64, angle, pulse) for angle in (pulses.aim_azimuth, pulses.aim_zenith))
+        vectors = direction(azimuth, zenith), *tangents(azimuth, zenith)
+        return tuple(rotated(self.rotation, each) for each in vectors)
 
     def _traced(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
         """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
