@@ -16,6 +16,7 @@ from matplotlib.text import Text
 from pipeline.cli.main import main
 from pipeline.formats.laz import read_laz
 from pipeline.formats.measurement import Measurement, read_measurement
+from pipeline.gap.decisions import read_decisions
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.verify import Gap
@@ -75,6 +76,15 @@ def test_every_verdict_has_a_report(
     assert places == sorted(places)
     assert "On blocks that no step has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
     assert ("± &lt; 0.001 mm" in page) == (verdict in ("named", "several", "ambiguous"))
+
+
+def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[GapDiagnosis, Measurement]) -> None:
+    """As it was diagnosed, wherever that is written: of a gap 500 of its errors wide none, where 1000 are asked for."""
+    found, measurement = few
+    gap = Gap(before=0.006, after=0.001, floor=0.001, error=1e-5, floor_error=1e-5, points=100)
+    strict = read_decisions(["verdict.gap_sigmas=1000"])
+    assert report.to_dict(replace(found, gap=gap), measurement)["gap"]["closed"] == 1.0
+    assert report.to_dict(replace(found, gap=gap, decisions=strict), measurement)["gap"]["closed"] is None
 
 
 def test_each_of_several_effects_says_what_it_takes_away(few: tuple[GapDiagnosis, Measurement]) -> None:

@@ -38,7 +38,12 @@ _MOST_TRIED = 25
 
 
 def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    """gap.json."""
+    """gap.json, by the thresholds of the diagnosis."""
+    with deciding(found.decisions):
+        return _to_dict(found, measurement)
+
+
+def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
     shift, turn = found.pose[:3], found.pose[3:]
     axes = measurement.frame.rotation
     return {
