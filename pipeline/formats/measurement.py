@@ -190,7 +190,7 @@ class MeasurementBase(ABC):
     @property
     def fit(self) -> PointFit:
         """How the points lie against the reference."""
-        return PointFit.of(self.cloud.points, self.viewpoint, self.scene)
+        return PointFit.of(self.cloud.points, self.viewpoint, self.scene, self.sensor)
 
     def changed(self, **values: Any) -> Self:
         """The same with other points, cameras or pose, in front of the same ray caster."""

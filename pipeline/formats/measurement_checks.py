@@ -15,14 +15,16 @@ from scene.errors import InputError
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from sensors.camera import Camera, CameraPair
+from sensors.effects.base import Sensor
 from sensors.polar import polar
 
 Sweep = tuple[float, float, float]
 _SAMPLE = 20_000
 _FEWEST_HITS, _FEWEST_NEAR = 0.01, 0.25
 """Share of the points whose rays must meet the reference, and of these the share that must lie near it."""
-_NEAR_M, _NEAR_SHARE = 1.0, 0.02
-"""A point is near the reference within this distance along its ray, or within this share of its range if that is more."""
+_NEAR_M, _NEAR_SHARE = 1.0, {"tls": 0.02, "stereo": 0.06}
+"""A point is near the reference within this distance along its ray, or within this share of its range if that is more: a camera
+that is turned by 4 mrad more than is known moves what lies ten bases away by 4 %."""
 _FEWEST_INSIDE = 0.5
 """Share of the points that must lie within the pattern's angles."""
 _PULSES_PER_POINT, _FEW_PULSES = 100.0, 1e6
@@ -45,25 +47,30 @@ _LEAST_SIGMA = {"tls": (1e-6, "m", "range_sigma_m"), "stereo": (2e-4, "px", "par
 @dataclass(frozen=True)
 class PointFit:
     """How a sample of the points lies against the reference. hits: share whose rays meet it; near: of these, share near it;
-    off_m: median distance behind it along the rays (negative: before it), NaN without hits."""
+    off_m: median distance behind it along the rays (negative: before it), NaN without hits; reach: share of the range within
+    which a point is near."""
 
     hits: float
     near: float
     off_m: float
+    reach: float
 
     @classmethod
-    def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster) -> PointFit:
+    def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster, sensor: Sensor) -> PointFit:
         """points: (n, 3), origin: (3,) of the rays; wall frame, m."""
+        reach = _NEAR_SHARE[sensor]
         away = points[:: max(len(points) // _SAMPLE, 1)] - origin
         length = np.linalg.norm(away, axis=1)
         away, length = away[length > _ONE_PLACE_M], length[length > _ONE_PLACE_M]
         if not len(length):
-            return cls(0.0, 0.0, np.nan)
+            return cls(0.0, 0.0, np.nan, reach)
         distance = reference.cast(origin, away / length[:, None])[0]
         hit = np.isfinite(distance)
         off = (length - distance)[hit]
-        near = np.abs(off) <= np.maximum(_NEAR_M, _NEAR_SHARE * length[hit])
-        return cls(float(hit.mean()), float(near.mean()) if len(off) else 0.0, float(np.median(off)) if len(off) else np.nan)
+        near = np.abs(off) <= np.maximum(_NEAR_M, reach * length[hit])
+        if not len(off):
+            return cls(0.0, 0.0, np.nan, reach)
+        return cls(float(hit.mean()), float(near.mean()), float(np.median(off)), reach)
 
     @property
     def good(self) -> bool:
@@ -182,7 +189,7 @@ def check_near(here: PointFit) -> None:
     problem = (
         f"the points lie {abs(here.off_m):.3g} m {'behind' if here.off_m > 0 else 'before'} the reference (median along the rays)"
     )
-    allowed = f"a quarter of them within {_NEAR_M:g} m or {100 * _NEAR_SHARE:g} % of the range"
+    allowed = f"a quarter of them within {_NEAR_M:g} m or {100 * here.reach:g} % of the range"
     remedy = "check the sensor's position, the unit (m) and that points and reference are of one wall"
     raise InputError(problem, where="measurement.yaml", allowed=allowed, remedy=remedy)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from gap_cases import write_scan
+from surfaces import plane
 
 from pipeline.cli.main import main
 from pipeline.formats.laz import write_laz
@@ -20,6 +21,8 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.xyz import read_xyz
 from scene.errors import InputError
+from scene.raycast import RayCaster
+from sensors.effects.base import Sensor
 
 SCALE_AT, OFFSET_AT = 131, 155
 """Places of the first scale factor and the first offset in the header of a LAS file."""
@@ -168,3 +171,13 @@ def test_a_line_is_bounded_wherever_it_stands(tmp_path: Path) -> None:
         read_xyz(path)
     path.write_bytes(b"1 2 3\n" * 50_000)
     assert len(read_xyz(path).points) == 50_000
+
+
+@pytest.mark.parametrize(("sensor", "off_m", "good"), [("tls", 4.0, False), ("stereo", 4.0, True), ("stereo", 8.0, False)])
+def test_a_pair_may_be_off_by_what_a_turned_camera_does(sensor: Sensor, off_m: float, good: bool) -> None:
+    """A camera that is turned by 3.5 mrad (catalogue: up to 4) moves what lies at 100 m, ten bases away, by 3.5 m and more."""
+    x, y = np.meshgrid(np.linspace(-10, 10, 21), np.linspace(-10, 10, 21))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, -100.0)], axis=1)
+    wall = RayCaster(plane(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -100.0]), half_side=50.0))
+    away = points * (1 + off_m / np.linalg.norm(points, axis=1, keepdims=True))
+    assert PointFit.of(away, np.zeros(3), wall, sensor).good == good

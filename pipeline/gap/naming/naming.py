@@ -82,8 +82,8 @@ def name_effects(
     What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
     slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread; left_out:
     families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word;
-    nodes: noise that neighbours share, found in what a search had left beside free forms, which such noise feigns; it is
-    searched again beside that.
+    nodes: noise that neighbours share, found in what a search had left: it feigns free forms, and an error of the reference that
+    is larger than the true one, so that all is searched again beside it.
     """
     named: list[Named] = []
     whole, whole_scale, added = part, scale, 0.0
@@ -123,10 +123,11 @@ def name_effects(
             case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
                 nodes_left = find_nodes(found.at, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
-                if nodes_left is not None and nodes is None and described:
-                    nodes_in_all = find_nodes(part, registered(part)[0], model, random)
+                if nodes_left is not None and nodes is None:
+                    nodes_in_all = find_nodes(part, registered(part)[0], model, random) if described else None
                     return name_effects(measurement, whole, whole_scale, random, left_out, nodes_in_all or nodes_left)
-                spread = [] if nodes_left is None else [nodes_left]
+                kept = nodes_left or (None if described else nodes)
+                spread = [] if kept is None else [kept]
     if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
     moving = [from_mean(each, found.at) for each in found.estimates]
