@@ -18,14 +18,15 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
+from pipeline.config.simulation import CamerasFile
 from pipeline.dataset.config import DATASET_FILE, DatasetConfig
 from pipeline.dataset.plan import SPLITS
 from pipeline.dataset.records import SHARDS, Record, read_shard
 from pipeline.formats.checksum import sha256
 from pipeline.formats.inside import inside
 from scene.errors import InputError
+from scene.imported import ImportedWall
 
 STAGING, CHECKSUMS, TRUTH = ".staging", "checksums.sha256", "truth"
 
@@ -34,16 +35,11 @@ def fingerprint(config: DatasetConfig) -> str:
     """What tells sets apart: a hash of the resolved config and of the files that its walls and cameras are read from."""
     digest = hashlib.sha256(config.model_dump_json().encode())
     for wall in config.walls.values():
-        for path in (getattr(wall.wall, "mesh", None), getattr(wall.cameras, "file", None)):
-            for file in _files(path):
-                digest.update(sha256(file).encode())
+        meshes = [wall.wall.mesh] if isinstance(wall.wall, ImportedWall) else []
+        cameras = wall.cameras.files() if isinstance(wall.cameras, CamerasFile) else []
+        for file in [*meshes, *cameras]:
+            digest.update(sha256(file).encode())
     return digest.hexdigest()[:12]
-
-
-def _files(path: Any) -> list[Path]:
-    if not isinstance(path, Path):
-        return []
-    return sorted(path.iterdir()) if path.is_dir() else [path]
 
 
 def tile_files(record: Record) -> Iterator[tuple[str, str]]:
