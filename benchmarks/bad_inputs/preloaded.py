@@ -25,8 +25,9 @@ MOST_WALL_S, MOST_OWN_S, MOST_GB = 180.0, 60.0, 4.0
 """A command that goes on for longer, on the wall's clock or the processor's, or takes more memory, is killed."""
 _LOOKS_AFTER_S = 0.5
 LIBRARIES = (
-    *("cv2", "jinja2", "laspy", "manifold3d", "matplotlib.backends.backend_agg", "matplotlib.figure", "numpy"),
-    *("pycocotools.mask", "pydantic", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "scipy.stats", "tifffile", "trimesh"),
+    *("cv2", "dash", "flask", "jinja2", "laspy", "manifold3d", "matplotlib.backends.backend_agg", "matplotlib.figure", "numpy"),
+    *("plotly.graph_objects", "pycocotools.mask", "pydantic.main", "pye57", "scipy.ndimage", "scipy.optimize", "scipy.spatial"),
+    *("scipy.stats", "tifffile", "trimesh", "xml.etree.ElementTree", "yaml"),
 )
 ROOMS = (
     *("pipeline.run.simulation", "pipeline.run.report", "pipeline.gap.naming.workflow", "pipeline.gap.report.report"),
