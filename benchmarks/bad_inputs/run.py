@@ -28,6 +28,7 @@ from benchmarks.bad_inputs import (
     coco_cases,
     dataset_cases,
     exchange_cases,
+    export_cases,
     further_cases,
     gap_cases,
     measurement_cases,
@@ -56,6 +57,7 @@ def all_cases() -> list[Case]:
         *camera_cases.cases(),
         *odd_results_cases.cases(),
         *odd_words_cases.cases(),
+        *export_cases.cases(),
     ]
 
 
