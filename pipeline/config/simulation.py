@@ -233,7 +233,10 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
     says of the instrument (pipeline/config/presets.py). Raises InputError for whatever is wrong, and where the config's only
     models are of another sensor than `sensor` (None: any).
     """
-    return resolved(load_yaml(path), overrides, sensor, seed, path)
+    values = load_yaml(path)
+    if values is None:
+        raise InputError("holds no key", where=str(path), remedy="write at least one, or begin with what `scarpsim init` writes")
+    return resolved(values, overrides, sensor, seed, path)
 
 
 def resolved(
