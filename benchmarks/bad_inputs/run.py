@@ -34,6 +34,7 @@ from benchmarks.bad_inputs import (
     measurement_cases,
     odd_results_cases,
     odd_words_cases,
+    people_cases,
     placed_cases,
     raw_cases,
     site_cases,
@@ -60,6 +61,7 @@ def all_cases() -> list[Case]:
         *odd_words_cases.cases(),
         *export_cases.cases(),
         *placed_cases.cases(),
+        *people_cases.cases(),
     ]
 
 
