@@ -14,8 +14,10 @@ from scene.errors import InputError
 
 MOST_TEXT_BYTES = 512_000_000
 """Of a text file that is read into memory as a whole."""
-JSON_LIMIT, MOST_JSON_GB = "SCARPSIM_JSON_GB", 1.7
-"""What a JSON file may take in memory; the variable of the environment allows more."""
+MOST_JSON_GB = 1.7
+"""What a JSON file may take in memory."""
+READ_LIMIT = "SCARPSIM_READ_GB"
+"""The variable of the environment that allows any file that is read to take more, in GB."""
 
 
 def check_file(
@@ -41,11 +43,11 @@ def check_file(
     return path
 
 
-def read_text(
-    path: Path, *, most_bytes: int = MOST_TEXT_BYTES, remedy: str = "check the path", smaller: str = "give a smaller one"
-) -> str:
-    """The text of a file in UTF-8; raises InputError as `check_file` does, and for other encodings."""
-    check_file(path, most_bytes=most_bytes, remedy=remedy, smaller=smaller)
+def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str | None = None) -> str:
+    """The text of a file in UTF-8; raises InputError as `check_file` does, and for other encodings. most_bytes: none: as many
+    as MOST_TEXT_BYTES or the variable READ_LIMIT allow."""
+    most = max(MOST_TEXT_BYTES, int(raised_gb() * 1e9)) if most_bytes is None else most_bytes
+    check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller one, or set the variable {READ_LIMIT}")
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -59,9 +61,9 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
     """The value that a JSON file holds.
 
     Raises InputError as `read_text` does, where the file is not JSON, and before it is read where it may take more than
-    MOST_JSON_GB of memory, or than the variable JSON_LIMIT says.
+    MOST_JSON_GB of memory, or than the variable READ_LIMIT says.
     """
-    most = _most_json_gb()
+    most = max(MOST_JSON_GB, raised_gb())
     size = check_file(path, remedy=remedy).stat().st_size
     try:
         needed = _json_gb(path, size, most)
@@ -69,7 +71,7 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
     if needed > most:
         problem = f"holds so much that it may take {needed:.1f} GB of memory"
-        smaller = f"cut it into parts, or set the variable {JSON_LIMIT}={math.ceil(1.1 * needed)}"
+        smaller = f"cut it into parts, or set the variable {READ_LIMIT}={math.ceil(1.1 * needed)}"
         raise InputError(problem, where=str(path), allowed=f"up to {most:g} GB", remedy=smaller)
     text = read_text(path, most_bytes=int(most * 1e9), remedy=remedy)
     try:
@@ -79,16 +81,17 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
         raise InputError(f"is not JSON ({problem})", where=str(path), remedy=remedy) from None
 
 
-def _most_json_gb() -> float:
-    given = os.environ.get(JSON_LIMIT)
+def raised_gb() -> float:
+    """What the variable READ_LIMIT says, 0 without it."""
+    given = os.environ.get(READ_LIMIT)
     if not given:
-        return MOST_JSON_GB
+        return 0.0
     try:
         most = float(given)
     except ValueError:
         most = math.nan
     if not most > 0:
-        raise InputError(f"got '{given}'", where=JSON_LIMIT, allowed="gigabytes, above 0")
+        raise InputError(f"got '{given}'", where=READ_LIMIT, allowed="gigabytes, above 0")
     return most
 
 

@@ -50,10 +50,10 @@ def test_what_it_may_take_is_more_than_it_takes(text: str, tmp_path: Path) -> No
 def test_too_much_is_refused_with_the_limit_that_would_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.json"
     path.write_text(f"[{','.join(['{}'] * 50_000)}]")
-    monkeypatch.setenv(regular_file.JSON_LIMIT, "0.001")
-    with pytest.raises(InputError, match=r"may take 0.0 GB of memory; allowed: up to 0.001 GB; .* SCARPSIM_JSON_GB=1$"):
+    monkeypatch.setattr(regular_file, "MOST_JSON_GB", 0.001)
+    with pytest.raises(InputError, match=r"may take 0.0 GB of memory; allowed: up to 0.001 GB; .* SCARPSIM_READ_GB=1$"):
         read_json(path)
-    monkeypatch.setenv(regular_file.JSON_LIMIT, "1")
+    monkeypatch.setenv(regular_file.READ_LIMIT, "1")
     assert len(read_json(path)) == 50_000
 
 
@@ -62,7 +62,7 @@ def test_gigabytes_are_refused_unread(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.write(b"[")
         file.truncate(60_000_000_000)
-    with pytest.raises(InputError, match=r"may take 120.0 GB of memory; .* SCARPSIM_JSON_GB=133"):
+    with pytest.raises(InputError, match=r"may take 120.0 GB of memory; .* SCARPSIM_READ_GB=133"):
         read_json(path)
 
 
@@ -70,6 +70,6 @@ def test_gigabytes_are_refused_unread(tmp_path: Path) -> None:
 def test_the_limit_is_a_number(given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.json"
     path.write_text("{}")
-    monkeypatch.setenv(regular_file.JSON_LIMIT, given)
-    with pytest.raises(InputError, match="SCARPSIM_JSON_GB: got"):
+    monkeypatch.setenv(regular_file.READ_LIMIT, given)
+    with pytest.raises(InputError, match="SCARPSIM_READ_GB: got"):
         read_json(path)
