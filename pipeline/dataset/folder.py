@@ -13,6 +13,7 @@ staging folder of the job and renamed; a later job removes the staging folders o
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
@@ -89,11 +90,19 @@ def require_no_folders(folder: Path, damage: list[Damage]) -> None:
             raise InputError("is a folder where a file of the set belongs", where=str(folder / each.file), remedy="move it away")
 
 
+def require_own_folders(folder: Path) -> None:
+    """Raise InputError where something else stands in the place of a folder that a job writes into, or a link leads out of it."""
+    for name in (STAGING, SHARDS, *SPLITS):
+        path = folder / name
+        if os.path.lexists(path) and (not path.is_dir() or (name == STAGING and path.is_symlink())):
+            raise InputError("is no folder", where=str(path), remedy="move it away, a folder of the set belongs there")
+
+
 def discard_unbegun(folder: Path) -> None:
     """Remove what a job has written that ended before its first epoch was made; what others put there stays."""
     if any((folder / SHARDS).glob("*.json")):
         return
-    shutil.rmtree(folder / STAGING, ignore_errors=True)
+    _remove_staging(folder)
     own = [folder / name for name in (SHARDS, *(f"{split}/{TRUTH}" for split in SPLITS), *SPLITS)]
     for each in own:
         with suppress(OSError):  # is not there, or holds tiles
@@ -104,6 +113,11 @@ def discard_unbegun(folder: Path) -> None:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove what dead jobs left under temporary names."""
-    shutil.rmtree(folder / STAGING, ignore_errors=True)
+    _remove_staging(folder)
     for part in folder.rglob(".*.part*"):
         part.unlink(missing_ok=True)
+
+
+def _remove_staging(folder: Path) -> None:
+    if (folder / STAGING).is_dir():  # rmtree waits for ever at a pipe
+        shutil.rmtree(folder / STAGING, ignore_errors=True)
