@@ -13,7 +13,6 @@ staging folder of the job and renamed; a later job removes the staging folders o
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
@@ -26,6 +25,7 @@ from pipeline.dataset.plan import SPLITS
 from pipeline.dataset.records import SHARDS, Record, read_shard
 from pipeline.formats.checksum import sha256
 from pipeline.formats.inside import inside
+from pipeline.formats.own_folders import require_own_folder
 from scene.errors import InputError
 from scene.imported import ImportedWall
 
@@ -91,11 +91,10 @@ def require_no_folders(folder: Path, damage: list[Damage]) -> None:
 
 
 def require_own_folders(folder: Path) -> None:
-    """Raise InputError where something else stands in the place of a folder that a job writes into, or a link leads out of it."""
+    """Raise InputError where something else stands in the place of a folder of a job; a split may be a link to one."""
     for name in (STAGING, SHARDS, *SPLITS):
-        path = folder / name
-        if os.path.lexists(path) and (not path.is_dir() or (name == STAGING and path.is_symlink())):
-            raise InputError("is no folder", where=str(path), remedy="move it away, a folder of the set belongs there")
+        if name not in SPLITS or not (folder / name).is_dir():
+            require_own_folder(folder / name)
 
 
 def discard_unbegun(folder: Path) -> None:

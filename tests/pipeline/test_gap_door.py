@@ -15,7 +15,7 @@ from gap_cases import write_scan
 from pipeline.cli.main import main
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import read_measurement
-from pipeline.formats.measurement_checks import PointFit
+from pipeline.formats.measurement_checks import PointFit, check_different
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.xyz import read_xyz
@@ -168,3 +168,10 @@ def test_a_line_is_bounded_wherever_it_stands(tmp_path: Path) -> None:
         read_xyz(path)
     path.write_bytes(b"1 2 3\n" * 50_000)
     assert len(read_xyz(path).points) == 50_000
+
+
+def test_one_epoch_under_two_names_is_named() -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3))
+    check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points + 1e-9)})
+    with pytest.raises(InputError, match=r"c\.laz: holds the same points as a\.laz"):
+        check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points[1:]), "c.laz": PointCloud(points.copy())})
