@@ -5,7 +5,8 @@
 Each runs as a process of its own, some seconds long, on copies of small good inputs that are made first, those of listed.txt
 before the others. Prints those that are answered badly (see case.py for what that is), and counts by command; exit status 1 where
 there are any. --state keeps the good inputs and each answer in a folder, so that a count that was stopped goes on where it was;
-with --again those answered badly are tried once more. --table writes the counts into the page.
+with --again those answered badly are tried once more; with --kept none is tried, and what is kept is counted. --table writes the
+counts into the page.
 """
 
 from __future__ import annotations
@@ -158,6 +159,7 @@ def main() -> int:
     parser.add_argument("--table", type=Path, help="a page with the two marks between which the table goes")
     parser.add_argument("--state", type=Path, help="keep the good inputs and all answers in this folder, and go on with them")
     parser.add_argument("--again", action="store_true", help="with --state: those answered badly once more")
+    parser.add_argument("--kept", action="store_true", help="with --state: count the answers there and try nothing")
     parser.add_argument("--show", action="store_true", help="print the good answers too")
     parser.add_argument("--here", action="store_true", help="in this process: faster, and memory is not looked at")
     parser.add_argument("--fresh", action="store_true", help="each process imports the program and ends by itself: slower")
@@ -183,6 +185,9 @@ def _counted(cases: Sequence[Case], arguments: argparse.Namespace) -> list[Outco
         kept = Kept(arguments.state / "outcomes.jsonl")
         done = {each.case.name for each in kept.outcomes(cases) if not (arguments.again and each.problems)}
         left = [case for case in cases if case.name not in done]
+        if arguments.kept:
+            print(f"{len(cases) - len(left)} of {len(cases)} were tried")
+            return kept.outcomes(cases)
 
     def heard(outcome: Outcome) -> None:
         if kept:
