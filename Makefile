@@ -1,7 +1,7 @@
 # `make demo` and `make test` work from an empty clone on a bare Debian or Ubuntu with Python 3.11 to 3.13; see tools/setup.sh.
 BIN := .venv/bin
 
-.PHONY: help setup setup-all demo test docs format benchmarks
+.PHONY: help setup setup-all demo test docs format benchmarks nightly
 
 help:
 	@echo 'make setup       what the program runs on: environment and system libraries (seconds when they are there)'
@@ -11,6 +11,7 @@ help:
 	@echo 'make docs        the documentation site, in site/index.html'
 	@echo 'make format      put the code into the project'"'"'s format'
 	@echo 'make benchmarks  every benchmark, each with its ratio to the limit measured in the same run'
+	@echo 'make nightly     robustness at length: 500 drawn inputs a command, the list of bad inputs, the soak (hours)'
 
 setup:
 	@sh tools/setup.sh
@@ -40,3 +41,10 @@ format: setup-all
 
 benchmarks: setup-all
 	@for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done
+
+nightly: setup-all
+	$(BIN)/python benchmarks/fuzz.py 500
+	$(BIN)/python benchmarks/fuzz.py 500 --through
+	$(BIN)/python benchmarks/bad_inputs/run.py --jobs 2
+	$(BIN)/python benchmarks/soak.py tls
+	$(BIN)/python benchmarks/soak.py stereo

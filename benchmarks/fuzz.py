@@ -46,7 +46,7 @@ def through(commands: list[str], examples: int) -> int:
     with tempfile.TemporaryDirectory(prefix="fuzz_") as name:
         folder = Path(name)
         make_small(folder / "materials")
-        forked_from = Preloaded(rooms=True)
+        forked_from = Preloaded(folder / "bytecode", rooms=True)
 
         def badly(command: str) -> int:
             found: list[Outcome] = []

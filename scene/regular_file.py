@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +14,10 @@ from scene.errors import InputError
 
 MOST_TEXT_BYTES = 512_000_000
 """Of a text file that is read into memory as a whole."""
+MOST_JSON_GB = 1.7
+"""What a JSON file may take in memory."""
+READ_LIMIT = "SCARPSIM_READ_GB"
+"""The variable of the environment that allows any file that is read to take more, in GB."""
 
 
 def check_file(
@@ -37,11 +43,11 @@ def check_file(
     return path
 
 
-def read_text(
-    path: Path, *, most_bytes: int = MOST_TEXT_BYTES, remedy: str = "check the path", smaller: str = "give a smaller one"
-) -> str:
-    """The text of a file in UTF-8; raises InputError as `check_file` does, and for other encodings."""
-    check_file(path, most_bytes=most_bytes, remedy=remedy, smaller=smaller)
+def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str | None = None) -> str:
+    """The text of a file in UTF-8; raises InputError as `check_file` does, and for other encodings. most_bytes: none: as many
+    as MOST_TEXT_BYTES or the variable READ_LIMIT allow."""
+    most = max(MOST_TEXT_BYTES, int(raised_gb() * 1e9)) if most_bytes is None else most_bytes
+    check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller one, or set the variable {READ_LIMIT}")
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -52,13 +58,59 @@ def read_text(
 
 
 def read_json(path: Path, *, remedy: str = "make it again") -> Any:
-    """The value that a JSON file holds; raises InputError as `read_text` does, and where the file is not JSON."""
-    text = read_text(path, remedy=remedy)
+    """The value that a JSON file holds.
+
+    Raises InputError as `read_text` does, where the file is not JSON, and before it is read where it may take more than
+    MOST_JSON_GB of memory, or than the variable READ_LIMIT says.
+    """
+    most = max(MOST_JSON_GB, raised_gb())
+    size = check_file(path, remedy=remedy).stat().st_size
+    try:
+        needed = _json_gb(path, size, most)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
+    if needed > most:
+        problem = f"holds so much that it may take {needed:.1f} GB of memory"
+        smaller = f"cut it into parts, or set the variable {READ_LIMIT}={math.ceil(1.1 * needed)}"
+        raise InputError(problem, where=str(path), allowed=f"up to {most:g} GB", remedy=smaller)
+    text = read_text(path, most_bytes=int(most * 1e9), remedy=remedy)
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         problem = " ".join(str(error).split()) or "nested too deeply"
         raise InputError(f"is not JSON ({problem})", where=str(path), remedy=remedy) from None
+
+
+def raised_gb() -> float:
+    """What the variable READ_LIMIT says, 0 without it."""
+    given = os.environ.get(READ_LIMIT)
+    if not given:
+        return 0.0
+    try:
+        most = float(given)
+    except ValueError:
+        most = math.nan
+    if not most > 0:
+        raise InputError(f"got '{given}'", where=READ_LIMIT, allowed="gigabytes, above 0")
+    return most
+
+
+def _json_gb(path: Path, size: int, enough: float) -> float:
+    """What a JSON file of `size` bytes takes in memory at most, as bytes, text and values; from its first part where that alone
+    takes more than `enough`.
+
+    In CPython 3.11 a value and its place take up to 72 bytes, a list 96 more, a mapping 190 more, a key that no other mapping has
+    100 more; a text with one letter beyond the first 256 takes up to four bytes a letter.
+    """
+    values, letter, read = 0, 1, 0
+    with path.open("rb") as file:
+        while piece := file.read(2**24):
+            read += len(piece)
+            letter = 1 if letter == 1 and piece.isascii() and b"\\u" not in piece else 4
+            values += 72 * piece.count(b",") + 96 * piece.count(b"[") + 190 * piece.count(b"{") + 100 * piece.count(b":")
+            if (2 * letter * size + values) / 1e9 > enough:
+                break
+    return (2 * letter * size + values * size / max(read, 1)) / 1e9
 
 
 def bounded_lines(file: IO[AnyStr], count: int, longest: int = 65_536) -> Iterator[AnyStr]:

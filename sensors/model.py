@@ -150,7 +150,7 @@ class StereoNoise(Config):
         0.1, ge=0, le=1000, description="smooth noise of the disparity, at the nodes of a grid [px]"
     )
     regularization_step_px: float = Field(
-        32.0, gt=0, description="distance of the grid's nodes [px of the full-resolution frame]"
+        32.0, gt=0, le=100_000, description="distance of the grid's nodes [px of the full-resolution frame]"
     )
     orientation: OrientationNoise = OrientationNoise()
     orientation_drawn: Literal["each_camera", "both_alike"] = Field(

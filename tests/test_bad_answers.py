@@ -284,3 +284,11 @@ def test_a_registration_in_a_record_is_a_rigid_motion(rotation: np.ndarray, tmp_
     (tmp_path / "run.json").write_text(json.dumps(record))
     with pytest.raises(InputError, match=r"registration\.rotation"):
         read_run(tmp_path / "run.json", "run it again")
+
+
+@pytest.mark.parametrize("content", ["", "\n", "\ufeff", "# nothing\n"])
+def test_an_empty_config_is_not_taken_for_one(content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "site.yaml").write_text(content, encoding="utf-8")
+    words = ["simulate", "--sensor", "tls", "--config", str(tmp_path / "site.yaml"), "--out", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert "holds no key" in capsys.readouterr().err

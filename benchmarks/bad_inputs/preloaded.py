@@ -10,20 +10,24 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import psutil
+
 ROOT = Path(__file__).parents[2]
-MOST_S, MOST_GB = 75.0, 4.0
-"""A command that goes on for longer, or takes more memory, is killed."""
+MOST_WALL_S, MOST_OWN_S, MOST_GB = 180.0, 60.0, 4.0
+"""A command that goes on for longer, on the wall's clock or the processor's, or takes more memory, is killed."""
+_LOOKS_AFTER_S = 0.5
 LIBRARIES = (
-    *("cv2", "jinja2", "laspy", "manifold3d", "matplotlib.backends.backend_agg", "matplotlib.figure", "numpy"),
-    *("pycocotools.mask", "pydantic", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "scipy.stats", "tifffile", "trimesh"),
+    *("cv2", "dash", "flask", "jinja2", "laspy", "manifold3d", "matplotlib.backends.backend_agg", "matplotlib.figure", "numpy"),
+    *("plotly.graph_objects", "pycocotools.mask", "pydantic.main", "pye57", "scipy.ndimage", "scipy.optimize", "scipy.spatial"),
+    *("scipy.stats", "tifffile", "trimesh", "xml.etree.ElementTree", "yaml"),
 )
 ROOMS = (
     *("pipeline.run.simulation", "pipeline.run.report", "pipeline.gap.naming.workflow", "pipeline.gap.report.report"),
@@ -44,7 +48,7 @@ class Order:
 
 @dataclass(frozen=True)
 class Ended:
-    """Exit status, seconds on the wall's clock and the processor's, peak memory of the largest process."""
+    """Exit status, seconds on the wall's clock and of processor time of all its processes, peak memory of the largest one."""
 
     code: int
     wall_s: float
@@ -53,10 +57,12 @@ class Ended:
 
 
 class Preloaded:
-    """The process that commands are forked from; close it. rooms: the program's own modules are imported too, and Dr.Jit."""
+    """The process that commands are forked from; close it. rooms: the program's own modules are imported too, and Dr.Jit;
+    bytecode: a folder of one's own where that of the modules is kept, as an installation has it."""
 
-    def __init__(self, *, rooms: bool) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    def __init__(self, bytecode: Path, *, rooms: bool) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONPYCACHEPREFIX": str(bytecode)}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
         self._process = subprocess.Popen(
             [sys.executable, __file__, *LIBRARIES, *(ROOMS if rooms else ())],
             env=environment,
@@ -93,10 +99,7 @@ def serve(modules: list[str]) -> int:
                 sys.stderr.flush()
                 os._exit(code)
             return code
-        status, usage = _waited(process, began)
-        ended = Ended(
-            os.waitstatus_to_exitcode(status), time.monotonic() - began, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e6
-        )
+        ended = _waited(process, began)
         print(json.dumps(asdict(ended)), flush=True)
     return 0
 
@@ -113,17 +116,46 @@ def _command(order: Order) -> int:
     return main(list(order.words))
 
 
-def _waited(process: int, began: float) -> tuple[int, resource.struct_rusage]:
-    """Status and use of resources of a process at its end, which comes by force where it takes too much."""
+def _waited(process: int, began: float) -> Ended:
+    """How a process ends, by force where it takes too much."""
+    tree, looked, forced = _Tree(process), began, False
     while True:
-        ended, status, usage = os.wait4(process, os.WNOHANG)
+        ended, status, usage = os.wait4(process, 0 if forced else os.WNOHANG)
+        now = time.monotonic()
         if ended:
-            return status, usage
-        if time.monotonic() - began > MOST_S or _resident_gb(process) > MOST_GB:
+            own_s = max(usage.ru_utime + usage.ru_stime, tree.own_s)
+            gigabytes = max(usage.ru_maxrss / 1e6, tree.gigabytes)
+            return Ended(os.waitstatus_to_exitcode(status), now - began, own_s, gigabytes)
+        if now - looked > _LOOKS_AFTER_S:
+            tree.look()
+            looked = now
+        if now - began > MOST_WALL_S or tree.own_s > MOST_OWN_S or max(_resident_gb(process), tree.gigabytes) > MOST_GB:
             os.killpg(process, signal.SIGKILL)
-            _, status, usage = os.wait4(process, 0)
-            return status, usage
+            forced = True
         time.sleep(0.02)
+
+
+class _Tree:
+    """A process and all that it started. own_s: their processor time, user and system, with those that have ended since."""
+
+    def __init__(self, process: int) -> None:
+        self._process = process
+        self._own_s: dict[int, float] = {}
+        self.gigabytes = 0.0
+
+    @property
+    def own_s(self) -> float:
+        return sum(self._own_s.values())
+
+    def look(self) -> None:
+        """Take the processes as they are now; one that ends meanwhile keeps what it had."""
+        with suppress(psutil.Error):
+            first = psutil.Process(self._process)
+            for each in [first, *first.children(recursive=True)]:
+                with suppress(psutil.Error):
+                    times = each.cpu_times()
+                    self._own_s[each.pid] = times.user + times.system
+                    self.gigabytes = max(self.gigabytes, each.memory_info().rss / 1e9)
 
 
 def _resident_gb(process: int) -> float:

@@ -1,20 +1,23 @@
 """Bad inputs, each to its command: how many are answered well.
 
-    python benchmarks/bad_inputs/run.py [--listed] [--only WORD ...] [--jobs 2] [--table docs/robustness.md]
+    python benchmarks/bad_inputs/run.py [--listed] [--only WORD ...] [--jobs 2] [--state FOLDER] [--table docs/robustness.md]
 
-Each runs as a process of its own, some seconds long, on copies of small good inputs that are made first. Prints those that are
-answered badly (see case.py for what that is), and counts by command; exit status 1 where
-there are any. --table writes the counts into the page.
+Each runs as a process of its own, some seconds long, on copies of small good inputs that are made first, those of listed.txt
+before the others. Prints those that are answered badly (see case.py for what that is), and counts by command; exit status 1 where
+there are any. --state keeps the good inputs and each answer in a folder, so that a count that was stopped goes on where it was;
+with --again those answered badly are tried once more; with --kept none is tried, and what is kept is counted. --table writes the
+counts into the page.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
@@ -26,11 +29,14 @@ from benchmarks.bad_inputs import (
     coco_cases,
     dataset_cases,
     exchange_cases,
+    export_cases,
     further_cases,
     gap_cases,
     measurement_cases,
     odd_results_cases,
     odd_words_cases,
+    people_cases,
+    placed_cases,
     raw_cases,
     site_cases,
 )
@@ -54,6 +60,9 @@ def all_cases() -> list[Case]:
         *camera_cases.cases(),
         *odd_results_cases.cases(),
         *odd_words_cases.cases(),
+        *export_cases.cases(),
+        *placed_cases.cases(),
+        *people_cases.cases(),
     ]
 
 
@@ -64,10 +73,22 @@ def listed_cases() -> list[Case]:
     return [known[name] for name in lines if not name.startswith("#")]
 
 
+def listed_first(cases: Sequence[Case]) -> list[Case]:
+    """The cases, those of listed.txt before the others."""
+    listed = {case.name for case in listed_cases()}
+    return sorted(cases, key=lambda case: case.name not in listed)
+
+
 def run(
-    cases: Sequence[Case], jobs: int, materials: Path | None = None, *, here: bool = False, fresh: bool = True, show: bool = False
+    cases: Sequence[Case],
+    jobs: int,
+    materials: Path | None = None,
+    *,
+    here: bool = False,
+    fresh: bool = True,
+    heard: Callable[[Outcome], object] = lambda outcome: None,
 ) -> list[Outcome]:
-    """Try each case, in the order given; prints the bad answers, with show all, as they come. fresh: see `Preloaded`."""
+    """Try each case, in the order given; `heard` gets each outcome as it comes. fresh: see `Preloaded`."""
     with tempfile.TemporaryDirectory(prefix="bad_inputs_") as name:
         folder = Path(name)
         good = materials or folder / "materials"
@@ -75,7 +96,7 @@ def run(
             make_materials(good)
         idle: Queue[Preloaded | None] = Queue()
         for _ in range(1 if here else jobs):
-            idle.put(None if here else Preloaded(rooms=not fresh))
+            idle.put(None if here else Preloaded(folder / "bytecode", rooms=not fresh))
 
         def one(numbered: tuple[int, Case]) -> Outcome:
             number, case = numbered
@@ -90,16 +111,34 @@ def run(
         with ThreadPoolExecutor(jobs) as pool:
             for outcome in map(one, enumerate(cases)) if here else pool.map(one, enumerate(cases)):
                 found.append(outcome)
-                if outcome.problems or show:
-                    print(said(outcome), flush=True)
+                heard(outcome)
         while not idle.empty():
             if started := idle.get():
                 started.close()
         return found
 
 
+class Kept:
+    """The outcomes in a file, a line of JSON for each; of a case tried again the last one counts."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    def add(self, outcome: Outcome) -> None:
+        values = {**vars(outcome), "case": outcome.case.name}
+        with self._file.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps(values) + "\n")
+
+    def outcomes(self, cases: Iterable[Case]) -> list[Outcome]:
+        """Those of these cases that were tried."""
+        lines = self._file.read_text(encoding="utf-8").splitlines() if self._file.exists() else []
+        found = {values["case"]: values for values in map(json.loads, lines)}
+        tried_ = [(case, found[case.name]) for case in cases if case.name in found]
+        return [Outcome(**{**values, "case": case, "problems": tuple(values["problems"])}) for case, values in tried_]
+
+
 def said(outcome: Outcome) -> str:
-    took = f"{outcome.code:>4} {outcome.seconds:6.1f} s {outcome.gigabytes:5.2f} GB"
+    took = f"{outcome.code:>4} {outcome.seconds:6.1f} s ({outcome.wall_s:.0f} s) {outcome.gigabytes:5.2f} GB"
     return f"{took} [{outcome.case.name}] {', '.join(outcome.problems) or 'well'}: {outcome.line}"
 
 
@@ -118,20 +157,46 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--materials", type=Path, help="keep the good inputs here, or take those that are here")
     parser.add_argument("--table", type=Path, help="a page with the two marks between which the table goes")
+    parser.add_argument("--state", type=Path, help="keep the good inputs and all answers in this folder, and go on with them")
+    parser.add_argument("--again", action="store_true", help="with --state: those answered badly once more")
+    parser.add_argument("--kept", action="store_true", help="with --state: count the answers there and try nothing")
     parser.add_argument("--show", action="store_true", help="print the good answers too")
     parser.add_argument("--here", action="store_true", help="in this process: faster, and memory is not looked at")
     parser.add_argument("--fresh", action="store_true", help="each process imports the program and ends by itself: slower")
     arguments = parser.parse_args()
-    chosen = listed_cases() if arguments.listed else all_cases()
+    chosen = listed_cases() if arguments.listed else listed_first(all_cases())
     cases = [case for case in chosen if not arguments.only or any(word in case.name for word in arguments.only)]
-    kind = {"here": arguments.here, "fresh": arguments.fresh}
-    outcomes = run(cases, arguments.jobs, arguments.materials, **kind, show=arguments.show)
+    outcomes = _counted(cases, arguments)
     print(table(outcomes))
     if arguments.table:
         page = arguments.table.read_text(encoding="utf-8")
         before, after = page.split(BEGIN)[0], page.split(END)[1]
         arguments.table.write_text(f"{before}{BEGIN}\n{table(outcomes)}\n{END}{after}", encoding="utf-8")
     return 1 if any(each.problems for each in outcomes) else 0
+
+
+def _counted(cases: Sequence[Case], arguments: argparse.Namespace) -> list[Outcome]:
+    """Outcomes of the cases, those kept from before among them."""
+    kept: Kept | None = None
+    materials, left = arguments.materials, list(cases)
+    if arguments.state:
+        arguments.state.mkdir(parents=True, exist_ok=True)
+        materials = materials or arguments.state / "materials"
+        kept = Kept(arguments.state / "outcomes.jsonl")
+        done = {each.case.name for each in kept.outcomes(cases) if not (arguments.again and each.problems)}
+        left = [case for case in cases if case.name not in done]
+        if arguments.kept:
+            print(f"{len(cases) - len(left)} of {len(cases)} were tried")
+            return kept.outcomes(cases)
+
+    def heard(outcome: Outcome) -> None:
+        if kept:
+            kept.add(outcome)
+        if outcome.problems or arguments.show:
+            print(said(outcome), flush=True)
+
+    found = run(left, arguments.jobs, materials, here=arguments.here, fresh=arguments.fresh, heard=heard)
+    return kept.outcomes(cases) if kept else found
 
 
 if __name__ == "__main__":

@@ -64,12 +64,15 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 
 def _check_training(out: Path) -> None:
-    """Raise InputError where a folder holds nothing of a training."""
+    """Raise InputError where a folder holds nothing of a training, or something else in the place of its folders."""
     from pipeline.detection.config import BEST, CHECKPOINT, CURVES, EVENTS
+    from pipeline.formats.own_folders import require_own_folder
 
     if not any((out / name).exists() for name in (CHECKPOINT, BEST, EVENTS, CURVES)):
         remedy = "begin it without --resume, in a new folder"
         raise InputError("there is no training", where=f"--resume, --out {out}", remedy=remedy)
+    for name in (CHECKPOINT, BEST, EVENTS):
+        require_own_folder(out / name)
 
 
 def load_keras(*, quiet: bool) -> None:

@@ -17,8 +17,8 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
 from pipeline.config.overrides import Override, apply_overrides
 from pipeline.config.presets import is_path, model_file, spelled_out, with_preset, without_what_a_preset_sets
-from pipeline.formats.camera_files import read_oriented, stereo_pair
-from pipeline.formats.cameras import PairConfig, read_cameras_yaml
+from pipeline.formats.camera_files import oriented_files, read_oriented, stereo_pair
+from pipeline.formats.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
 from pipeline.precision.detectability import PlanningConfig
 from pipeline.registration.register import IcpConfig
 from pipeline.surface.mesh import SurfaceConfig
@@ -56,6 +56,10 @@ class CamerasFile(Config):
         """The cameras, world frame."""
         found = read_oriented(self.file)
         return read_cameras_yaml(self.file) if found is None else stereo_pair(found, self.left, self.right, str(self.file))
+
+    def files(self) -> list[Path]:
+        """Those that `pair` reads."""
+        return cameras_yaml_files(self.file) if read_oriented(self.file) is None else oriented_files(self.file)
 
 
 def _camera_kind(values: Any) -> str:
@@ -229,7 +233,10 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
     says of the instrument (pipeline/config/presets.py). Raises InputError for whatever is wrong, and where the config's only
     models are of another sensor than `sensor` (None: any).
     """
-    return resolved(load_yaml(path), overrides, sensor, seed, path)
+    values = load_yaml(path)
+    if values is None:
+        raise InputError("holds no key", where=str(path), remedy="write at least one, or begin with what `scarpsim init` writes")
+    return resolved(values, overrides, sensor, seed, path)
 
 
 def resolved(

@@ -18,14 +18,16 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
+from pipeline.config.simulation import CamerasFile
 from pipeline.dataset.config import DATASET_FILE, DatasetConfig
 from pipeline.dataset.plan import SPLITS
 from pipeline.dataset.records import SHARDS, Record, read_shard
 from pipeline.formats.checksum import sha256
 from pipeline.formats.inside import inside
+from pipeline.formats.own_folders import require_own_folder
 from scene.errors import InputError
+from scene.imported import ImportedWall
 
 STAGING, CHECKSUMS, TRUTH = ".staging", "checksums.sha256", "truth"
 
@@ -34,16 +36,11 @@ def fingerprint(config: DatasetConfig) -> str:
     """What tells sets apart: a hash of the resolved config and of the files that its walls and cameras are read from."""
     digest = hashlib.sha256(config.model_dump_json().encode())
     for wall in config.walls.values():
-        for path in (getattr(wall.wall, "mesh", None), getattr(wall.cameras, "file", None)):
-            for file in _files(path):
-                digest.update(sha256(file).encode())
+        meshes = [wall.wall.mesh] if isinstance(wall.wall, ImportedWall) else []
+        cameras = wall.cameras.files() if isinstance(wall.cameras, CamerasFile) else []
+        for file in [*meshes, *cameras]:
+            digest.update(sha256(file).encode())
     return digest.hexdigest()[:12]
-
-
-def _files(path: Any) -> list[Path]:
-    if not isinstance(path, Path):
-        return []
-    return sorted(path.iterdir()) if path.is_dir() else [path]
 
 
 def tile_files(record: Record) -> Iterator[tuple[str, str]]:
@@ -93,11 +90,18 @@ def require_no_folders(folder: Path, damage: list[Damage]) -> None:
             raise InputError("is a folder where a file of the set belongs", where=str(folder / each.file), remedy="move it away")
 
 
+def require_own_folders(folder: Path) -> None:
+    """Raise InputError where something else stands in the place of a folder of a job; a split may be a link to one."""
+    for name in (STAGING, SHARDS, *SPLITS):
+        if name not in SPLITS or not (folder / name).is_dir():
+            require_own_folder(folder / name)
+
+
 def discard_unbegun(folder: Path) -> None:
     """Remove what a job has written that ended before its first epoch was made; what others put there stays."""
     if any((folder / SHARDS).glob("*.json")):
         return
-    shutil.rmtree(folder / STAGING, ignore_errors=True)
+    _remove_staging(folder)
     own = [folder / name for name in (SHARDS, *(f"{split}/{TRUTH}" for split in SPLITS), *SPLITS)]
     for each in own:
         with suppress(OSError):  # is not there, or holds tiles
@@ -108,6 +112,11 @@ def discard_unbegun(folder: Path) -> None:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove what dead jobs left under temporary names."""
-    shutil.rmtree(folder / STAGING, ignore_errors=True)
+    _remove_staging(folder)
     for part in folder.rglob(".*.part*"):
         part.unlink(missing_ok=True)
+
+
+def _remove_staging(folder: Path) -> None:
+    if (folder / STAGING).is_dir():  # rmtree waits for ever at a pipe
+        shutil.rmtree(folder / STAGING, ignore_errors=True)

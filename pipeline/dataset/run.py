@@ -15,7 +15,15 @@ from typing import Any
 
 from pipeline.dataset.assemble import assemble, assembled_damages
 from pipeline.dataset.config import DATASET_FILE, DatasetConfig
-from pipeline.dataset.folder import Damage, damages, discard_unbegun, fingerprint, remove_leftovers, require_no_folders
+from pipeline.dataset.folder import (
+    Damage,
+    damages,
+    discard_unbegun,
+    fingerprint,
+    remove_leftovers,
+    require_no_folders,
+    require_own_folders,
+)
 from pipeline.dataset.plan import planned_epochs
 from pipeline.dataset.records import read_dataset_file, shard_name, write_dataset_file
 from pipeline.dataset.worker import Order, fill, makers, require_same_makers
@@ -128,8 +136,16 @@ def _find_damage(folder: Path, progress: Progress) -> dict[tuple[str, int], list
 
 
 def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSummary:
-    """Make what is missing or damaged, and put the set together."""
+    """Make what is missing or damaged, and put the set together; whatever happens, nothing stays under temporary names."""
+    require_own_folders(folder)
     remove_leftovers(folder)
+    try:
+        return _completed(folder, workers, progress)
+    finally:
+        remove_leftovers(folder)
+
+
+def _completed(folder: Path, workers: Workers, progress: Progress) -> DatasetSummary:
     progress.plan({"check": 1.0, "epochs": 1000.0, "card": 10.0})
     known = read_dataset_file(folder)
     found = _find_damage(folder, progress)
@@ -154,7 +170,6 @@ def _complete(folder: Path, workers: Workers, progress: Progress) -> DatasetSumm
     with progress.stage("card"):
         assembled = assemble(folder, complete=True)
         write_dataset_file(folder, known["name"], known["sources"], known["epochs"], complete=True)
-    remove_leftovers(folder)
     summary.images, summary.annotations, summary.warnings = assembled.images, assembled.annotations, assembled.warnings
     return summary
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.detection.events import Event
-from pipeline.formats.ply import read_ply
+from pipeline.formats.result_files import read_surface
 from pipeline.formats.result_records import RUN_FILE, read_run
 from scene.frame import WallFrame
 from scene.mesh import FloatArray
@@ -57,6 +57,6 @@ def _places(folder: Path) -> EventPlaces | None:
     if not frame:
         return None
     surface = folder / "epoch_000" / "surface.ply"
-    vertices = read_ply(surface).vertices if surface.is_file() else np.empty((0, 3))
+    vertices = read_surface(surface).vertices if surface.is_file() else np.empty((0, 3))
     ordered = vertices[np.argsort(vertices[:, 0])]
     return EventPlaces(WallFrame(np.array(frame["rotation"]), np.array(frame["origin_m"])), ordered)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -126,7 +127,7 @@ def _optimizer(config: TrainConfig) -> keras.optimizers.Optimizer:
 def _begun(out: Path, config: TrainConfig, model: MaskRCNN, *, resume: bool) -> History:
     """The history in `out`, with model and optimizer as they were then; an empty one for a new training."""
     path = out / CHECKPOINT / _STATE
-    if not path.is_file():
+    if not os.path.lexists(path):
         return History()
     if not resume:
         raise InputError(

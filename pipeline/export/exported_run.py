@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.laz import read_laz
-from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.result_files import read_own_points, read_surface
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.report.figures import SCALE_SIGMAS
 from scene.errors import InputError
@@ -42,7 +41,11 @@ class ExportedRun:
 
     def limit_m(self, number: int) -> float:
         """Where the colours of an epoch's map end in the report."""
-        return float(SCALE_SIGMAS * self.record["epochs"][number]["statistics"]["sigma_m"])
+        statistics = self.record["epochs"][number].get("statistics")
+        if not statistics:
+            problem = f"has no statistics of epoch {number}"
+            raise InputError(problem, where=str(self.folder / RUN_FILE), remedy="go on with it by simulate --resume")
+        return float(SCALE_SIGMAS * statistics["sigma_m"])
 
     def blocks(self, number: int) -> list[dict[str, Any]]:
         """What fell in an epoch, the largest first."""
@@ -50,11 +53,11 @@ class ExportedRun:
 
     def surface(self, number: int) -> TriangleMesh:
         """The measured surface of an epoch, wall frame."""
-        return read_ply(self._file(number, "surface.ply"))
+        return read_surface(self._file(number, "surface.ply"))
 
     def points(self, number: int) -> PointCloud:
         """The sensor's points of an epoch, wall frame."""
-        return read_laz(self._file(number, "points.laz"))
+        return read_own_points(self._file(number, "points.laz"))
 
     def difference(self, number: int) -> tuple[NDArray[np.float32], Grid]:
         """(h, w) reference minus epoch, m, and its grid."""

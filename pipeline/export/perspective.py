@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.report.figures import COLOURS, NO_DATA
+from scene.errors import InputError
 from scene.grid import Grid
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import RayCaster
@@ -19,6 +20,8 @@ _LIGHT = np.array([-0.45, 0.55, 0.7])
 _HALF_VIEW = np.tan(np.radians(16.0))
 """Half of the field of view across; a long lens keeps the wall's lines straight."""
 _MARGIN = 1.04
+_TALLEST = 3.0
+_LEAST_SHARE = 1e-3
 _OVERSAMPLED = 2
 _PLACES = 200_000
 """That the picture is made to hold, at least where there are more."""
@@ -39,7 +42,10 @@ class PerspectiveView:
 
     @classmethod
     def on(cls, places: FloatArray, width: int = 1280) -> PerspectiveView:
-        """The camera that has all of `places`, (n, 3) m, in its picture of `width` px."""
+        """The camera that has all of `places`, (n, 3) m, in its picture of `width` px, at most _TALLEST times as high.
+
+        Raises InputError for places that are one point or lie on one line of sight.
+        """
         forward = -_FROM / np.linalg.norm(_FROM)
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
@@ -48,7 +54,10 @@ class PerspectiveView:
         middle = (own.min(axis=0) + own.max(axis=0)) / 2
         across, down = _MARGIN * np.abs(own - middle)[:, :2].T
         ahead = own[:, 2] - middle[2]
-        distance = float((across / _HALF_VIEW - ahead).max())
+        needed = np.maximum(across, down / _TALLEST) / _HALF_VIEW
+        if needed.max() <= _LEAST_SHARE * np.ptp(own[:, 2]):
+            raise InputError("lies on one place or line of sight", where="what is drawn", remedy="make the run again")
+        distance = float((np.maximum(needed, _LEAST_SHARE * needed.max()) - ahead).max())
         focal_px = width / 2 / _HALF_VIEW
         height = 2 * int(np.ceil(float((down / (distance + ahead)).max()) * focal_px))
         return cls(middle @ axes - distance * forward, axes, width, max(height, 2), focal_px)

@@ -31,6 +31,7 @@ _MOST_NUMBERED = 60
 _EPOCH_MS, _SCAN_MS, _LAST_MS = 1200, 80, 2500
 _SCAN_FRAMES, _SCAN_POINTS = 48, 400_000
 _ANIMATED_PX, _COLOURS_OF_GIF = 900, 96
+_LONGEST_SCAN_S = 1e6
 _NIGHT, _BEAM = 26, np.array([255, 150, 30], dtype=np.uint8)
 
 
@@ -60,17 +61,20 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
         raise InputError("is of a stereo pair", where=str(run.folder), allowed="a run of a laser scanner")
     cloud = run.points(number)
     count, clock = len(cloud.points), np.zeros(len(cloud.points)) if cloud.gps_time is None else cloud.gps_time
+    if not np.isfinite(clock).all() or np.ptp(clock) > _LONGEST_SCAN_S:
+        allowed = f"numbers of seconds over at most {_LONGEST_SCAN_S:g} s"
+        raise InputError(f"the points of epoch {number} have other times", where=str(run.folder), allowed=allowed)
     order = np.argsort(clock, kind="stable")[:: max(1, count // _SCAN_POINTS)]
     places, time = cloud.points[order], clock[order]
     view = PerspectiveView.on(places, _ANIMATED_PX)
-    ends = np.linspace(0, len(places), _SCAN_FRAMES + 1).astype(int)[1:]
+    ends = np.linspace(0, len(places), min(_SCAN_FRAMES, len(places)) + 1).astype(int)[1:]
     frames = []
     for start, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
         came = f"{end * count / len(places) / 1e6:.2f} of {count / 1e6:.2f} million points"
         title = f"{came}, {time[end - 1] - time[0]:.1f} s"
         frames.append(_framed(_cloud_pixels(view, places, start, end), title, None))
     frames.append(_framed(_cloud_pixels(view, places, len(places), len(places)), title, None))
-    _write_gif(path, frames, [_SCAN_MS] * _SCAN_FRAMES + [_LAST_MS])
+    _write_gif(path, frames, [_SCAN_MS] * len(ends) + [_LAST_MS])
 
 
 def _cloud_pixels(view: PerspectiveView, places: FloatArray, start: int, end: int) -> Pixels:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +59,8 @@ def save_yolo(folder: Path, out: Path, limit_m: float | None, progress: Progress
 
 
 def _usual_limit(sets: dict[str, Tiles], folder: Path) -> float:
-    noise = [record["noise_sigma_m"] for tiles in sets.values() for record in tiles.records if record.get("noise_sigma_m")]
+    said: list[Any] = [record.get("noise_sigma_m") for tiles in sets.values() for record in tiles.records]
+    noise = [value for value in said if type(value) in (int, float) and 0 < value < math.inf]
     if not noise:
         raise InputError(
             "says nothing of its images' noise", where=str(folder), remedy="give the grey values' end with --limit-m"

@@ -34,6 +34,14 @@ def read_oriented(path: Path) -> MetashapeCameras | None:
     return None
 
 
+def oriented_files(path: Path) -> list[Path]:
+    """The files of what `read_oriented` reads: COLMAP's model, whose folder may hold others, or `path` alone."""
+    if path.is_dir() or path.name in _COLMAP_FILES:
+        folder = path if path.is_dir() else path.parent
+        return [folder / name for name in sorted(_COLMAP_FILES) if (folder / name).exists()]
+    return [path]
+
+
 def read_lens(path: Path) -> Camera:
     """A calibration alone, at the origin: Metashape's calibration XML, OpenCV's FileStorage, or plain numbers (.txt)."""
     root = _xml_root(path)

@@ -34,6 +34,13 @@ def read_cameras_yaml(path: Path) -> CameraPair:
     return parse(PairConfig, values, str(path)).pair()
 
 
+def cameras_yaml_files(path: Path) -> list[Path]:
+    """The files that `read_cameras_yaml` reads: itself, and the calibrations that it names."""
+    values = load_yaml(path)
+    cameras = values.values() if isinstance(values, dict) else ()
+    return [path, *(path.parent / camera["calibration"] for camera in cameras if _names_lens(camera))]
+
+
 def write_cameras_yaml(path: Path, pair: CameraPair) -> None:
     """Write a pair, world frame, as cameras.yaml."""
     lines = ["# Rotation maps camera (x right, y down, z forward) to world; the camera model is Agisoft Metashape's."]
@@ -47,11 +54,15 @@ def write_cameras_yaml(path: Path, pair: CameraPair) -> None:
 
 
 def _with_lens(camera: Any, folder: Path) -> Any:
-    if not (isinstance(camera, dict) and isinstance(camera.get("calibration"), str)):
+    if not _names_lens(camera):
         return camera
     lens = read_lens(folder / camera["calibration"])
     interior = {"width": lens.width, "height": lens.height} | {name: float(getattr(lens, name)) for name in INTERIOR}
     return interior | {key: value for key, value in camera.items() if key != "calibration"}
+
+
+def _names_lens(camera: Any) -> bool:
+    return isinstance(camera, dict) and isinstance(camera.get("calibration"), str)
 
 
 def _row(values: Any) -> str:

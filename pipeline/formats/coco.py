@@ -15,7 +15,7 @@ from pycocotools import mask as coco_mask
 from pydantic import ConfigDict, Field
 
 from pipeline.formats.coco_masks import BEYOND_PX, FORMS, run_lengths
-from pipeline.formats.geotiff import MOST_PIXELS
+from pipeline.formats.geotiff import most_pixels
 from pipeline.formats.plain_json import without_nan
 from scene.config import Config, parse
 from scene.errors import InputError
@@ -81,7 +81,7 @@ def read_coco(path: Path, *, masks: bool = True) -> Coco:
     """Read COCO annotations. masks: without one an annotation is wrong; else it needs a mask or a box.
 
     Raises InputError, naming the annotation, for wrong types and numbers, ids that are there twice or belong to nothing, images
-    of more than MOST_PIXELS, boxes and polygons outside their image, and run lengths that are not its image's.
+    of more than `most_pixels`, boxes and polygons outside their image, and run lengths that are not its image's.
     """
     content = read_json(path, remedy=_REMEDY)
     if not isinstance(content, Mapping):
@@ -215,8 +215,8 @@ def _unique(entries: Sequence[Entry], key: str, kind: str, path: Path) -> None:
 
 def _check_pixels(image: Entry, path: Path) -> None:
     height, width = image["height"], image["width"]
-    if height * width > MOST_PIXELS:
-        allowed = f"at most {MOST_PIXELS:,} px"
+    if height * width > (most := most_pixels()):
+        allowed = f"at most {most:,} px"
         where = f"{path}: image {image['id']}"
         raise InputError(f"has {height} x {width} px", where=where, allowed=allowed, remedy="cut it into tiles")
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pipeline.formats.atomic import writing
 from scene.errors import InputError
 from scene.grid import Grid
-from scene.regular_file import check_file
+from scene.regular_file import READ_LIMIT, check_file, raised_gb
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # its complaints come as exceptions too
 _PIXEL_SCALE, _TIEPOINT, _GEO_KEYS, _GEO_ASCII, _NODATA = 33550, 33922, 34735, 34737, 42113
@@ -81,7 +81,7 @@ def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = ""
 def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
     """Read a raster of one band and where its pixels lie: (h, w) float32, NaN where there is no data, and its grid.
 
-    Raises InputError for a damaged file, one of more than MOST_PIXELS, one without a place, and pixels that are not square or not
+    Raises InputError for a damaged file, one beyond `most_pixels`, one without a place, and pixels that are not square or not
     along the axes.
     """
     raster, tags = _read(path)
@@ -184,16 +184,21 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
         raise InputError(problem, where=str(path), allowed=f"up to {_LARGEST:g}", remedy=remedy)
 
 
+def most_pixels() -> int:
+    """Of an image: MOST_PIXELS, or as many as the variable READ_LIMIT allows."""
+    return max(MOST_PIXELS, int(raised_gb() * 1e9 / 4))
+
+
 def _check_size(page: tifffile.TiffPage, path: Path) -> None:
     """Raise InputError for an image that is too large, before any memory is taken for it."""
     pixels, depth = math.prod(page.shape), page.dtype.itemsize if page.dtype else 4
-    if pixels > MOST_PIXELS:
+    if pixels > (most := most_pixels()):
         size = " x ".join(map(str, page.shape))
         raise InputError(
             f"has {size} px, {pixels * depth / 1e9:.3g} GB in memory",
             where=str(path),
-            allowed=f"at most {MOST_PIXELS:,} px",
-            remedy="cut it into parts, or export it with larger pixels",
+            allowed=f"at most {most:,} px",
+            remedy=f"cut it into parts, export it with larger pixels, or set the variable {READ_LIMIT}",
         )
 
 

@@ -19,6 +19,7 @@ from pipeline.formats.cameras import read_cameras_yaml
 from pipeline.formats.measurement_checks import (
     PointFit,
     Sweep,
+    check_different,
     check_frame,
     check_inside,
     check_pixels,
@@ -330,6 +331,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     local = mesh.with_vertices(frame.to_wall(mesh.vertices))
     local, words = facing(local, [frame.to_wall(position) for position in viewpoints.values()], reference)
     clouds = [check_power(finite(cloud, name), name) for name, cloud in material.points.items()]
+    check_different(dict(zip(material.points, clouds, strict=True)))
     if cameras is not None:
         for name, each in zip(material.points, clouds, strict=True):
             check_seen(cameras, each.points, name)

@@ -5,6 +5,8 @@ Rays with NaN or infinity never reach the ray tracer, and nothing here takes mor
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -180,6 +182,17 @@ def check_power(cloud: PointCloud, where: str) -> PointCloud:
         allowed=f"0 to {_LARGEST_POWER:g}, relative received power",
         remedy="convert decibels, as 10^(dB / 10), or leave the intensity out; `scarpsim measurement` does so of raw files",
     )  # fmt: skip
+
+
+def check_different(clouds: Mapping[str, PointCloud]) -> None:
+    """Raise InputError where two epochs, by name, have the same coordinates: noise is never the same twice."""
+    known: dict[bytes, str] = {}
+    for name, cloud in clouds.items():
+        digest = hashlib.sha256(cloud.points.tobytes()).digest()
+        if digest in known:
+            problem = f"holds the same points as {known[digest]}"
+            raise InputError(problem, where=name, remedy="give each epoch's own file, once")
+        known[digest] = name
 
 
 def check_near(here: PointFit) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
 from scene.config import parse
 from scene.regular_file import read_json
@@ -25,17 +25,20 @@ class _Record(BaseModel):
     model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True)
 
 
-class _Registration(_Record):
-    rotation: Annotated[list[_Vector], Field(min_length=3, max_length=3)]
-    translation_m: _Vector
+def _orthonormal(rotation: list[list[float]]) -> list[list[float]]:
+    rows = np.array(rotation)
+    if np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS or np.linalg.det(rows) < 0:
+        raise ValueError("is no rotation matrix")
+    return rotation
 
-    @field_validator("rotation")
-    @classmethod
-    def _orthonormal(cls, rotation: list[list[float]]) -> list[list[float]]:
-        rows = np.array(rotation)
-        if np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS or np.linalg.det(rows) < 0:
-            raise ValueError("is no rotation matrix")
-        return rotation
+
+_Rotation = Annotated[list[_Vector], Field(min_length=3, max_length=3), AfterValidator(_orthonormal)]
+_Row = Annotated[list[_Coordinate], Field(min_length=4, max_length=4)]
+
+
+class _Registration(_Record):
+    rotation: _Rotation
+    translation_m: _Vector
 
 
 class _Statistics(_Record):
@@ -52,6 +55,12 @@ class _Block(_Record):
     measured_area_m2: float
     measured_volume_m3: float
     measured_mean_depth_m: float | None
+
+
+class _WallFrame(_Record):
+    matrix_world_to_wall: Annotated[list[_Row], Field(min_length=4, max_length=4)]
+    rotation: _Rotation
+    origin_m: _Vector
 
 
 class _EpochRecord(_Record):
@@ -71,6 +80,7 @@ class _RunRecord(_Record):
     sensor: Literal["stereo", "tls"]
     config: dict[str, Any]
     wall: _Wall | None = None
+    wall_frame: _WallFrame | None = None
     epochs: list[_EpochRecord] = Field([], max_length=10_000)
     products: dict[Annotated[str, StringConstraints(pattern=r"^epoch_\d+$")], dict[str, str]] = {}
 
@@ -92,10 +102,18 @@ class _Gap(_Record):
 
 
 def read_run(path: Path, remedy: str) -> dict[str, Any]:
-    """The record of a run, finished or not. Raises InputError, which ends with `remedy`, for a file that is none."""
+    """The record of a run, finished or not; an epoch without a list of blocks has none, and what is null is not there.
+
+    Raises InputError, which ends with `remedy`, for a file that is none.
+    """
     values = read_json(path, remedy=remedy)
     parse(_RunRecord, values, str(path))
-    return dict(values)
+    epochs = [{"blocks": [], **_without_null(each, "statistics")} for each in values.get("epochs", [])]
+    return {**_without_null(values, "wall", "wall_frame"), "epochs": epochs}
+
+
+def _without_null(values: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key not in names or value is not None}
 
 
 def read_gap(path: Path) -> dict[str, Any]:

@@ -22,8 +22,7 @@ import numpy as np
 from scipy import stats
 
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
-from pipeline.formats.ply import read_ply
-from pipeline.formats.points import check_reach
+from pipeline.formats.result_files import read_surface
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, fit, register_to
@@ -170,16 +169,8 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     found = []
     for number, applied in records[: epochs + 1]:
         epoch = epoch_folder(folder, number)
-        found.append(Surfaces(number, _surface(epoch / "surface.ply"), _surface(epoch / "truth.ply"), applied))
+        found.append(Surfaces(number, read_surface(epoch / "surface.ply"), read_surface(epoch / "truth.ply"), applied))
     return config, sensor, found
-
-
-def _surface(path: Path) -> TriangleMesh:
-    mesh = read_ply(path)
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError("has vertices that are no numbers", where=str(path), remedy="run it again")
-    check_reach(mesh.vertices, str(path))
-    return mesh
 
 
 def _applied(record: dict[str, Any]) -> RigidTransform | None:

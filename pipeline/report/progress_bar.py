@@ -33,7 +33,8 @@ class _Bar(RichProgress):
     def __init__(self, source: Progress, stream: TextIO) -> None:
         self._source = source
         time, stage = TextColumn("{task.fields[time]}"), TextColumn("{task.description}")
-        super().__init__(BarColumn(), TaskProgressColumn(), time, stage, console=Console(file=stream), transient=True)
+        share = TaskProgressColumn("[progress.percentage]{task.percentage:>3.0f} %")
+        super().__init__(BarColumn(), share, time, stage, console=Console(file=stream), transient=True)
         self.add_task("", total=1.0, time="")
 
     def get_renderables(self) -> Iterable[RenderableType]:

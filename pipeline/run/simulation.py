@@ -19,6 +19,7 @@ from pipeline.formats.atomic import noting, remove_written, write_json
 from pipeline.formats.checksum import sha256
 from pipeline.formats.crs import wkt_of
 from pipeline.formats.lock import is_free, locked
+from pipeline.formats.own_folders import require_own_folder
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
@@ -183,6 +184,7 @@ def _require_same(earlier: dict[str, Any], identity: dict[str, Any], out: Path) 
 
 def _remove_unfinished(out: Path) -> None:
     for left in out.glob(".epoch_*"):
+        require_own_folder(left)
         shutil.rmtree(left)
 
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from pipeline.change.difference import SurfaceRaster, surface_raster
 from pipeline.detection.events import Event, read_events
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.laz import read_laz
-from pipeline.formats.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.result_files import read_own_points, read_surface
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
 from pipeline.run.products import epoch_folder
@@ -49,7 +48,7 @@ class RunResults:
             raise InputError("holds no detections of this run's maps", where=str(detections), allowed=allowed)
         self._map = lru_cache(4)(read_geotiff)
         self._heights = lru_cache(3)(self._raster_of)
-        self._cloud = lru_cache(1)(read_laz)
+        self._cloud = lru_cache(1)(read_own_points)
 
     @property
     def extent_m(self) -> float:
@@ -102,7 +101,7 @@ class RunResults:
         return epoch_folder(self.folder, number) / ("truth.ply" if surface == "truth" else "surface.ply")
 
     def _raster_of(self, path: Path, grid: Grid) -> SurfaceRaster:
-        return surface_raster(read_ply(path), grid)
+        return surface_raster(read_surface(path), grid)
 
 
 def _channels(cloud: PointCloud) -> dict[str, NDArray[Any]]:

@@ -238,6 +238,9 @@ def test_a_pair_is_told_by_content(tmp_path: Path) -> None:
         pair = CamerasFile(file=tmp_path / name).pair()
         assert largest_difference_px(left, pair.left) < 1e-9
         assert largest_difference_px(right, pair.right) < 1e-9
+    for name in ("sparse", "sparse/images.txt"):
+        files = {file.relative_to(tmp_path / "sparse").as_posix() for file in CamerasFile(file=tmp_path / name).files()}
+        assert files == {"cameras.txt", "images.txt", "points3D.txt"}
     named = CamerasFile(file=tmp_path / "no_suffix", left="b", right="a").pair()
     assert largest_difference_px(right, named.left) < 1e-9
 
@@ -268,6 +271,7 @@ def test_a_calibration_alone_is_no_pair_but_serves_in_cameras_yaml(tmp_path: Pat
     found = read_cameras_yaml(tmp_path / "cameras.yaml")
     assert largest_difference_px(pair.left, found.left) < 1e-9
     assert largest_difference_px(pair.right, found.right) < 1e-9
+    assert {*CamerasFile(file=tmp_path / "cameras.yaml").files()} == {tmp_path / "cameras.yaml", tmp_path / name}
 
 
 def test_unreadable_files_are_one_line(tmp_path: Path) -> None:

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tiny_dataset import TINY, digests, tiny
 
 from pipeline.cli.main import main
 from pipeline.dataset import records
+from pipeline.dataset import run as run_module
 from pipeline.dataset.combine import merge_datasets, split_dataset
+from pipeline.dataset.folder import fingerprint
 from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.records import read_dataset_file, read_shard, write_dataset_file, write_shard
 from pipeline.dataset.run import Workers, make_dataset, verify_dataset
+from pipeline.dataset.worker import Order
 from pipeline.detection.data import CocoFolder
 from pipeline.detection.run import find_inputs
+from pipeline.formats.colmap import write_colmap
 from pipeline.formats.inside import inside
+from pipeline.formats.opencv import write_opencv
 from scene.errors import InputError
+from sensors.camera import Camera
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +50,26 @@ def in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     error = capsys.readouterr().err.strip()
     assert "\n" not in error
     return error
+
+
+def test_a_set_is_told_by_the_files_of_its_cameras(tmp_path: Path) -> None:
+    """A camera's folder may hold others, and folders; a lens that cameras.yaml names is the set's too."""
+    lens = dict.fromkeys(("cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0)
+    camera = Camera(640, 480, 900.0, **lens, position=np.zeros(3), rotation=np.eye(3))
+    write_colmap(tmp_path / "model", {"left": camera, "right": replace(camera, position=np.array([5.0, 0, 0]))})
+    write_opencv(tmp_path / "lens.yml", camera)
+    pose = f"{{calibration: lens.yml, position_m: [0, 0, 0], rotation: {np.eye(3).tolist()}}}"
+    lines = [f"{side}: {pose}\n" for side in ("left", "right")]
+    (tmp_path / "cameras.yaml").write_text("".join(lines))
+    wall = TINY["walls"]["ledge"]
+    folder, yaml = (tiny(walls={"ledge": {**wall, "cameras": {"file": tmp_path / name}}}) for name in ("model", "cameras.yaml"))
+    before = [fingerprint(folder), fingerprint(yaml)]
+    (tmp_path / "model/pictures").mkdir()
+    (tmp_path / "model/pictures/1.jpg").write_text("a picture")
+    assert [fingerprint(folder), fingerprint(yaml)] == before
+    write_opencv(tmp_path / "lens.yml", replace(camera, k1=0.1))
+    assert fingerprint(folder) == before[0]
+    assert fingerprint(yaml) != before[1]
 
 
 def test_nothing_is_left_of_the_lock(made: Path) -> None:
@@ -265,3 +294,36 @@ def test_a_set_that_is_not_whole_is_neither_merged_nor_split(spoil: str, copy: P
     with pytest.raises(InputError, match="is missing or damaged; verify its set"):
         split_dataset(copy, tmp_path / "parts", ["sensor"])
     assert not (tmp_path / "parts").exists()
+
+
+@pytest.mark.parametrize("name", [".staging", "shards", "val"])
+@pytest.mark.parametrize("make", [os.mkfifo, Path.touch, lambda path: path.symlink_to("nowhere")])
+def test_what_stands_in_the_place_of_a_folder_is_named(
+    name: str, make: Callable[[Path], object], copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(copy / name, ignore_errors=True)
+    make(copy / name)
+    before = sorted(copy.rglob("*"))
+    assert f"{name}: is no folder" in in_one_line(["dataset", "verify", str(copy), "--quiet"], capsys)
+    assert sorted(copy.rglob("*")) == before
+
+
+def test_nothing_is_staged_through_a_link(copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (copy / ".staging").symlink_to(tmp_path / "elsewhere")
+    next((copy / "train").glob("*.tif")).unlink()
+    with pytest.raises(InputError, match="is no folder"):
+        verify_dataset(copy)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_an_epoch_that_cannot_be_made_again_leaves_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(order: Order) -> dict[str, Any]:
+        (copy / ".staging" / order.job).mkdir(parents=True)
+        raise InputError("cannot be made")
+
+    next((copy / "train").glob("*.tif")).unlink()
+    monkeypatch.setattr(run_module, "fill", fails)
+    with pytest.raises(InputError, match="cannot be made"):
+        verify_dataset(copy)
+    assert not (copy / ".staging").exists()

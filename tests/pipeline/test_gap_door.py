@@ -16,7 +16,7 @@ from surfaces import plane
 from pipeline.cli.main import main
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import read_measurement
-from pipeline.formats.measurement_checks import PointFit
+from pipeline.formats.measurement_checks import PointFit, check_different
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.xyz import read_xyz
@@ -181,3 +181,10 @@ def test_a_pair_may_be_off_by_what_a_turned_camera_does(sensor: Sensor, off_m: f
     wall = RayCaster(plane(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -100.0]), half_side=50.0))
     away = points * (1 + off_m / np.linalg.norm(points, axis=1, keepdims=True))
     assert PointFit.of(away, np.zeros(3), wall, sensor).good == good
+
+
+def test_one_epoch_under_two_names_is_named() -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3))
+    check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points + 1e-9)})
+    with pytest.raises(InputError, match=r"c\.laz: holds the same points as a\.laz"):
+        check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points[1:]), "c.laz": PointCloud(points.copy())})

@@ -12,7 +12,7 @@ from gap_cases import HEIGHT, STEP, WIDTH, Array, Field, smooth_noise, unit, wri
 
 from pipeline.cli.main import main
 from pipeline.config.simulation import load_config
-from pipeline.gap.survey.identifiability import Identifiability, identifiability
+from pipeline.gap.survey.identifiability import Identifiability, identifiability, table
 from pipeline.gap.survey.planned import planned_survey
 
 POSITION = np.array([WIDTH * 0.42, -34.0, 2.5])
@@ -54,6 +54,12 @@ def moved_by(azimuth: Array, zenith: Array, distance: Array, name: str) -> Array
         unit(azimuth + s * across, zenith + s * down) * (distance + s * radial)[:, None] for s in (step / 2, -step / 2)
     )
     return (ahead - behind) / step
+
+
+def test_the_table_writes_shares_with_a_space(found: Identifiability) -> None:
+    head, *rows = table(found).splitlines()
+    for row, share in zip(rows, found.survival, strict=True):
+        assert row[: head.index("seen from")].endswith(f" {100 * share:.1f} %  ")
 
 
 @pytest.mark.parametrize("name", ["range_offset", "vertical_index", "collimation", "trunnion_tilt"])

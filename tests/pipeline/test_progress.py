@@ -137,7 +137,7 @@ def test_the_bar_shows_stage_and_share(monkeypatch: pytest.MonkeyPatch) -> None:
             progress.advance(0.5)
             progress._bar.refresh()
     assert "carve" in terminal.getvalue()
-    assert "75%" in terminal.getvalue()
+    assert "75 %" in terminal.getvalue()
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.6, "1 min 0 s"), (200, "3 min 20 s"), (7500, "2 h 5 min")])
