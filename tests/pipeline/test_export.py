@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import laspy
 import numpy as np
 import pytest
 import trimesh
@@ -100,6 +101,18 @@ def test_a_run_as_gltf(run: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.bounds, surface.bounds, atol=1e-5)
 
 
+def test_a_run_as_copc(run: Path, tmp_path: Path) -> None:
+    """The points of points.laz, each once."""
+    assert export(run, "copc", "--epoch", 2, "--out", tmp_path / "wall.copc.laz") == 0
+    with laspy.CopcReader.open(tmp_path / "wall.copc.laz") as reader:
+        found = reader.query()
+    points = laspy.read(run / "epoch_002/points.laz")
+    order, given = np.argsort(found.gps_time), np.argsort(points.gps_time)
+    np.testing.assert_array_equal(np.asarray(found.block)[order], np.asarray(points.block)[given])
+    np.testing.assert_allclose(np.stack([found.x, found.y, found.z], axis=1)[order], points.xyz[given], rtol=0, atol=2e-6)
+    assert export(run, "copc", "--out", tmp_path / "wall.laz") == 2
+
+
 def test_a_package_lists_every_file_with_its_checksum(run: Path, tmp_path: Path) -> None:
     assert export(run, "package", "--out", tmp_path / "datapackage.json") == 0
     made = json.loads((tmp_path / "datapackage.json").read_text())
@@ -116,7 +129,7 @@ def test_a_package_lists_every_file_with_its_checksum(run: Path, tmp_path: Path)
     [
         (["epochs", "--epoch", "1"], "--epoch: goes with picture, gltf, scan"),
         (["picture", "--epoch", "9"], "--epoch: epoch 9 is not there; allowed: 0 to 2"),
-        (["gltf", "--out", "wall.obj"], "--out: got '.obj'; allowed: .glb"),
+        (["gltf", "--out", "wall.obj"], "--out: got 'wall.obj'; allowed: .glb"),
         (["movie"], "got 'movie'; allowed: picture"),
         (["yolo"], "holds no split of a data set"),
     ],
