@@ -171,7 +171,7 @@ def table(found: Identifiability) -> str:
     for row, (name, share) in enumerate(zip(found.names, found.survival, strict=True)):
         other = int(np.argmax(cosines[row]))
         value = f"{found.parameters[row]} {found.seen_from[row]:.2g}"
-        lines.append(f"{name:<32}{share:>14.1%}  {value:<32}{found.names[other]} ({cosines[row, other]:.2f})")
+        lines.append(f"{name:<32}{100 * share:>12.1f} %  {value:<32}{found.names[other]} ({cosines[row, other]:.2f})")
     return "\n".join(lines)
 
 
