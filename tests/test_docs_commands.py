@@ -105,7 +105,9 @@ PARSED = (
     "scarpsim export runs/my_run epochs --out epochs.gif",
     "scarpsim export runs/my_run scan --out scan.gif",
     "scarpsim export runs/my_run gltf --out wall.glb",
+    "scarpsim export runs/my_run copc --out wall.copc.laz",
     "scarpsim export sets/small yolo --out sets/small_yolo",
+    "scarpsim export sets/small huggingface --out sets/small_hf",
     "scarpsim export runs/my_run package",
 )
 """Work on results alone: their words are parsed."""

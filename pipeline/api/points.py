@@ -56,7 +56,7 @@ class Points(np.ndarray[Any, Any]):
         return PointCloud(self.xyz, intensity, further.pop("gps_time", None), further)
 
     def save(self, path: Path | str) -> Path:
-        """Write .laz, .las, .ply, .pcd or .xyz; returns the path. Raises InputError for another suffix."""
+        """Write .laz (.copc.laz: as COPC), .las, .ply, .pcd or .xyz; returns the path. Raises InputError for another suffix."""
         path, cloud = Path(path), self.cloud()
         if path.suffix in (".laz", ".las"):
             write_cloud(path, cloud)
@@ -67,7 +67,9 @@ class Points(np.ndarray[Any, Any]):
         elif path.suffix in (".xyz", ".txt"):
             write_xyz(path, cloud)
         else:
-            raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".laz .las .ply .pcd .xyz")
+            raise InputError(
+                f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".laz .copc.laz .las .ply .pcd .xyz"
+            )
         return path
 
     def to_open3d(self) -> Any:

@@ -34,6 +34,7 @@ EXTRAS = {
     "crs": ("projected coordinate systems in Metashape's files", "30 MB"),
     "dataset": ("data sets by several workers", "30 MB"),
     "detect": ("the detector, by TensorFlow", "2.0 GB"),
+    "huggingface": ("data sets for Hugging Face's datasets", "0.2 GB"),
     "m3c2": ("M3C2 distances", "0.1 GB"),
     "notebook": ("xarray, GeoPandas, PyVista: the types of the Python interface", "0.9 GB"),
     "poisson": ("Poisson surfaces, by Open3D", "1.0 GB"),

@@ -10,30 +10,35 @@ from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 from scene.errors import InputError
 
-SUMMARY = "make pictures, animations, glTF, YOLO sets or checksummed lists of results"
+SUMMARY = "make pictures, animations, glTF, COPC, sets for YOLO or Hugging Face, checksummed lists of results"
 EXAMPLE = """  scarpsim export runs/my_run picture --epoch 1 --out wall.png
   scarpsim export runs/my_run gltf --out wall.glb
   scarpsim export runs/my_run epochs --out epochs.gif
+  scarpsim export runs/my_run copc --out wall.copc.laz
   scarpsim export sets/small yolo --out sets/small_yolo
+  scarpsim export sets/small huggingface --out sets/small_hf
   scarpsim export runs/my_run package"""
-_SUFFIXES = {"picture": ".png", "gltf": ".glb", "epochs": ".gif", "scan": ".gif"}
+_SUFFIXES = {"picture": ".png", "gltf": ".glb", "epochs": ".gif", "scan": ".gif", "copc": ".copc.laz"}
 """What is made of a run, and the ending of its file."""
-FORMS = (*_SUFFIXES, "yolo", "package")
+_SETS = ("yolo", "huggingface")
+FORMS = (*_SUFFIXES, *_SETS, "package")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run; of yolo a data set; of package any result")
+    sets = " and ".join(_SETS)
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"a run; of {sets} a data set; of package any result")
     parser.add_argument(
         "form",
         type=one_of(*FORMS),
         metavar="FORM",
         help="picture: the wall in 3D (PNG); gltf: wall and niches with the difference as colours (.glb); epochs, scan: animated "
-        "GIF of the epochs, or of a laser scan coming in; yolo: a data set for YOLO; package: datapackage.json with checksums",
+        "GIF of the epochs, or of a laser scan coming in; copc: points as cloud-optimised LAZ (QGIS, web); yolo: a data set for "
+        "YOLO; huggingface: one as Parquet files for load_dataset and the Hub; package: datapackage.json with checksums",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="PATH", help="the file, of yolo the folder (default: beside what is exported)"
+        "--out", type=Path, metavar="PATH", help=f"the file, of {sets} the folder (default: beside what is exported)"
     )
-    parser.add_argument("--epoch", type=at_least(0, at_most=9999), metavar="N", help="of picture, gltf, scan (default: 1)")
+    parser.add_argument("--epoch", type=at_least(0, at_most=9999), metavar="N", help="of picture, gltf, scan, copc (default: 1)")
     parser.add_argument("--width", type=at_least(320, at_most=4000), metavar="PX", help="of picture (default: 1280)")
     parser.add_argument(
         "--limit-m",
@@ -47,8 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     form = arguments.form
     _check_options(arguments)
-    if form == "yolo":
-        return _yolo(arguments)
+    if form in _SETS:
+        return _of_a_set(arguments)
     if form == "package":
         from pipeline.export.package import PACKAGE_FILE, save_package
 
@@ -60,24 +65,31 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def _check_options(arguments: argparse.Namespace) -> None:
     """Raise InputError for an option of another form, and a file of another ending."""
-    allowed = {"epoch": ("picture", "gltf", "scan"), "width": ("picture",), "limit_m": ("yolo",)}
+    allowed = {"epoch": ("picture", "gltf", "scan", "copc"), "width": ("picture",), "limit_m": ("yolo",)}
     for option, forms in allowed.items():
         if getattr(arguments, option) is not None and arguments.form not in forms:
             raise InputError(f"goes with {', '.join(forms)}", where=f"--{option.replace('_', '-')}", remedy="leave it out")
     suffix = _SUFFIXES.get(arguments.form)
-    if suffix and arguments.out is not None and arguments.out.suffix.lower() != suffix:
-        raise InputError(f"got '{arguments.out.suffix}'", where="--out", allowed=suffix)
+    if suffix and arguments.out is not None and not arguments.out.name.lower().endswith(suffix):
+        raise InputError(f"got '{arguments.out.name}'", where="--out", allowed=suffix)
 
 
-def _yolo(arguments: argparse.Namespace) -> Answer:
-    from pipeline.export.yolo import save_yolo, summary, to_dict
+def _of_a_set(arguments: argparse.Namespace) -> Answer:
     from pipeline.formats.atomic import empty_folder
     from pipeline.report.progress import shown_progress
 
-    out = empty_folder(arguments.out or arguments.folder.with_name(f"{arguments.folder.resolve().name}_yolo"))
+    form = arguments.form
+    out = empty_folder(arguments.out or arguments.folder.with_name(f"{arguments.folder.resolve().name}_{form}"))
     with shown_progress(quiet=arguments.quiet) as progress:
-        made = save_yolo(arguments.folder, out, arguments.limit_m, progress)
-    return Answer(summary(made), lambda: to_dict(made))
+        if form == "yolo":
+            from pipeline.export import yolo
+
+            made = yolo.save_yolo(arguments.folder, out, arguments.limit_m, progress)
+            return Answer(yolo.summary(made), lambda: yolo.to_dict(made))
+        from pipeline.export import huggingface
+
+        written = huggingface.save_huggingface(arguments.folder, out, progress)
+        return Answer(huggingface.summary(written), lambda: huggingface.to_dict(written))
 
 
 def _of_a_run(arguments: argparse.Namespace) -> Answer:
@@ -99,6 +111,12 @@ def _save(form: str, run: Any, number: int, path: Path, width: int, progress: An
 
         with progress.stage("surface"):
             save_gltf(run, number, path)
+        return
+    if form == "copc":
+        from pipeline.run.products import write_cloud
+
+        with progress.stage("points"):
+            write_cloud(path, *run.survey_points(number))
         return
     from pipeline.export import pictures
 

@@ -29,6 +29,7 @@ from pipeline.formats.geotiff import write_geotiff
 from pipeline.report.figures import DIFFERENCE_LABEL
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import millimetres, p_value_in_words, percent, template
+from pipeline.report.progress import duration
 from pipeline.report.provenance import versions
 from pipeline.run.products import write_cloud
 from pipeline.run.recorded_points import recorded_points
@@ -276,7 +277,9 @@ def _class_rows(found: Sequence[SensorAssessment]) -> Iterable[dict[str, Any]]:
 
 
 def _seconds(seconds: float | None) -> str:
-    return _NOTHING if seconds is None else f"{seconds:.1f} s"
+    if seconds is None:
+        return _NOTHING
+    return f"{seconds:.2g} s" if seconds < 10 else duration(seconds)
 
 
 def _megabytes(size: int) -> str:

@@ -98,7 +98,7 @@ class ProductsConfig(Config):
     crs: str | None = Field(
         None, description="coordinate system of the wall's own coordinates, such as EPSG:28356: stated in points_world.laz"
     )
-    formats: tuple[Literal["ply", "xyz", "e57", "pcd"], ...] = Field(
+    formats: tuple[Literal["copc", "ply", "xyz", "e57", "pcd"], ...] = Field(
         (), description="points in these formats too, beside points.laz"
     )
     block_meshes: bool = Field(

@@ -72,7 +72,7 @@ class Tiles(Sequence[Sample]):
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
         record = self.records[index]
-        values = read_tiff(self._path(record["file_name"]))
+        values = read_tiff(self.path_of(record))
         valid = ~np.isnan(values)
         annotations = self._annotations[record["id"]]
         truth = read_tiff(self._path(record["truth_file_name"])) if "truth_file_name" in record else None
@@ -85,6 +85,10 @@ class Tiles(Sequence[Sample]):
             record=record,
             annotations=annotations,
         )
+
+    def path_of(self, record: dict[str, Any]) -> Path:
+        """The file of a tile."""
+        return self._path(record["file_name"])
 
     def _path(self, name: Any) -> Path:
         return inside(self.folder, name, self.folder / "annotations.json")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.formats.crs import wkt_of
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.result_files import read_own_points, read_surface
@@ -58,6 +59,17 @@ class ExportedRun:
     def points(self, number: int) -> PointCloud:
         """The sensor's points of an epoch, wall frame."""
         return read_own_points(self._file(number, "points.laz"))
+
+    def survey_points(self, number: int) -> tuple[PointCloud, str]:
+        """The points of an epoch, and the WKT of their coordinates, "" where the config names none.
+
+        In the wall's own coordinates where the run wrote those, else in the wall frame.
+        """
+        world = self.folder / f"epoch_{number:03d}" / "points_world.laz"
+        if not world.is_file():
+            return self.points(number), ""
+        crs = self.record["config"]["products"].get("crs")
+        return read_laz(world), wkt_of(crs, "products.crs") if crs else ""
 
     def difference(self, number: int) -> tuple[NDArray[np.float32], Grid]:
         """(h, w) reference minus epoch, m, and its grid."""

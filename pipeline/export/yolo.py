@@ -14,7 +14,7 @@ import yaml
 from numpy.typing import NDArray
 
 from pipeline.dataset.loaders import Sample, Tiles
-from pipeline.dataset.plan import SPLITS
+from pipeline.export.exported_set import splits_of
 from pipeline.formats.atomic import filling, write_bytes, write_text
 from pipeline.report.progress import Progress
 from scene.errors import InputError
@@ -42,17 +42,14 @@ def save_yolo(folder: Path, out: Path, limit_m: float | None, progress: Progress
     noise of the set's images. A label's line is class 0 and the outline of a block, in shares of width and height; detectors
     make its box of it. Raises InputError where the folder holds no split.
     """
-    splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
-    if not splits:
-        raise InputError("holds no split of a data set", where=str(folder), allowed=f"a folder with {', '.join(SPLITS)}")
-    sets: dict[str, Tiles] = {split: Tiles(folder / split) for split in splits}
+    sets = splits_of(folder)
     limit = limit_m or _usual_limit(sets, folder)
     blocks: dict[str, int] = {}
     with filling(out) as into:
         for split, tiles in sets.items():
             with progress.stage(split):
                 blocks[split] = sum(_write(into, split, sample, limit) for sample in tiles)
-        described: dict[str, Any] = {**{split: f"images/{split}" for split in splits}, "names": {0: "block"}}
+        described: dict[str, Any] = {**{split: f"images/{split}" for split in sets}, "names": {0: "block"}}
         head = f"# Difference maps in grey values: 128 + 127 * difference / {limit:.6g} m, 0 without data. Made by scarpsim.\n"
         write_text(into / "data.yaml", head + yaml.safe_dump(described, sort_keys=False))
     return YoloSet(out, limit, {split: len(tiles) for split, tiles in sets.items()}, blocks)

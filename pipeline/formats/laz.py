@@ -64,6 +64,42 @@ class LazHeader:
 _PLAIN, _USUAL = PulseChannels(), LazHeader()
 
 
+@dataclass(frozen=True)
+class StoredCloud:
+    """A cloud as LAS stores it: the header with its records, as yet of no points, and the fields of the points by name."""
+
+    header: laspy.LasHeader
+    cloud: PointCloud
+    fields: Mapping[str, NDArray[Any]]
+    full_scale: float
+
+    @classmethod
+    def of(cls, cloud: PointCloud, pulses: PulseChannels, header: LazHeader) -> StoredCloud:
+        """As `write_laz` writes it. Raises ValueError for points that are not finite, and for return numbers unknown to LAS."""
+        fields = {"bit_fields": _return_bits(pulses.return_number, pulses.number_of_returns), "gps_time": cloud.gps_time}
+        if pulses.scan_angle_rad is not None:
+            fields["scan_angle"] = np.rint(pulses.scan_angle_rad / _SCAN_ANGLE_STEP)
+        full_scale = _full_scale(cloud.intensity)
+        las = _header(cloud, header, full_scale)
+        present = {name: values for name, values in fields.items() if values is not None}
+        return cls(las, cloud, present | dict(cloud.extra), full_scale)
+
+    def steps(self) -> NDArray[np.int64]:
+        """(n, 3) the coordinates as they are stored: in steps of the header's scale from its offset."""
+        return np.rint((self.cloud.points - self.header.offsets) / self.header.scales).astype(np.int64)
+
+    def records(self, rows: slice | NDArray[np.integer]) -> laspy.ScaleAwarePointRecord:
+        """The points in these rows."""
+        places, intensity = self.cloud.points[rows], self.cloud.intensity
+        record = laspy.ScaleAwarePointRecord.zeros(len(places), header=self.header)
+        _fill(record.array, self.header, places)
+        for name, values in self.fields.items():
+            record.array[name] = values if values.ndim == 0 else values[rows]
+        if intensity is not None:
+            record.array["intensity"] = np.rint(intensity[rows] * (_COUNTS / self.full_scale))
+        return record
+
+
 def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
     """Write a point cloud as LAZ, or as LAS where `path` ends in .las; equal arguments give equal bytes.
 
@@ -72,27 +108,10 @@ def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, hea
     metres at the middle of the cloud; a cloud wider than 4295 m takes the next power of ten of the scale. Raises InputError where
     the file cannot be written.
     """
-    points, intensity = cloud.points, cloud.intensity
-    bits = _return_bits(pulses.return_number, pulses.number_of_returns)
-    channels = cloud.extra if cloud.gps_time is None else {"gps_time": cloud.gps_time, **cloud.extra}
-    if pulses.scan_angle_rad is not None:
-        channels = {"scan_angle": np.rint(pulses.scan_angle_rad / _SCAN_ANGLE_STEP), **channels}
-    las, full_scale = _header(points, cloud.extra, header.scale_m, header.date), _full_scale(intensity)
-    if header.wkt:
-        las.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(header.wkt))
-    if intensity is not None:
-        las.vlrs.append(laspy.VLR(_USER, _FULL_SCALE_RECORD, "intensity of 65535 counts", struct.pack("<d", full_scale)))
-    with writing(path) as temporary, temporary.open("wb") as file, _writer(file, las, path.suffix != ".las") as writer:
-        for start in range(0, len(points), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            record = laspy.ScaleAwarePointRecord.zeros(len(points[rows]), header=las)
-            _fill(record.array, las, points[rows])
-            record.array["bit_fields"] = bits if bits.ndim == 0 else bits[rows]
-            for name, channel in channels.items():
-                record.array[name] = channel[rows]
-            if intensity is not None:
-                record.array["intensity"] = np.rint(intensity[rows] * (_COUNTS / full_scale))
-            writer.write_points(record)
+    stored = StoredCloud.of(cloud, pulses, header)
+    with writing(path) as temporary, temporary.open("wb") as file, _writer(file, stored.header, path.suffix != ".las") as writer:
+        for start in range(0, len(cloud.points), _CHUNK):
+            writer.write_points(stored.records(slice(start, start + _CHUNK)))
 
 
 def read_laz(path: Path) -> PointCloud:
@@ -184,12 +203,19 @@ def _check_chunk_size(header: laspy.LasHeader) -> None:
             raise ValueError(f"chunks of {size:,} points for {header.point_count:,} points")
 
 
-def _header(points: FloatArray, extra: Mapping[str, NDArray[Any]], scale_m: float, date: datetime.date) -> laspy.LasHeader:
+def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.LasHeader:
     header = laspy.LasHeader(point_format=6, version="1.4")
-    header.generating_software, header.system_identifier, header.creation_date = "scarpsim", "scarpsim", date
+    header.generating_software, header.system_identifier, header.creation_date = "scarpsim", "scarpsim", given.date
     header.global_encoding.wkt = True  # point formats 6 and up know no other form of coordinate system
-    header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in extra.items()])
-    header.scales, header.offsets = _quantisation(points, scale_m)
+    header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in cloud.extra.items()])
+    for record in header.vlrs.get("ExtraBytesVlr"):
+        for dimension in record.extra_bytes_structs:  # no extremes: laspy takes the first point of each piece for them
+            dimension.options &= ~(dimension.MIN_BIT_MASK | dimension.MAX_BIT_MASK)
+    header.scales, header.offsets = _quantisation(cloud.points, given.scale_m)
+    if given.wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(given.wkt))
+    if cloud.intensity is not None:
+        header.vlrs.append(laspy.VLR(_USER, _FULL_SCALE_RECORD, "intensity of 65535 counts", struct.pack("<d", full_scale)))
     return header
 
 

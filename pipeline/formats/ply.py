@@ -19,6 +19,10 @@ _CHUNK = 1_000_000
 """Records in memory at a time while writing."""
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 _FACE_LISTS = ("vertex_indices", "vertex_index")
+_SCALAR = "scalar_"
+"""Before the names of channels: beside coordinates and intensity CloudCompare loads only properties that have it."""
+_FIELDS = {"Intensity": "intensity", "GpsTime": "gps_time", "Gps_Time": "gps_time"}
+"""CloudCompare's names of channels that have a place of their own here."""
 
 
 def write_ply(path: Path, mesh: TriangleMesh) -> None:
@@ -31,10 +35,12 @@ def write_ply(path: Path, mesh: TriangleMesh) -> None:
 def write_ply_points(path: Path, cloud: PointCloud) -> None:
     """Write a point cloud: x, y, z as double, the other channels in the type they have, or PLY's nearest (`_storable`).
 
-    Raises InputError for a channel that no type of PLY holds without loss.
+    Channels other than the intensity are called `scalar_...`, for CloudCompare. Raises InputError for a channel that no type of
+    PLY holds without loss.
     """
     channels = _present(intensity=cloud.intensity, gps_time=cloud.gps_time) | cloud.extra
-    stored = {name: _storable(column, f"{path}: {name}") for name, column in channels.items()}
+    names = {name: name if name == "intensity" else _SCALAR + name for name in channels}
+    stored = {names[name]: _storable(column, f"{path}: {name}") for name, column in channels.items()}
     _write(path, {"vertex": _xyz(cloud.points) | stored})
 
 
@@ -63,13 +69,23 @@ def read_ply(path: Path) -> TriangleMesh:
 
 
 def read_ply_points(path: Path) -> PointCloud:
-    """Read the vertices of any PLY file with all their scalar properties; raises InputError for a missing or damaged file."""
+    """Read the vertices of any PLY file with all their scalar properties, by their names without `scalar_`.
+
+    Raises InputError for a missing or damaged file.
+    """
     vertex = read_elements(path, only="vertex").get("vertex")
     if vertex is None:
         raise InputError("holds no vertices", where=str(path))
     names = [name for name in vertex if name not in ("x", "y", "z") and vertex[name].ndim == 1]
-    extra = {name: _native(vertex[name]) for name in names}
+    extra = {_channel(name, vertex): _native(vertex[name]) for name in names}
     return PointCloud(_points(vertex, path), _column(extra, "intensity"), _column(extra, "gps_time", np.float64), _others(extra))
+
+
+def _channel(name: str, vertex: Columns) -> str:
+    """What a property is called here: a field of CloudCompare by its own name, where no other property has it."""
+    plain = name.removeprefix(_SCALAR)
+    known = _FIELDS.get(plain, plain) if name.startswith(_SCALAR) else name
+    return name if known in vertex else known
 
 
 def _others(extra: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -166,8 +166,7 @@ def blocks_figure(
         if min(difference[part].shape) > 1:
             axes.contour(block[part] == label, levels=[0.5], colors="black", linewidths=0.8)
         side = difference[part].shape[1] * grid.gsd
-        axes.set_title(f"{label}: {captions[label]}", fontsize=8)
-        axes.set_xlabel(f"{side:.2g} m wide", fontsize=7)
+        axes.set_title(f"{label}: {captions[label]}, {side:.2g} m wide", fontsize=8)
         axes.set(xticks=[], yticks=[])
     for axes in figure.axes[len(shown) :]:
         axes.set_visible(False)

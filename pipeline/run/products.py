@@ -23,6 +23,8 @@ from pipeline.change.tiles import tiles
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.atomic import explained, give_name, note, noting, to_disk, write_bytes, write_json
 from pipeline.formats.checksum import sha256
+from pipeline.formats.copc import SUFFIX as COPC
+from pipeline.formats.copc import write_copc
 from pipeline.formats.crs import wkt_of
 from pipeline.formats.e57 import E57Scan, write_e57
 from pipeline.formats.geotiff import write_geotiff, write_tiff
@@ -194,7 +196,7 @@ def _write_common(
     products = config.products
     cloud = recorded_points(seen.observations)
     write_cloud(folder / "points.laz", cloud)
-    _write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations))
+    _write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations), "")
     if seen.observation.sensor == "stereo":
         depth = seen.observation.depth.astype(np.float32)
         write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
@@ -205,16 +207,19 @@ def _write_common(
     write_json(folder / "blocks.json", blocks)
     if products.world or (products.world is None and isinstance(config.wall, ImportedWall)):
         cloud = replace(cloud, points=site.frame.to_world(cloud.points))
-        write_cloud(folder / "points_world.laz", cloud, wkt_of(products.crs, "products.crs") if products.crs else "")
-        _write_formats(folder / "points_world", products.formats, cloud, partial(scans_of, seen.observations, site.frame))
+        wkt = wkt_of(products.crs, "products.crs") if products.crs else ""
+        write_cloud(folder / "points_world.laz", cloud, wkt)
+        _write_formats(folder / "points_world", products.formats, cloud, partial(scans_of, seen.observations, site.frame), wkt)
         if products.surface:
             write_ply(folder / "surface_world.ply", _in_world(surface, site))
     if products.metashape and seen.depth_maps is not None:
         write_metashape_export(folder / "metashape", *seen.depth_maps)
 
 
-def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]]) -> None:
+def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]], wkt: str) -> None:
     """Points in the formats beside LAZ, by one stem."""
+    if "copc" in formats:
+        write_cloud(stem.with_suffix(COPC), cloud, wkt)
     if "ply" in formats:
         write_ply_points(stem.with_suffix(".ply"), cloud)
     if "xyz" in formats:
@@ -226,10 +231,14 @@ def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans:
 
 
 def write_cloud(path: Path, cloud: PointCloud, wkt: str = "") -> None:
-    """Write points.laz, with the channels that the format has a place of its own for in theirs; wkt: of the coordinates."""
+    """Write LAZ, or COPC where `path` ends in .copc.laz, with the channels that the format has a place of its own for in theirs.
+
+    wkt: coordinate system of the points. Raises InputError as `write_laz` and `write_copc` do.
+    """
     extra = dict(cloud.extra)
     pulses = PulseChannels(*(extra.pop(name, None) for name in ("return_number", "number_of_returns", "scan_angle_rad")))
-    write_laz(path, replace(cloud, extra=extra), pulses, LazHeader(wkt=wkt))
+    write = write_copc if path.name.lower().endswith(COPC) else write_laz
+    write(path, replace(cloud, extra=extra), pulses, LazHeader(wkt=wkt))
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:

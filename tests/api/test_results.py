@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import geopandas
+import laspy
 import numpy as np
 import pytest
 import rasterio
@@ -94,6 +95,8 @@ def test_points_are_the_files_and_go_to_others(run: Run, tmp_path: Path) -> None
     assert np.array_equal(found.to_pyvista().point_data["block"], held.extra["block"])
     again = read_laz(found.save(tmp_path / "again.laz"))
     assert np.abs(again.points - held.points).max() < 1e-6
+    with laspy.CopcReader.open(found.save(tmp_path / "again.copc.laz")) as reader:
+        assert len(reader.query()) == len(held.points)
     with pytest.raises(InputError, match=r"allowed: \.laz"):
         found.save(tmp_path / "points.dwg")
 

@@ -28,13 +28,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("chosen")
     wall = make_wall(style="pilkington", width_m=6.0, height_m=4.0, resolution_m=0.2)
     path = wall.with_vertices(wall.vertices + ORIGIN).save(place / "wall.ply")  # type: ignore[attr-defined]
-    chosen = {"truth": False, "surface": False, "crs": "EPSG:28356", "formats": ["xyz", "ply", "e57", "pcd"]}
+    chosen = {"truth": False, "surface": False, "crs": "EPSG:28356", "formats": ["copc", "xyz", "ply", "e57", "pcd"]}
     return simulate(None, "tls", out=place / "run", progress=False, wall={"mesh": path}, products=chosen, **SMALL).folder
 
 
 def test_only_what_was_chosen_is_written(folder: Path) -> None:
     names = {path.name for path in (folder / "epoch_001").iterdir()}
-    points = {f"points{world}.{suffix}" for world in ("", "_world") for suffix in ("laz", "xyz", "ply", "e57", "pcd")}
+    points = {f"points{world}.{suffix}" for world in ("", "_world") for suffix in ("laz", "copc.laz", "xyz", "ply", "e57", "pcd")}
     assert names == {*points, "blocks.json", "epoch.json"}
     with pytest.raises(InputError, match=r"did not write surface\.ply.*products"):
         _ = open_run(folder)[1].surface
@@ -45,16 +45,17 @@ def test_the_map_has_its_style_beside_it(folder: Path) -> None:
 
 
 def test_world_points_state_their_system(folder: Path) -> None:
-    with laspy.open(folder / "epoch_001" / "points_world.laz") as file:
-        crs = file.header.parse_crs()
-        assert file.header.global_encoding.wkt
-    assert crs is not None
-    assert crs.to_epsg() == 28356
+    for name in ("points_world.laz", "points_world.copc.laz"):
+        with laspy.open(folder / "epoch_001" / name) as file:
+            crs = file.header.parse_crs()
+            assert file.header.global_encoding.wkt
+        assert crs is not None
+        assert crs.to_epsg() == 28356
     with laspy.open(folder / "epoch_001" / "points.laz") as file:
         assert file.header.parse_crs() is None
 
 
-@pytest.mark.parametrize("suffix", ["laz", "xyz", "ply", "e57"])
+@pytest.mark.parametrize("suffix", ["laz", "copc.laz", "xyz", "ply", "e57"])
 def test_world_points_are_the_wall_frames_moved(suffix: str, folder: Path) -> None:
     frame = open_run(folder).frame
     local = read_points(folder / "epoch_001" / "points.laz").points

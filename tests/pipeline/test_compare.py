@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from pipeline.cli.main import main
+from pipeline.comparison import report
 from pipeline.comparison.assess import assess
 from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.covariates import edge_distance
@@ -244,3 +245,10 @@ def test_the_command_and_its_folder(site: Path, tmp_path: Path, capsys: pytest.C
     assert (out / "site_tls/difference_002.tif").exists()
     assert main(words) == 2
     assert "not an empty folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(None, report._NOTHING), (0.0299, "0.03 s"), (4.92, "4.9 s"), (600.0, "10 min 0 s")]
+)
+def test_times_have_their_unit_and_no_false_zero(seconds: float | None, words: str) -> None:
+    assert report._seconds(seconds) == words

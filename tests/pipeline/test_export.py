@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
+import laspy
 import numpy as np
 import pytest
 import trimesh
 import yaml
 from PIL import Image
+from pycocotools import mask as coco_mask
 
 from pipeline.change.annotate import BLOCK_CATEGORY, run_length_encoding
 from pipeline.cli.main import main
@@ -22,7 +25,7 @@ from pipeline.export import pictures
 from pipeline.export.perspective import PerspectiveView, draw_wall
 from pipeline.export.yolo import grey_values, outline
 from pipeline.formats.atomic import write_json
-from pipeline.formats.geotiff import write_geotiff
+from pipeline.formats.geotiff import read_tiff, write_geotiff
 from pipeline.formats.ply import read_ply
 from pipeline.run.simulation import simulate
 from scene.config import parse
@@ -100,6 +103,18 @@ def test_a_run_as_gltf(run: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.bounds, surface.bounds, atol=1e-5)
 
 
+def test_a_run_as_copc(run: Path, tmp_path: Path) -> None:
+    """The points of points.laz, each once."""
+    assert export(run, "copc", "--epoch", 2, "--out", tmp_path / "wall.copc.laz") == 0
+    with laspy.CopcReader.open(tmp_path / "wall.copc.laz") as reader:
+        found = reader.query()
+    points = laspy.read(run / "epoch_002/points.laz")
+    order, given = np.argsort(found.gps_time), np.argsort(points.gps_time)
+    np.testing.assert_array_equal(np.asarray(found.block)[order], np.asarray(points.block)[given])
+    np.testing.assert_allclose(np.stack([found.x, found.y, found.z], axis=1)[order], points.xyz[given], rtol=0, atol=2e-6)
+    assert export(run, "copc", "--out", tmp_path / "wall.laz") == 2
+
+
 def test_a_package_lists_every_file_with_its_checksum(run: Path, tmp_path: Path) -> None:
     assert export(run, "package", "--out", tmp_path / "datapackage.json") == 0
     made = json.loads((tmp_path / "datapackage.json").read_text())
@@ -116,7 +131,7 @@ def test_a_package_lists_every_file_with_its_checksum(run: Path, tmp_path: Path)
     [
         (["epochs", "--epoch", "1"], "--epoch: goes with picture, gltf, scan"),
         (["picture", "--epoch", "9"], "--epoch: epoch 9 is not there; allowed: 0 to 2"),
-        (["gltf", "--out", "wall.obj"], "--out: got '.obj'; allowed: .glb"),
+        (["gltf", "--out", "wall.obj"], "--out: got 'wall.obj'; allowed: .glb"),
         (["movie"], "got 'movie'; allowed: picture"),
         (["yolo"], "holds no split of a data set"),
     ],
@@ -158,21 +173,23 @@ def test_an_outline_covers_its_mask(number: int) -> None:
     assert outline(np.zeros((3, 3), dtype=bool)).shape == (0, 2)
 
 
-def test_a_set_as_yolo_reads_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    values = np.full((30, 40), -0.006, np.float32)
-    values[0, 0] = np.nan
-    mask = masks()[0]
-    values[mask] = 0.4
+@pytest.fixture
+def tiles(tmp_path: Path) -> Path:
+    """A set of one tile in two splits: 6 mm of rock added, one block of 0.4 m, one pixel without data."""
+    values, mask = np.full((30, 40), -0.006, np.float32), masks()[0]
+    values[0, 0], values[mask] = np.nan, 0.4
     for split in ("train", "val"):
         write_geotiff(tmp_path / "set" / split / "deep/a.tif", values, Grid(0.0, 3.0, 0.1, 40, 30))
         image = {"id": 7, "file_name": "deep/a.tif", "width": 40, "height": 30, "noise_sigma_m": 0.002}
         mask_of = run_length_encoding(mask, 0, 0, mask.shape)
         block = {"id": 1, "image_id": 7, "category_id": 1, "bbox": [8, 5, 12, 7], "segmentation": mask_of}
-        write_json(
-            tmp_path / "set" / split / "annotations.json",
-            {"images": [image], "annotations": [block], "categories": [BLOCK_CATEGORY]},
-        )
-    assert export(tmp_path / "set", "yolo", "--out", tmp_path / "yolo") == 0
+        content = {"images": [image], "annotations": [block], "categories": [BLOCK_CATEGORY]}
+        write_json(tmp_path / "set" / split / "annotations.json", content)
+    return tmp_path / "set"
+
+
+def test_a_set_as_yolo_reads_it(tiles: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export(tiles, "yolo", "--out", tmp_path / "yolo") == 0
     assert "train: 1 images, 1 blocks" in capsys.readouterr().out
     described = yaml.safe_load((tmp_path / "yolo/data.yaml").read_text())
     assert described == {"train": "images/train", "val": "images/val", "names": {0: "block"}}
@@ -183,4 +200,29 @@ def test_a_set_as_yolo_reads_it(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert label[0] == 0
     np.testing.assert_allclose([min(label[1::2]), max(label[1::2])], [8 / 40, 20 / 40], atol=0.15 / 40)
     np.testing.assert_allclose([min(label[2::2]), max(label[2::2])], [5 / 30, 12 / 30], atol=0.15 / 30)
+    values = read_tiff(tiles / "train/deep/a.tif")
     np.testing.assert_array_equal(grey_values(values, ~np.isnan(values), 0.012), grey)
+
+
+def test_a_set_as_hugging_face_reads_it(tiles: Path, tmp_path: Path) -> None:
+    """Its own library finds the splits, metres and missing data bit for bit, and the blocks' outlines."""
+    datasets = pytest.importorskip("datasets", reason="the extra huggingface is not installed")
+    assert export(tiles, "huggingface", "--out", tmp_path / "hub") == 0
+    loaded = datasets.load_dataset(str(tmp_path / "hub"), cache_dir=str(tmp_path / "cache"))
+    assert {split: len(rows) for split, rows in loaded.items()} == {"train": 1, "validation": 1}
+    (tile,) = loaded["validation"]
+    np.testing.assert_array_equal(np.asarray(tile["image"]), read_tiff(tiles / "val/deep/a.tif"))
+    objects = tile["objects"]
+    assert (objects["bbox"], objects["ignore"], objects["volume_m3"]) == ([[8.0, 5.0, 12.0, 7.0]], [0], [None])
+    assert loaded["train"].features["objects"]["category"].feature.names == ["block"]
+    mask = coco_mask.decode({"size": [tile["height"], tile["width"]], "counts": objects["segmentation"][0]})
+    np.testing.assert_array_equal(mask.astype(bool), masks()[0])
+
+
+def test_hugging_face_without_its_library_is_told_in_one_line(
+    tiles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "datasets", None)
+    assert export(tiles, "huggingface", "--out", tmp_path / "hub") == 2
+    assert "pip install 'scarpsim[huggingface]'" in capsys.readouterr().err
+    assert not (tmp_path / "hub").exists()

@@ -51,6 +51,15 @@ def test_laz_header_as_laspy_reads_it(tmp_path: Path, cloud: PointCloud) -> None
     np.testing.assert_allclose(header.maxs, cloud.points.max(axis=0), atol=1e-6)
 
 
+def test_laz_claims_no_extremes_of_its_channels(tmp_path: Path, cloud: PointCloud) -> None:
+    """laspy would write the first point's value as minimum and maximum."""
+    write_laz(tmp_path / "a.laz", cloud)
+    with laspy.open(tmp_path / "a.laz") as reader:
+        (record,) = reader.header.vlrs.get("ExtraBytesVlr")
+    assert [each.name.decode() for each in record.extra_bytes_structs] == list(cloud.extra)
+    assert not any(each.min_is_relevant() or each.max_is_relevant() for each in record.extra_bytes_structs)
+
+
 @pytest.mark.parametrize(("extent_m", "step_m"), [(70.0, 1e-6), (5000.0, 1e-5), (1e6, 1e-3)])
 def test_laz_keeps_large_coordinates(tmp_path: Path, extent_m: float, step_m: float) -> None:
     points = UTM + np.random.default_rng(4).uniform(-0.5, 0.5, (1000, 3)) * extent_m

@@ -14,6 +14,7 @@ from pipeline.formats.ply import read_ply, read_ply_points, write_ply, write_ply
 from pipeline.formats.point_cloud import PointCloud
 from scene.errors import InputError
 from scene.mesh import TriangleMesh
+from scene.ply import read_elements
 
 
 @pytest.fixture
@@ -72,6 +73,28 @@ def test_ply_points_round_trip_is_exact(tmp_path: Path, cloud: PointCloud) -> No
     assert list(read.extra) == list(cloud.extra)
     for name, channel in cloud.extra.items():
         np.testing.assert_array_equal(read.extra[name], channel)
+
+
+def test_ply_points_have_the_names_that_cloudcompare_loads(tmp_path: Path, cloud: PointCloud) -> None:
+    write_ply_points(tmp_path / "a.ply", cloud)
+    names = list(read_elements(tmp_path / "a.ply")["vertex"])
+    assert names == ["x", "y", "z", "intensity", "scalar_gps_time", *(f"scalar_{name}" for name in cloud.extra)]
+
+
+def test_fields_of_cloudcompare_are_channels(tmp_path: Path) -> None:
+    fields = ("Intensity", "GpsTime", "Original_cloud_index")
+    header = "".join(f"property float {name}\n" for name in ("x", "y", "z", *(f"scalar_{field}" for field in fields)))
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n1 2 3 0.5 7 2\n")
+    read = read_ply_points(tmp_path / "a.ply")
+    assert (read.intensity, read.gps_time) == (0.5, 7.0)
+    assert list(read.extra) == ["Original_cloud_index"]
+
+
+def test_a_field_and_a_property_of_one_name_stay_two(tmp_path: Path) -> None:
+    header = "".join(f"property float {name}\n" for name in ("x", "y", "z", "block", "scalar_block", "scalar_x"))
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n1 2 3 4 5 6\n")
+    read = read_ply_points(tmp_path / "a.ply")
+    assert {name: channel.item() for name, channel in read.extra.items()} == {"block": 4, "scalar_block": 5, "scalar_x": 6}
 
 
 PROPERTIES = "property double x\nproperty double y\nproperty double z\nproperty uchar class\nproperty float intensity\n"

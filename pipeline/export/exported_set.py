@@ -1,0 +1,17 @@
+"""A data set's folder as it is exported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.dataset.loaders import Tiles
+from pipeline.dataset.plan import SPLITS
+from scene.errors import InputError
+
+
+def splits_of(folder: Path) -> dict[str, Tiles]:
+    """The tiles of each split that a set has; raises InputError where the folder holds none."""
+    splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
+    if not splits:
+        raise InputError("holds no split of a data set", where=str(folder), allowed=f"a folder with {', '.join(SPLITS)}")
+    return {split: Tiles(folder / split) for split in splits}

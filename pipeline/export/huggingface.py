@@ -1,0 +1,154 @@
+"""A data set for Hugging Face's `datasets`: Parquet files of tiles with their blocks, as `load_dataset` and the Hub read them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.change.annotate import BLOCK_CATEGORY
+from pipeline.dataset.loaders import Sample, Tiles
+from pipeline.export.exported_set import splits_of
+from pipeline.formats.atomic import filling, write_text
+from pipeline.report.progress import Progress
+from scene.errors import InputError
+
+_TILES_A_FILE = 256
+_NAMES = {"train": "train", "val": "validation", "test": "test"}
+"""Splits by the names that the Hub has for them."""
+_TEXTS, _NUMBERS = ("sensor", "wall", "noise", "size_class"), ("gsd_m", "x_min_m", "y_max_m", "noise_sigma_m")
+_OF_A_BLOCK = ("area", "volume_m3", "depth_m", "signal_to_noise")
+_CARD = """---
+pretty_name: {name}
+task_categories: [object-detection, image-segmentation]
+tags: [rockfall, difference-map, simulated]
+configs:
+- config_name: default
+  data_files:
+{files}
+---
+
+# {name}
+
+Simulated difference maps of rock walls with annotated rockfalls, made by scarpsim.
+
+    from datasets import load_dataset
+    tiles = load_dataset("{name}")          # this folder, or its name on the Hub
+    metres = np.asarray(tiles["train"][0]["image"])
+
+- `image`: float32 TIFF, reference minus epoch in metres, missing rock positive, NaN without data.
+- `objects`, of each block: `bbox` (x, y, width, height in pixels from the top-left corner), `segmentation` (COCO's compressed run
+  lengths: `pycocotools.mask.decode({{"size": [height, width], "counts": s}})`), `area` in px, `volume_m3` of the rock removed,
+  `depth_m` and `signal_to_noise` in the map, `ignore`: 1 where the block is below the noise.
+- `x_min_m`, `y_max_m`, `gsd_m`: the tile's place on the wall; `noise_sigma_m`: spread of its epoch's map outside the blocks.
+"""
+
+
+@dataclass(frozen=True)
+class HuggingFaceSet:
+    """What was written. images, blocks: by split, as the Hub names them."""
+
+    folder: Path
+    images: dict[str, int]
+    blocks: dict[str, int]
+
+
+def save_huggingface(folder: Path, out: Path, progress: Progress) -> HuggingFaceSet:
+    """Write the splits of a set: data/SPLIT-00000-of-00002.parquet ... of 256 tiles each, and README.md.
+
+    The tiles are the set's own TIFF files, byte for byte. Raises InputError where the folder holds no split, and where `datasets`
+    (the extra `huggingface`) is not installed.
+    """
+    library, sets = _library(), splits_of(folder)
+    blocks: dict[str, int] = {}
+    with filling(out) as into, _without_bars(library):
+        (into / "data").mkdir()
+        for split, tiles in sets.items():
+            with progress.stage(split):
+                blocks[_NAMES[split]] = _write(library, into / "data" / _NAMES[split], tiles)
+        files = "\n".join(f"  - {{split: {_NAMES[split]}, path: data/{_NAMES[split]}-*}}" for split in sets)
+        write_text(into / "README.md", _CARD.format(name=out.resolve().name, files=files))
+    return HuggingFaceSet(out, {_NAMES[split]: len(tiles) for split, tiles in sets.items()}, blocks)
+
+
+def _library() -> Any:
+    try:
+        import datasets
+    except ImportError as error:
+        raise InputError(
+            f"needs the library datasets, which does not load ({error})",
+            where="export huggingface",
+            remedy="pip install 'scarpsim[huggingface]', or uv sync --extra huggingface in a checkout",
+        ) from None
+    return datasets
+
+
+@contextmanager
+def _without_bars(library: Any) -> Iterator[None]:
+    """Progress is told here; the library's own bars come back afterwards."""
+    shown = not library.are_progress_bars_disabled()
+    library.disable_progress_bars()
+    try:
+        yield
+    finally:
+        if shown:
+            library.enable_progress_bars()
+
+
+def _write(library: Any, stem: Path, tiles: Tiles) -> int:
+    """Write a split's files; returns how many blocks they hold."""
+    features, files, blocks = _features(library), -(-len(tiles) // _TILES_A_FILE), 0
+    for number in range(files):
+        some = range(number * _TILES_A_FILE, min((number + 1) * _TILES_A_FILE, len(tiles)))
+        rows = [_row(tiles, tiles[index]) for index in some]
+        blocks += sum(len(row["objects"]["id"]) for row in rows)
+        path = stem.with_name(f"{stem.name}-{number:05d}-of-{files:05d}.parquet")
+        library.Dataset.from_list(rows, features=features).to_parquet(path)
+    return blocks
+
+
+def _features(library: Any) -> Any:
+    whole, number, text = (library.Value(kind) for kind in ("int64", "float64", "string"))
+    objects = {
+        "id": whole,
+        "bbox": library.Sequence(number, length=4),
+        "category": library.ClassLabel(names=[BLOCK_CATEGORY["name"]]),
+        "segmentation": text,
+        "ignore": whole,
+        **dict.fromkeys(_OF_A_BLOCK, number),
+    }
+    tile = {"image": library.Image(), "image_id": whole, "width": whole, "height": whole, "objects": library.Sequence(objects)}
+    return library.Features(tile | dict.fromkeys(_TEXTS, text) | dict.fromkeys(_NUMBERS, number))
+
+
+def _row(tiles: Tiles, sample: Sample) -> dict[str, Any]:
+    record, blocks = sample.record, sample.annotations
+    name = record["file_name"]
+    objects: dict[str, list[Any]] = {
+        "id": [each["id"] for each in blocks],
+        "bbox": [each["bbox"] for each in blocks],
+        "category": [0] * len(blocks),
+        "segmentation": [each["segmentation"]["counts"] for each in blocks],
+        "ignore": [each.get("ignore", 0) for each in blocks],
+    }
+    return {
+        "image": {"bytes": tiles.path_of(record).read_bytes(), "path": name},
+        "image_id": record["id"],
+        "width": record["width"],
+        "height": record["height"],
+        "objects": objects | {key: [each.get(key) for each in blocks] for key in _OF_A_BLOCK},
+        **{key: record.get(key) for key in (*_TEXTS, *_NUMBERS)},
+    }
+
+
+def summary(made: HuggingFaceSet) -> str:
+    """What was written, in lines."""
+    lines = [f"{split}: {images:,} images, {made.blocks[split]:,} blocks" for split, images in made.images.items()]
+    return "\n".join([*lines, f"load it with datasets.load_dataset({str(made.folder)!r})"])
+
+
+def to_dict(made: HuggingFaceSet) -> dict[str, Any]:
+    """As --json prints it."""
+    return {"folder": str(made.folder), "images": made.images, "blocks": made.blocks}
