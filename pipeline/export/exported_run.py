@@ -68,8 +68,8 @@ class ExportedRun:
         world = self.folder / f"epoch_{number:03d}" / "points_world.laz"
         if not world.is_file():
             return self.points(number), ""
-        crs = self.record["config"]["products"].get("crs")
-        return read_laz(world), wkt_of(crs, "products.crs") if crs else ""
+        crs = (self.record["config"].get("products") or {}).get("crs")
+        return read_own_points(world), wkt_of(crs, "products.crs") if crs else ""
 
     def difference(self, number: int) -> tuple[NDArray[np.float32], Grid]:
         """(h, w) reference minus epoch, m, and its grid."""

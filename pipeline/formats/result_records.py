@@ -74,11 +74,19 @@ class _Wall(_Record):
     name: str
 
 
+class _Products(_Record):
+    crs: str | None = None
+
+
+class _Config(_Record):
+    products: _Products | None = None
+
+
 class _RunRecord(_Record):
     """schema: of the file; products: checksums of each finished epoch's files."""
 
     sensor: Literal["stereo", "tls"]
-    config: dict[str, Any]
+    config: _Config
     wall: _Wall | None = None
     wall_frame: _WallFrame | None = None
     epochs: list[_EpochRecord] = Field([], max_length=10_000)

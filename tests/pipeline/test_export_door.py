@@ -114,6 +114,13 @@ def test_an_epoch_without_a_list_of_blocks_has_none(tmp_path: Path) -> None:
     assert [each["blocks"] for each in read_run(run / "run.json", "")["epochs"]] == [[], []]
 
 
+@pytest.mark.parametrize("products", ["x", {"crs": 3}, {"crs": ["EPSG:28356"]}])
+def test_products_that_are_none(products: Any, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", lambda record: record["config"].update(products=products))
+    with pytest.raises(InputError, match="products"):
+        read_run(run / "run.json", "")
+
+
 @pytest.mark.parametrize("change", [{"rotation": [[1, 0], [0, 1]]}, {"matrix_world_to_wall": "e"}, {"origin_m": [0, 1e300, 0]}])
 def test_a_frame_that_is_none(change: dict[str, Any], tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", lambda record: record["wall_frame"].update(change))
