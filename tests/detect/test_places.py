@@ -24,7 +24,8 @@ def run(tmp_path: Path) -> Path:
     """A wall in survey coordinates whose reference is the plane z = 0.1 x."""
     turn = np.deg2rad(30)
     rotation = np.array([[np.cos(turn), np.sin(turn), 0.0], [0.0, 0.0, 1.0], [np.sin(turn), -np.cos(turn), 0.0]])
-    frame = {"rotation": rotation.tolist(), "origin_m": ORIGIN.tolist()}
+    matrix = WallFrame(rotation, ORIGIN).matrix
+    frame = {"matrix_world_to_wall": matrix.tolist(), "rotation": rotation.tolist(), "origin_m": ORIGIN.tolist()}
     write_json(tmp_path / "run.json", {"sensor": "tls", "config": {}, "wall": {"name": "w"}, "wall_frame": frame})
     x, y = (part.ravel() for part in np.meshgrid(np.arange(0, 6, 0.04), np.arange(0, 4, 0.04)))
     vertices = np.stack([x, y, 0.1 * x], axis=1)

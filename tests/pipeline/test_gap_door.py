@@ -159,7 +159,7 @@ def test_fit_tells_how_far_points_lie_behind_the_reference(case: Path) -> None:
     away = good.cloud.points - origin
     behind = origin + away * (1 + 3.0 / np.linalg.norm(away, axis=1, keepdims=True))
     assert good.fit.good
-    fit = PointFit.of(behind, origin, good.scene)
+    fit = PointFit.of(behind, origin, good.scene, "tls")
     assert not fit.good
     assert fit.off_m == pytest.approx(3.0, abs=0.01)  # noise of 3 mm, pose off by some millimetres
 
