@@ -173,3 +173,10 @@ def test_nothing_found_and_nothing_measured_is_no_answer() -> None:
 def test_all_noise_is_lowered_alike(model: TlsModel | StereoModel, expected: dict[str, float]) -> None:
     assert lower_noise(model, 0.5) == pytest.approx(expected)
     assert lower_noise(model, 1.0) == {}
+
+
+@pytest.mark.parametrize(("error", "open_still"), [(0.0001, True), (0.004, False)])
+def test_a_gap_stays_open_only_beyond_its_uncertainty(error: float, open_still: bool) -> None:
+    """Rare edges may decide the score of a few held-out patches: 8.9 mm before, 10.9 after, each with an error of some millimetres."""
+    gap = Gap(before=0.0089, after=0.0109, floor=0.0006, error=error, floor_error=0.003, points=100)
+    assert Evidence(gap, 0.3).stays_open == open_still

@@ -57,10 +57,12 @@ class Evidence:
 
     @property
     def stays_open(self) -> bool:
-        """Whether the gap with the named effects is above the floor by more than its uncertainty, and most of what it was."""
-        if self.gap is None or not self.gap.left_open:
+        """Whether the gap with the named effects is above the floor, and most of what it was, by more than its uncertainty."""
+        gap = self.gap
+        by = decided().verdict
+        if gap is None or gap.closed is None or not gap.left_open:
             return False
-        return self.gap.closed is not None and self.gap.closed < decided().verdict.least_closed
+        return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
     def only_too_noisy(self, named: Sequence[Named]) -> bool:
         """Whether the model's noise is too large and nothing else was found to be wrong."""

@@ -83,23 +83,32 @@ class Showing:
         """The gap on points that no step has used, and words for effects that are taken out.
 
         As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
-        one goes without which those are predicted best. What is described, not named, goes only where it clearly does harm. A
-        lower noise is proposed only if it predicts better.
+        one goes that does most. What is described, not named, goes only where it clearly does harm. A lower noise is proposed
+        only if it predicts better.
         """
         shown, words = self._of(named, self.tested), []
         if self.lower and shown.is_worse:
             return replace(self, lower={}).show(named)
-        learned = self._of(named, self.learned) if shown.is_worse else shown
         while shown.is_worse:
             doubtful = [item for item in shown.named if shown.is_clearly_worse or _may_be_harmful(item)]
-            fewer = [self._of([item for item in shown.named if item is not out], self.learned) for out in doubtful]
-            best = min(fewer, key=_score, default=learned)
-            if _score(best) >= _score(learned):
+            harms = [self._harm(shown, item) for item in doubtful]
+            if max(harms, default=0.0) <= 0:
                 break
-            out = next(item for item in shown.named if item not in best.named)
+            out = doubtful[int(np.argmax(harms))]
             words.append(f"{out.name} dropped: with it the model predicts worse")
-            shown, learned = self._of(best.named, self.tested), best
+            shown = self._of([item for item in shown.named if item is not out], self.tested)
         return shown, words
+
+    def _harm(self, shown: Shown, item: Named) -> float:
+        """By how much the model predicts the points that may be looked at worse with an effect than without; the same points,
+        since an effect that moves some far may bring others near."""
+        others = [each for each in shown.named if each is not item]
+        gap = self._gap(shown.named, (self._version(others), Version(shown.model, shown.pose)), self.learned)
+        return 0.0 if gap is None else gap.after - gap.before
+
+    def _version(self, named: list[Named]) -> Version:
+        model = with_effects(self.measurement.model, [item.entry for item in named], self.lower)
+        return Version(model, self._registered(named)[1] if named or self.lower else self.pose)
 
     def _of(self, named: list[Named], rows: BoolArray) -> Shown:
         model = with_effects(self.measurement.model, [item.entry for item in named], self.lower)
@@ -135,7 +144,3 @@ class Showing:
 def _may_be_harmful(item: Named) -> bool:
     """Of what is described, only noise: a term on the mean is not exact, and without it nothing would be said of it."""
     return item.spreads or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)
-
-
-def _score(shown: Shown) -> float:
-    return shown.gap.after if shown.gap else np.inf
