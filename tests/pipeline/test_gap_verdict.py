@@ -177,6 +177,6 @@ def test_all_noise_is_lowered_alike(model: TlsModel | StereoModel, expected: dic
 
 @pytest.mark.parametrize(("error", "open_still"), [(0.0001, True), (0.004, False)])
 def test_a_gap_stays_open_only_beyond_its_uncertainty(error: float, open_still: bool) -> None:
-    """Rare edges may decide the score of a few held-out patches: 8.9 mm before, 10.9 after, each with an error of some millimetres."""
+    """Rare edges may decide the score of a few held-out patches: 8.9 mm before, 10.9 after, off by some millimetres."""
     gap = Gap(before=0.0089, after=0.0109, floor=0.0006, error=error, floor_error=0.003, points=100)
     assert Evidence(gap, 0.3).stays_open == open_still
