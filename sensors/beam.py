@@ -93,7 +93,10 @@ class Beam:
     modulation_wavelength_m: float | None = None
 
     def sub_ray(self, axis: mi.Array3f64, across: Sequence[mi.Array3f64], number: mi.UInt32) -> mi.Array3f64:
-        """Unit vectors of sub-rays by `number` (n,), 3 x (n,), about the axis and with the two unit vectors across it."""
+        """Unit vectors of sub-rays by `number` (n,), 3 x (n,), about the axis and with the two unit vectors across it.
+
+        The three stand upright on each other, so that weights of unit length make unit vectors.
+        """
         if self.sub_rays == 1:
             return axis
         aside = self.divergence_rad * unit_offsets(self.sub_rays)

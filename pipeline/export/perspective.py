@@ -21,7 +21,9 @@ _HALF_VIEW = np.tan(np.radians(16.0))
 """Half of the field of view across; a long lens keeps the wall's lines straight."""
 _MARGIN = 1.04
 _TALLEST = 3.0
+"""Height over width of a picture: a column of points would take gigabytes."""
 _LEAST_SHARE = 1e-3
+"""Of the places' depth that their width has to have, and of the camera's distance the least before any of them."""
 _OVERSAMPLED = 2
 _PLACES = 200_000
 """That the picture is made to hold, at least where there are more."""

@@ -32,6 +32,7 @@ _EPOCH_MS, _SCAN_MS, _LAST_MS = 1200, 80, 2500
 _SCAN_FRAMES, _SCAN_POINTS = 48, 400_000
 _ANIMATED_PX, _COLOURS_OF_GIF = 900, 96
 _LONGEST_SCAN_S = 1e6
+"""Eleven days: no scan takes longer."""
 _NIGHT, _BEAM = 26, np.array([255, 150, 30], dtype=np.uint8)
 
 

@@ -185,7 +185,7 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
 
 
 def most_pixels() -> int:
-    """Of an image: MOST_PIXELS, or as many as the variable READ_LIMIT allows."""
+    """Of an image: MOST_PIXELS, or as many as the variable READ_LIMIT allows, of four bytes each."""
     return max(MOST_PIXELS, int(raised_gb() * 1e9 / 4))
 
 

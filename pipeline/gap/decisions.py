@@ -91,7 +91,11 @@ class MeanDecisions(_Group):
         10.0, "typical sizes", "From which on an effect that the registration undoes nearly is not committed to.", _JUDGEMENT
     )
     undone_share: PositiveFloat = _by(
-        0.1, "share", "Of an effect that the registration leaves, below which it undoes it nearly.", _JUDGEMENT, lt=1
+        0.1,
+        "share",
+        "Of an effect that the registration, or a curve of an angle, leaves, below which that holds it nearly.",
+        _JUDGEMENT,
+        lt=1,
     )
     practical_share: PositiveFloat = _by(
         0.02,

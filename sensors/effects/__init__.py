@@ -85,7 +85,7 @@ def _named(effects: Effects) -> Any:
 
 def _doing_something(effect: Effect) -> Effect:
     """Refuse an effect that was named without the parameter that switches it on; one that is set to null by name stays."""
-    switches = list(effect.nulls()) or ["values_m" if effect.sensor == "tls" else "values_px"]
+    switches = list(effect.nulls()) or [key for key in type(effect).model_fields if key.startswith("values_")]
     if effect.is_null and not effect.model_fields_set.intersection(switches):
         raise ValueError(f"{effect.name} does nothing without {' or '.join(switches)}; give a value")
     return effect

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from scene.keyed_random import KeyedRandom
 from sensors.curve import Axis, Table, surface
@@ -31,11 +31,18 @@ class AngleEmpirical(Effect):
     along: Axis = Field(Axis(), description="where the values stand on x")
     values_rad: Table = Field(((0.0, 0.0),), description="c, recorded minus true: one row, from low to high of x [rad]")
 
+    @field_validator("values_rad")
+    @classmethod
+    def _one_row(cls, values: Table) -> Table:
+        if len(values) != 1:
+            raise ValueError(f"holds {len(values)} rows; an angle's error is a curve: one row")
+        return values
+
     @property
     def is_null(self) -> bool:
         return not any(map(any, self.values_rad))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         x = state.azimuth if self.covariate == "azimuth" else state.zenith
-        error = surface(x, x, self.along, Axis(), self.values_rad[:1])
+        error = surface(x, x, self.along, Axis(), self.values_rad)
         return state.with_angle_error(**{self.angle: error})

@@ -330,6 +330,8 @@ def test_an_effect_acts_at_a_step_edge_with_the_range_that_is_hit() -> None:
         ([{"name": "tilt_drift"}], "without rate_x_rad or rate_y_rad"),
         ([{"name": "range_cyclic", "period_m": 4.0}], "without amplitude_m"),
         ([{"name": "range_empirical", "covariate": "zenith"}], "without values_m"),
+        ([{"name": "angle_empirical", "covariate": "zenith"}], "without values_rad"),
+        ([{"name": "angle_empirical", "values_rad": [[0.0, 1e-4], [0.0, 1e-4]]}], "holds 2 rows"),
     ],
 )
 def test_wrong_effects_are_named(effects: list[dict[str, Any]], message: str) -> None:

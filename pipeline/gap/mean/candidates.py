@@ -19,6 +19,7 @@ _STEPS = 13
 """Places at which a step in a covariate is tried: quantiles of it."""
 _MOST_CYCLES = 12.0
 _MOST_CYCLES_OF_A_CIRCLE = 40.0
+"""In a field of view: a divided circle is off tens of times a turn, where what lies along a wall is not."""
 _CHUNK = 32
 PLACE = "place along"
 HARMONICS, FOLDED, SURFACE = "harmonics", "folded", "surface"

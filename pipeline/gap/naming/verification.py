@@ -103,25 +103,23 @@ class Showing:
         """By how much the model predicts the points that may be looked at worse with an effect than without; the same points,
         since an effect that moves some far may bring others near."""
         others = [each for each in shown.named if each is not item]
-        gap = self._gap(shown.named, (self._version(others), Version(shown.model, shown.pose)), self.learned)
+        without = Version(self._model(others), self._registered(others)[1])
+        gap = self._gap(shown.named, (without, Version(shown.model, shown.pose)), self.learned)
         return 0.0 if gap is None else gap.after - gap.before
 
-    def _version(self, named: list[Named]) -> Version:
-        model = with_effects(self.measurement.model, [item.entry for item in named], self.lower)
-        return Version(model, self._registered(named)[1] if named or self.lower else self.pose)
+    def _model(self, named: list[Named]) -> TlsModel | StereoModel:
+        return with_effects(self.measurement.model, [item.entry for item in named], self.lower)
 
     def _of(self, named: list[Named], rows: BoolArray) -> Shown:
-        model = with_effects(self.measurement.model, [item.entry for item in named], self.lower)
-        before = self.pose
-        if named or self.lower:
-            value, pose = self._registered(named)
-        else:
-            value, pose = self.residuals.value - self.residuals.pose @ before, before
-        versions = Version(self.measurement.model, before), Version(model, pose)
+        model = self._model(named)
+        value, pose = self._registered(named)
+        versions = Version(self.measurement.model, self.pose), Version(model, pose)
         return Shown(named, self.lower, model, value, pose, self._gap(named, versions, rows))
 
     def _registered(self, named: list[Named]) -> tuple[FloatArray, FloatArray]:
         """(n,) residuals of the same points with some effects, NaN where their rays miss the reference; the pose (6,)."""
+        if not (named or self.lower):
+            return self.residuals.value - self.residuals.pose @ self.pose, self.pose
         trusted = self.residuals.index[self.chosen]
         _, found, there = settled_with(self.measurement, named, trusted, self.lower)
         rest = pose_of(found, found.smooth & np.isin(found.index, trusted))
