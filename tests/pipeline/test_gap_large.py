@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,16 +15,19 @@ from benchmarks.gap_challenge import stereo_cases
 from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_challenge.strength import Target
 from pipeline.formats.measurement import read_measurement
-from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanModel, fitted
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.naming.held_out import score_effects
+from pipeline.gap.naming.relinearised import SearchedPoints, fitted_together, searched_at_best_fit
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
 from pipeline.gap.residuals.registration import settled
+from pipeline.gap.residuals.residuals import Residuals
 from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
 
 
 class _Strong(Target):
@@ -49,6 +53,54 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
         assert abs(error) < max(4 * effect.std["angle_rad"], 0.02 * abs(truth["parameters"]["angle_rad"]))
     assert found.gap is not None
     assert (found.gap.closed or 0.0) > 0.9
+
+
+@pytest.fixture(scope="module")
+def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchedPoints, dict[str, dict[str, Any]]]:
+    """What is measured by a pair with a turned camera (4 mrad) and another focal length (8 px), and both effects' parameters."""
+    folder = tmp_path_factory.mktemp("large")
+    kinds = ("camera_kappa", "focal_length")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(stereo_cases, "Target", _Strong)
+        make(Case(0, (9241, 310), "two", "stereo", kinds, 3_000, 3_000), folder / "case", folder / "truth.json")
+    truth = {each["name"]: each["parameters"] for each in json.loads((folder / "truth.json").read_text())["effects"]}
+    there, residuals, _ = settled(read_measurement(folder / "case"))
+    part = residuals.part(residuals.smooth)
+    there, part = there.part(part.index), replace(part, index=np.arange(residuals.smooth.sum()))
+    return SearchedPoints(there, part, families_of(there, part), [], (1.0, 0.0), KeyedRandom(1)), truth
+
+
+def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
+    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]],
+) -> None:
+    """Least squares with the columns of both effects there find both values to 15 %, two to three standard errors;
+    by the slopes at the model they miss a third of one."""
+    points, truth = turned_and_zoomed
+
+    def both(families: list[Candidate | SineGrid], part: Residuals, value: FloatArray) -> list[float]:
+        physical = [each for each in families if isinstance(each, Candidate) and not each.empirical]
+        chosen = [each for each in physical if each.name in truth and each.fixed["camera"] == truth[each.name]["camera"]]
+        columns = np.concatenate([part.pose, *(each.columns for each in chosen)], axis=1) / part.sigma[:, None]
+        found = np.linalg.lstsq(columns, value / part.sigma, rcond=None)[0][6:]
+        wanted = [next(v for key, v in truth[each.name].items() if key != "camera") for each in chosen]
+        return [abs(one / other - 1) for one, other in zip(found, wanted, strict=True)]
+
+    assert max(both(points.families, points.part, points.part.value)) > 0.3
+    fitted = fitted_together(points, [each for each in points.families if isinstance(each, Candidate) and not each.empirical])
+    assert fitted is not None
+    there, at, explained = fitted
+    assert max(both(families_of(there, at), at, at.value + explained)) < 0.15
+
+
+def test_two_large_effects_are_found_where_all_together_fit_best(
+    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]],
+) -> None:
+    """By slopes at the model two others, and a free form, say it."""
+    found = searched_at_best_fit(turned_and_zoomed[0])
+    assert found is not None
+    assert {each.candidate.name for each in found.chosen} <= {"focal_length", "camera_kappa", "affinity_skew"}  # a turn is a skew
+    assert [each.candidate.name for each in found.chosen].count("focal_length") == 1
+    assert len(found.chosen) == 2
 
 
 def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:

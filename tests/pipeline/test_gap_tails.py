@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.gap.mean.selection import Chosen
+from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.naming import with_doubtful
 from pipeline.gap.naming.relinearised import undone
 from pipeline.gap.other.spread import find_tails
 
@@ -67,3 +70,16 @@ def test_an_effect_that_registration_undoes_is_not_believed_at_38_times_its_size
 ) -> None:
     found = undone([_estimate(monkeypatch, amplitude)], Any, {"horizontal_eccentricity": left})  # type: ignore[arg-type]
     assert found == (frozenset({("horizontal_eccentricity", False)}) if out else frozenset())
+
+
+def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:
+    """A camera turned by 23 times the usual looks as a tangential distortion does: whichever it is, it is not named alone."""
+    turn: Any = SimpleNamespace(name="camera_omega", empirical=False)
+    chosen = Chosen(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
+    named = [
+        Named(f"stereo.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0)
+        for name in ("smoothing", "tangential_distortion")
+    ]
+    found = with_doubtful(named, [chosen], frozenset({("camera_omega", False)}))
+    assert [item.alike for item in found] == [(), ("stereo.camera_omega",)]
+    assert [item.alike for item in with_doubtful(named, [chosen], frozenset())] == [(), ()]

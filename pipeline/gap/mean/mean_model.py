@@ -12,13 +12,15 @@ the covariance too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cholesky, eigh, solve_triangular
+from scipy.linalg.lapack import dsysv
 from scipy.spatial.distance import cdist
 from scipy.special import j0
 
@@ -115,8 +117,9 @@ class MeanModel:
         for row, design in enumerate(designs):
             normal = _Normal.of(design, value)
             for basis in range(len(self._bases)):
-                found = [normal.at(self._at(basis, ratio)).log_likelihood for ratio in ratios]
-                tops[row, basis], heights[row, basis] = int(np.argmax(found)), max(found)
+                tops[row, basis], heights[row, basis] = _highest(
+                    [partial(normal.log_likelihood, self._at(basis, ratio)) for ratio in ratios]
+                )
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
         narrower = copy(self)
         narrower._bases = [self._bases[basis] for basis in kept]
@@ -242,14 +245,24 @@ class _Normal:
         y = value.weighed[:, 0]
         return cls(columns, value, columns.within.T @ columns.weighed, columns.within.T @ y, float(value.within[:, 0] @ y))
 
+    def log_likelihood(self, at: Covariance) -> float:
+        """All columns fitted."""
+        matrix, right, constant = self._equations(at)
+        scale = _scale(matrix)
+        found = dsysv(_ridged(matrix, scale), scale * right)[2]
+        return constant + 0.5 * float(right @ (scale * found))
+
     def at(self, at: Covariance, precision: FloatArray | None = None) -> MeanFit:
         """All columns fitted. precision: (k, k) inverse covariance of the coefficients, around 0, before there are data."""
+        matrix, right, constant = self._equations(at)
+        return _solve(matrix if precision is None else matrix + precision, right, constant, at)
+
+    def _equations(self, at: Covariance) -> tuple[FloatArray, FloatArray, float]:
+        """Matrix (k, k), right side (k,), and the log-likelihood without the columns."""
         basis, y = self.columns.between[at.length], self.value.between[at.length][:, 0]
         weighted = basis * at.weight[:, None]
         constant = 0.5 * (np.log(at.weight).sum() - y @ (at.weight * y) - self.square)
-        matrix = self.gram + weighted.T @ basis
-        matrix = matrix if precision is None else matrix + precision
-        return _solve(matrix, self.right + weighted.T @ y, float(constant), at)
+        return self.gram + weighted.T @ basis, self.right + weighted.T @ y, float(constant)
 
 
 def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> MeanFit:
@@ -269,9 +282,28 @@ def fitted(covariances: list[Covariance], columns: Projected, value: Projected, 
     return replace(best, covariance=covariance + np.einsum("f,fi,fj->ij", weights, moves, moves))
 
 
+def _highest(heights: Sequence[Callable[[], float]]) -> tuple[int, float]:
+    """Number and height of the highest on a curve with one top: every second one is asked for, then those beside the best."""
+    found = {number: heights[number]() for number in range(0, len(heights), 2)}
+    best = max(found, key=lambda number: found[number])
+    for number in {best - 1, best + 1} & set(range(len(heights))):
+        found[number] = heights[number]()
+    top = max(sorted(found), key=lambda number: found[number])
+    return top, found[top]
+
+
 def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> MeanFit:
-    size = np.sqrt(np.diag(matrix))
-    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max())
-    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(right))) * np.outer(scale, scale)
+    scale = _scale(matrix)
+    inverse = np.linalg.inv(_ridged(matrix, scale)) * np.outer(scale, scale)
     coefficients = inverse @ right
     return MeanFit(coefficients, inverse, constant + 0.5 * float(right @ coefficients), at)
+
+
+def _scale(matrix: FloatArray) -> FloatArray:
+    """(k,) of columns to size 1, 0 of those that are absent."""
+    size = np.sqrt(np.diag(matrix))
+    return np.divide(1.0, size, out=np.zeros_like(size), where=size > _NOTHING * size.max())
+
+
+def _ridged(matrix: FloatArray, scale: FloatArray) -> FloatArray:
+    return matrix * np.outer(scale, scale) + _RIDGE * np.eye(len(scale))

@@ -30,9 +30,14 @@ def believes(measurement: Measurement, name: str) -> bool:
     return any(effect.name == name for effect in measurement.model.effects)
 
 
+def effects_of(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+    """Every effect of the catalogue that the fields of `part` allow, with what is typical of it."""
+    return [_with_precision(each) for each in mean_families(part, measurement)]
+
+
 def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
     """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
-    named = mean_families(part, measurement)
+    named = effects_of(measurement, part)
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}
     free = [
         form
@@ -45,7 +50,7 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
         named, free = _not_held(named, angles, measurement, part), [*free, *angles]
     first, second = PLANES[part.sensor]
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
-    return [*map(_with_precision, named), *free, both, *_repeated(part), *places(part.at)]
+    return [*named, *free, both, *_repeated(part), *places(part.at)]
 
 
 def _of_angles(part: TlsResiduals) -> list[Candidate | SineGrid]:

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import PLACE, REPEATED
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import Tried
+from pipeline.gap.mean.selection import Chosen, Tried
 from pipeline.gap.naming.entries import (
     Estimate,
     Named,
@@ -129,7 +129,8 @@ def name_effects(
                 kept = nodes_left or (None if described else nodes)
                 spread = [] if kept is None else [kept]
     if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
-        return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
+        again, naming = name_effects(measurement, whole, whole_scale, random, left_out | wrong)
+        return with_doubtful(again, found.chosen, wrong), naming
     moving = [from_mean(each, found.at) for each in found.estimates]
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
@@ -148,6 +149,17 @@ def name_effects(
     if angles and not believes(measurement, AngleEmpirical.tag()):
         return _with_angles(measurement, whole, angles, naming, random, left_out)
     return named, naming
+
+
+def with_doubtful(named: list[Named], chosen: list[Chosen], left_out: frozenset[tuple[str, bool]]) -> list[Named]:
+    """An effect that was chosen first and is too large to be committed to stays in the class of those that would do as well."""
+    doubtful = [each for each in chosen if (each.candidate.name, False) in left_out]
+    found = []
+    for item in named:
+        sensor, name = item.name.split(".", 1)
+        alike = {f"{sensor}.{each.candidate.name}" for each in doubtful if name in each.alike} - {item.name, *item.alike}
+        found.append(replace(item, alike=(*item.alike, *sorted(alike))))
+    return found
 
 
 def _with_angles(

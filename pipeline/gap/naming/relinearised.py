@@ -13,7 +13,7 @@ from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, Sine
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Chosen, Tried, class_margin
 from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, settled_with, typical_sizes
-from pipeline.gap.naming.families import PERIODIC, families_of
+from pipeline.gap.naming.families import PERIODIC, effects_of, families_of
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.registration import Settled, registered
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
@@ -24,6 +24,8 @@ from sensors.effects.matching_noise import MatchingNoise
 
 _MOST_CONVERGED, _ROUNDS, _CONVERGED = 3, 4, 1.0
 """Effects whose values are sought exactly, by so many rounds, while the log-likelihood rises by so much."""
+_MOST_FITS, _FITTED = 10, 0.005
+"""Rounds of a fit of all effects together, and the share by which its sum of squares falls at the least."""
 
 
 @dataclass(frozen=True)
@@ -91,17 +93,16 @@ class _Alone:
     def better(self, points: SearchedPoints, first: MeanSearch) -> _Alone | None:
         """With its values moved by the slopes here."""
         candidate = _renewed(self.estimate.candidate, families_of(self.there, self.at))
-        columns = np.concatenate([self.at.pose, candidate.columns], axis=1) / self.at.sigma[:, None]
-        known = np.concatenate([np.zeros(6), precision_of(candidate, candidate.columns.shape[1])])
-        step = np.linalg.solve(columns.T @ columns + np.diag(known), columns.T @ (self.at.value / self.at.sigma))
-        return _Alone.of(points, first, self.chosen, replace(self.estimate, values=self.estimate.values + step[6:]))
+        width = candidate.columns.shape[1]
+        step = _step(self.at, candidate.columns, precision_of(candidate, width), np.zeros(width))
+        return _Alone.of(points, first, self.chosen, replace(self.estimate, values=self.estimate.values + step))
 
 
 def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     """What the first search chose, with what stands beside it when it is taken exactly.
 
     Slopes miss some of a large effect, and others then make up for it: where one alone, taken exactly, needs fewer beside it,
-    that is the explanation.
+    or those that are found by slopes where all effects together fit best, that is the explanation.
     """
     together, tried = first.select()
     plain = Explained(together, _estimates(first, together), first, points.part, together, tried)
@@ -111,8 +112,78 @@ def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     by_itself = _beside(points, replace(plain, chosen=[one.chosen], estimates=[one.estimate]))
     if len(by_itself.estimates) == 1:
         return by_itself
-    found = [each for each in (_beside(points, plain), by_itself) if not beyond(points.measurement, each.estimates, each.at)]
-    return min(found, key=lambda each: each.complexity, default=plain)
+    found = [by_itself, _beside(points, plain)]
+    there = searched_at_best_fit(points)
+    if there is not None and there.chosen:
+        found.append(_beside(points, there))
+    possible = [each for each in found if not beyond(points.measurement, each.estimates, each.at)]
+    return min(possible, key=lambda each: each.complexity, default=plain)
+
+
+def searched_at_best_fit(points: SearchedPoints) -> Explained | None:
+    """What a search chooses by slopes where all effects of the catalogue together, none far beyond its typical size, fit best.
+
+    There the rays go where they went, whichever of the effects turned them: slopes are the true ones, and to what is left by all
+    of them the part of each is added again. None where one of them would be beyond what can be.
+    """
+    plain = [each for each in points.families if isinstance(each, Candidate) and not each.empirical]
+    fitted = fitted_together(points, plain)
+    if fitted is None:
+        return None
+    there, at, explained = fitted
+    allowed = {(family.name, family.empirical) for family in points.families}
+    families = [each for each in families_of(there, at) if (each.name, each.empirical) in allowed]
+    left = replace(at, value=at.value + explained)
+    search = MeanSearch(_weighed_at(points, left), families, points.random.child("best fit"))
+    together, tried = search.select()
+    return Explained(together, _estimates(search, together), search, left, together, tried)
+
+
+def fitted_together(points: SearchedPoints, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
+    """The measurement with some effects in its model, what is left there, and how much (n,) they explain by slopes there."""
+    there, at, before = points.measurement, points.part, np.inf
+    widths = [each.columns.shape[1] for each in candidates]
+    values = np.zeros(sum(widths))
+    for _ in range(_MOST_FITS):
+        after = float(np.mean((at.value / at.sigma) ** 2))
+        if after > (1 - _FITTED) * before:
+            break
+        before = after
+        precision = np.concatenate([precision_of(each, width) for each, width in zip(candidates, widths, strict=True)])
+        values = values + _step(at, _all_columns(candidates), precision, values)
+        parts = np.split(values, np.cumsum(widths)[:-1])
+        estimates = [_unchosen(each, part) for each, part in zip(candidates, parts, strict=True)]
+        if beyond(points.measurement, estimates, at):
+            return None
+        there, found, _ = _with(points, estimates)
+        at = noisier(at_points(found, points.part), points.noise[1])
+        if len(at) < decided().points.kept * len(points.part):
+            return None
+        renewed = effects_of(there, at)
+        candidates = [_renewed(each, renewed) for each in candidates]
+    explained: FloatArray = _all_columns(candidates) @ values
+    return there, at, explained
+
+
+def _all_columns(candidates: list[Candidate]) -> FloatArray:
+    columns: FloatArray = np.concatenate([each.columns for each in candidates], axis=1)
+    return columns
+
+
+def _unchosen(candidate: Candidate, values: FloatArray) -> Estimate:
+    """An effect of some size for which nothing speaks yet."""
+    nothing = Chosen(candidate, (), 1.0, 0.0, 0.0, ())
+    return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
+
+
+def _step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
+    """(k,) by how much values (k,) change: least squares by slopes (n, k), the pose free and each value known to be near 0."""
+    design = np.concatenate([at.pose, columns], axis=1) / at.sigma[:, None]
+    known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
+    start = at.pose.shape[1]
+    known[start:], pull[start:] = precision, precision * values
+    found = np.linalg.solve(design.T @ design + np.diag(known), design.T @ (at.value / at.sigma) - pull)
+    return np.asarray(found[start:])
 
 
 def _largest_alone(points: SearchedPoints, first: MeanSearch) -> _Alone | None:
@@ -208,9 +279,9 @@ def _again(
     alone: what each explanation gains by itself. Returns the search, its residuals, the effects with what was found beside them,
     that only, and what was tried last.
     """
-    part, noise = points.part, points.noise
+    part = points.part
     there, found, _ = _with(points, had)
-    at = noisier(at_points(found, part), noise[1])
+    at = noisier(at_points(found, part), points.noise[1])
     renewed = families_of(there, at)
     allowed = {(family.name, family.empirical) for family in points.families}
     names = {each.candidate.name for each in had}
@@ -218,7 +289,7 @@ def _again(
     known = [replace(each, candidate=_renewed(each.candidate, renewed)) for each in had]
     columns = [_columns(each) for each in known]
     others += [harmonics(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
-    heavier = weighed(at, [replace(each, variance=each.variance[_kept(at, part)]) for each in points.spread], noise[0])
+    heavier = _weighed_at(points, at)
     precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
         replace(heavier, pose=np.concatenate([at.pose, *columns], axis=1)),
@@ -234,6 +305,12 @@ def _again(
         place = slice(start, start := start + matrix.shape[1])
         kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
     return search, at, _without_sines([*kept, *_estimates(search, chosen)]), chosen, tried
+
+
+def _weighed_at(points: SearchedPoints, at: Residuals) -> Residuals:
+    """Residuals of those of the points that are left, with the spread that they really have."""
+    kept = _kept(at, points.part)
+    return weighed(at, [replace(each, variance=each.variance[kept]) for each in points.spread], points.noise[0])
 
 
 def _with(points: SearchedPoints, effects: list[Estimate]) -> Settled:
