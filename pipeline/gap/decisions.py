@@ -333,6 +333,12 @@ class HeldOutDecisions(_Group):
         "That chance may take: held-out blocks that are less likely by more with an effect speak against it.",
         _DEVELOPMENT,
     )
+    least_beside: PositiveFloat = _by(
+        2.0,
+        "log-likelihood",
+        "That an effect must gain beside others to be named, not only mentioned: where a gain is as large as its standard error.",
+        "the gain of a true effect, half a difference of two chi^2, has twice its expectation as variance",
+    )
     left_over: PositiveFloat = _by(
         0.02,
         "share",

@@ -150,3 +150,18 @@ def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path
     assert [item.name for item in scored.failed] == ["tls.range_scale"]
     assert [item.name for item in scored.named] == ["tls.range_incidence_bias"]
     assert scored.named[0].gain > 50
+
+
+def test_an_effect_that_gains_no_more_than_its_standard_error_is_only_mentioned_beside_others(tmp_path: Path) -> None:
+    """Ranges grow with the incidence angle; beside that a scale error of 1 ppm, which nothing can tell from none."""
+    write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
+    there, residuals, _ = settled(read_measurement(tmp_path))
+    trained = ~held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    true, slight = (
+        Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
+        for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 1.0))
+    )
+    both = score_effects(there, residuals, [true, slight], trained, 0.0004)
+    assert [item.name for item in both.named] == ["tls.range_incidence_bias"]
+    assert [item.name for item in both.weak] == ["tls.range_scale"]
+    assert 0 < both.weak[0].gain < 2

@@ -26,10 +26,11 @@ _LEAST_OWN = 0.02
 
 @dataclass(frozen=True)
 class Scored:
-    """Effects with their held-out gains, and those that failed."""
+    """Effects with their held-out gains, those that failed, and those that are too weak beside others to be committed to."""
 
     named: list[Named]
     failed: list[Named]
+    weak: list[Named]
 
 
 def score_effects(
@@ -42,7 +43,7 @@ def score_effects(
     """
     scored = [item for item in named if item.effect.scored()]
     if not scored or (~trained).sum() < 100:
-        return Scored(named, [])
+        return Scored(named, [], [])
     whole = _value(measurement, named, residuals, trained)
 
     def gains(out: list[Named]) -> tuple[float, float]:
@@ -59,10 +60,16 @@ def score_effects(
         if tested <= _least(expected):
             out = min(moving, key=lambda item: (item.kind != "empirical", found[item.name][0]))
             left = score_effects(measurement, residuals, [each for each in named if each is not out], trained, reference_sigma)
-            return Scored(left.named, [out, *left.failed])
+            return Scored(left.named, [out, *left.failed], left.weak)
     failed = [item for item in scored if found[item.name][0] <= _least_of(item, found[item.name][1])]
-    kept = [item for item in named if item not in failed]
-    return Scored([replace(item, gain=found[item.name][0]) if item.name in found else item for item in kept], failed)
+    measured = [replace(item, gain=found[item.name][0]) if item.name in found else item for item in named if item not in failed]
+    weak = [item for item in measured if _is_weak(item)] if len(measured) > 1 else []
+    return Scored([item for item in measured if item not in weak], failed, weak)
+
+
+def _is_weak(item: Named) -> bool:
+    """Whether an effect gains no more than its standard error: that of a gain g is the root of 2 g."""
+    return item.kind == "physical" and item.effect.scored() and item.gain <= decided().held_out.least_beside
 
 
 def _least_of(item: Named, expected: float) -> float:

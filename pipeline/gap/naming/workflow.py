@@ -301,6 +301,7 @@ def _confirmed(
     trained = np.arange(len(rows)) < len(state.chosen)
     scored = score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
     words = [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
+    words += [f"{item.name} only mentioned: beside the others it gains {item.gain:.1f} on new blocks" for item in scored.weak]
     described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
     least = decided().held_out.left_over * max(described, default=0.0)
     left = [item for item in scored.named if item.spreads and item.gain < least]
