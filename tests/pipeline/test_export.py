@@ -224,5 +224,5 @@ def test_hugging_face_without_its_library_is_told_in_one_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "datasets", None)
     assert export(tiles, "huggingface", "--out", tmp_path / "hub") == 2
-    assert "pip install 'scarpsim[huggingface]'" in capsys.readouterr().err
+    assert "make setup EXTRAS=huggingface" in capsys.readouterr().err
     assert not (tmp_path / "hub").exists()
