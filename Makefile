@@ -5,6 +5,7 @@ BIN := .venv/bin
 
 help:
 	@echo 'make setup       what the program runs on: environment and system libraries (seconds when they are there)'
+	@echo '                 with EXTRAS="detect notebook" those extras too; `scarpsim doctor` says what each is for'
 	@echo 'make setup-all   what tests, documentation and benchmarks need too; the targets below do it themselves'
 	@echo 'make demo        simulate both sensors on the demo wall, into a new folder under runs/'
 	@echo 'make test        lint, types and tests'
@@ -14,7 +15,7 @@ help:
 	@echo 'make nightly     robustness at length: 500 drawn inputs a command, the list of bad inputs, the soak (hours)'
 
 setup:
-	@sh tools/setup.sh
+	@sh tools/setup.sh $(EXTRAS)
 
 setup-all:
 	@sh tools/setup.sh all

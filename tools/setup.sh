@@ -1,6 +1,7 @@
 #!/bin/sh
 # Makes what the project needs on a bare Debian or Ubuntu: uv, the environment in .venv, the system libraries.
 #   tools/setup.sh        what the program runs on
+#   tools/setup.sh detect notebook    that and some of the extras of pyproject.toml
 #   tools/setup.sh all    what tests, documentation and benchmarks need too
 # Does only what is not done yet, so that running it again takes a second. Registries are those that pip, uv and apt are
 # configured for on this machine.
@@ -57,11 +58,13 @@ install_uv() {
     "$python" -m pip --version >/dev/null 2>&1 && "$python" -m pip install -q --target .uv uv
 }
 
-case "${1:-}" in
-    "") groups=--no-default-groups extras="" ;;
-    all) groups="" extras=poisson ;;
-    *) fail "got '$1'; allowed: nothing, all" ;;
-esac
+extras_known=$(sed -n '/^\[project.optional-dependencies\]/,/^$/s/ = .*//p' pyproject.toml)
+groups=--no-default-groups extras="$*"
+[ "$extras" != all ] || { groups="" extras=poisson; }
+for extra in $extras; do
+    printf '%s\n' "$extras_known" | grep -qx -e "$extra" ||
+        fail "got '$extra'; allowed: nothing, all, or some of $(echo $extras_known)"
+done
 
 python=$(find_python)
 
@@ -75,9 +78,9 @@ if ! uv_is_recent "$uv"; then
     fi
 fi
 
-# dataset: `scarpsim dataset --workers`. --inexact keeps extras added by hand, such as `uv sync --extra detect --inexact`.
-# shellcheck disable=SC2086  # no word where it is empty
-"$uv" sync --quiet --locked --inexact $groups --extra dataset --python "$python" || fail "the environment could not be made from uv.lock"
+# dataset: `scarpsim dataset --workers`. --inexact keeps what an earlier set-up installed.
+# shellcheck disable=SC2046,SC2086  # a word each
+"$uv" sync --quiet --locked --inexact $groups $(printf ' --extra %s' dataset $extras) --python "$python" || fail "the environment could not be made from uv.lock"
 
 # -P: the script's folder stays off the path, where modules have names of the standard library's.
 # shellcheck disable=SC2086

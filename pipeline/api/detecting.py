@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _COMMAND = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))"
 _WRONG_INPUT = 2
+_WAITING = "the detector, after TensorFlow, which takes ten seconds and more to load"
 
 
 def detect(
@@ -51,7 +52,8 @@ def detect(
             with python_progress(progress) as shown:
                 found = run.detect(str(model), places, folder, confidences, True, shown)
         else:
-            _in_another_process(str(model), places, folder, confidences)
+            with python_progress(progress) as shown, shown.stage(_WAITING):
+                _in_another_process(str(model), places, folder, confidences)
             found = read_events(folder / f"events_{min(confidences):g}.csv")
     return Detections(folder, tuple(found), min(confidences), kept)
 

@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from scene.errors import InputError
+from scene.extras import how_to_install
 
 EXTRAS = {"open3d": "poisson"}
 """The extra of a library; of all others it is `notebook`."""
@@ -20,5 +21,5 @@ def library(name: str) -> Any:
         raise InputError(
             f"needs {name}, which does not load ({error})",
             where="Python interface",
-            remedy=f"pip install 'scarpsim[{extra}]', or uv sync --extra {extra} in a checkout",
+            remedy=how_to_install(extra),
         ) from None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.api.configs import ConfigLike, configure, one_sensor
+from pipeline.api.configs import ConfigLike, Show, configure, one_sensor
 from pipeline.api.maps import data_array, dataset
 from pipeline.api.pictures import Picture, html_table, pick
 from pipeline.api.tables import frame
@@ -15,6 +15,7 @@ from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.planning.inspect import inspect, write_plans
 from pipeline.planning.maps import Plan as Promise
 from pipeline.planning.report import answer, map_picture, summary
+from pipeline.report.notebook_progress import python_progress
 
 if TYPE_CHECKING:
     import pandas
@@ -28,6 +29,7 @@ def plan(
     out: Path | str | None = None,
     seed: int | None = None,
     model: Any = None,
+    progress: Show = "auto",
     **overrides: Any,
 ) -> Plans:
     """Map precision, spacing, blind spots and the smallest block of a set-up; the same as `scarpsim inspect`.
@@ -36,10 +38,11 @@ def plan(
     nothing is written.
     """
     resolved = configure(config, sensor, seed=seed, model=model, **overrides)
-    found = inspect(resolved, [one_sensor(resolved, sensor)] if sensor else resolved.sensor_names())
-    result = Plans(resolved, tuple(SensorPlan(each) for each in found))
-    if out is not None:
-        result.write(out)
+    sensors = [one_sensor(resolved, sensor)] if sensor else resolved.sensor_names()
+    with python_progress(progress) as shown:
+        result = Plans(resolved, tuple(SensorPlan(each) for each in inspect(resolved, sensors, shown)))
+        if out is not None:
+            result.write(out)
     return result
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,8 +18,8 @@ from pipeline.api.tables import boxes, frame, spread_out
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.atomic import new_folder
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.laz import read_laz
-from pipeline.formats.result_records import RUN_FILE
+from pipeline.formats.result_records import RUN_FILE, read_annotations
+from pipeline.formats.run_files import RunFiles
 from pipeline.report.notebook_progress import python_progress
 from pipeline.report.page import millimetres
 from scene.errors import InputError
@@ -78,15 +77,15 @@ class Run:
     folder: Path
 
     @cached_property
+    def _files(self) -> RunFiles:
+        if not (self.folder / RUN_FILE).exists():
+            raise InputError(f"holds no {RUN_FILE}", where=str(self.folder), remedy="name a run's folder")
+        return RunFiles(self.folder)
+
+    @property
     def record(self) -> dict[str, Any]:
-        """run.json."""
-        path = self.folder / RUN_FILE
-        try:
-            return dict(json.loads(path.read_text(encoding="utf-8")))
-        except OSError:
-            raise InputError(f"holds no {RUN_FILE}", where=str(self.folder), remedy="name a run's folder") from None
-        except ValueError:
-            raise InputError("is damaged", where=str(path), remedy="make the run again") from None
+        """run.json, checked."""
+        return self._files.record
 
     @cached_property
     def config(self) -> SimulationConfig:
@@ -112,7 +111,7 @@ class Run:
     @property
     def annotations(self) -> dict[str, Any]:
         """annotations.json, COCO."""
-        return dict(json.loads((self.folder / "annotations.json").read_text(encoding="utf-8")))
+        return read_annotations(self.folder / "annotations.json")
 
     @property
     def epochs(self) -> list[Epoch]:
@@ -152,7 +151,7 @@ class Run:
         return f"<Run {self.folder}: {self.sensor}, {len(self.epochs)} epochs>"
 
     def _repr_html_(self) -> str:
-        rows: dict[str, Any] = {"sensor": self.sensor, "seed": self.record["seed"], "epochs": len(self.epochs)}
+        rows: dict[str, Any] = {"sensor": self.sensor, "seed": self.record.get("seed"), "epochs": len(self.epochs)}
         rows |= {f"epoch {each.number}": each.summary() for each in self.epochs[:5]}
         picture = self.plot() if len(self) > 1 else None
         return html_table(f"Run {self.folder}", {**rows, "report": self.report}, picture)
@@ -168,7 +167,7 @@ class Epoch:
     @property
     def folder(self) -> Path:
         """Of the epoch's own files."""
-        return self.run.folder / f"epoch_{self.number:03d}"
+        return self.run._files.epoch_folder(self.number)
 
     def file(self, kind: str, suffix: str) -> Path:
         """A file of the epoch in the run's folder; raises InputError where the run has none."""
@@ -200,17 +199,17 @@ class Epoch:
     @property
     def points(self) -> Points:
         """The sensor's points."""
-        return Points.of(read_laz(self.folder / "points.laz"))
+        return Points.of(self.run._files.points(self.number))
 
     @property
     def surface(self) -> Mesh:
         """The reconstructed mesh."""
-        return self._mesh("surface")
+        return Mesh.of(self.run._files.surface(self.number))
 
     @property
     def truth(self) -> Mesh:
         """The wall as it really is."""
-        return self._mesh("truth")
+        return Mesh.of(self.run._files.surface(self.number, "truth"))
 
     @property
     def blocks(self) -> geopandas.GeoDataFrame:
@@ -220,9 +219,11 @@ class Epoch:
     @property
     def statistics(self) -> dict[str, Any]:
         """The differences outside the blocks, SI, and the RMS of the registration."""
-        outside = self.record["statistics"]["outside_blocks"]
-        registration = self.record["registration"]
-        return {"epoch": self.number, **outside, "registration_rms_m": registration and registration["rms_m"]}
+        outside = self.record.get("statistics", {}).get("outside_blocks")
+        if outside is None:
+            raise InputError(f"epoch {self.number} has no statistics", where=str(self.run.folder / RUN_FILE))
+        registration = self.record.get("registration")
+        return {"epoch": self.number, **outside, "registration_rms_m": registration and registration.get("rms_m")}
 
     def summary(self) -> str:
         """One line."""
@@ -245,18 +246,12 @@ class Epoch:
         save_gltf(ExportedRun(self.run.folder), self.number, Path(path))
         return Path(path)
 
-    def _mesh(self, name: str) -> Mesh:
-        path = self.folder / f"{name}.ply"
-        if not path.is_file():
-            raise InputError(f"the run did not write {name}.ply", where=str(self.folder), remedy="see `products` in the config")
-        return Mesh.read(path)
-
     def __repr__(self) -> str:
         return f"<Epoch {self.number} of {self.run!r}>"
 
     def _repr_html_(self) -> str:
         title = f"Epoch {self.number} of {self.run.folder}"
-        rows = {"points": f"{self.record['points']:,}"} | ({"": self.summary()} if self.number else {})
+        rows = {"points": f"{self.record.get('points', 0):,}"} | ({"": self.summary()} if self.number else {})
         return html_table(title, rows, self.plot())
 
 
@@ -267,11 +262,12 @@ def _blocks(epochs: list[Epoch]) -> geopandas.GeoDataFrame:
         images = {image["id"] for image in annotations["images"] if image["epoch"] == epoch.number}
         annotated = {each["block"] for each in annotations["annotations"] if each["image_id"] in images}
         for block in epoch.record["blocks"]:
+            world = block.get("world_position_m") or epoch.run.frame.to_world(np.array(block["position_m"])).tolist()
             measured = {name: block[name] for name in ("measured_volume_m3", "measured_area_m2", "measured_mean_depth_m")}
             rows.append({
                 "epoch": epoch.number, "block": block["label"], "shape": block["shape"], "volume_m3": block["volume_m3"],
                 **spread_out("size", block["size_m"]), **measured, **spread_out("position", block["position_m"]),
-                **spread_out("world", block["world_position_m"]), "annotated": block["label"] in annotated,
+                **spread_out("world", world), "annotated": block["label"] in annotated,
             })  # fmt: skip
             bounds.append([block["bbox_m"][place] for place in (0, 1, 3, 4)])
     return boxes(rows, bounds, _COLUMNS)

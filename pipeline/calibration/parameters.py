@@ -53,6 +53,15 @@ class Parameters:
             plain["orientation"] = _orientation(self.base.noise.orientation, found)
         return self.base.model_copy(update={"noise": noise.model_copy(update=plain)})
 
+    def meaning(self, name: str) -> str:
+        """What a parameter is, in the words of the config, without its unit."""
+        if name == ORIENTATION:
+            return "all sigmas of the orientation, as a multiple of the config's"
+        section, _, key = name.rpartition(".")
+        held = getattr(self.base.noise, section) if section else self.base.noise
+        words = (type(held).model_fields[key].description or key).partition(" [")[0]
+        return f"standard deviation: {words}" if section else words
+
     def values(self, logarithms: FloatArray) -> FloatArray:
         """(..., k) values of logarithms, within the bounds."""
         return np.clip(np.exp(logarithms), self.low, self.high)

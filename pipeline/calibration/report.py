@@ -122,6 +122,7 @@ def write_calibration_report(path: Path, result: CalibrationResult, shown: Pictu
     """Write report.html, whole or not at all."""
     page = template("calibration/report.html.jinja").render(
         title=f"Noise of a {_INSTRUMENTS[result.sensor]}, calibrated",
+        answer=_answer(result),
         summary=_sentence(result),
         warnings=warnings(result),
         tables=_tables(result),
@@ -133,6 +134,13 @@ def write_calibration_report(path: Path, result: CalibrationResult, shown: Pictu
 
 def _maps(count: int) -> str:
     return f"{count} difference map{'' if count == 1 else 's'}"
+
+
+def _answer(result: CalibrationResult) -> str:
+    """The fitted values, for a reader who wants nothing else."""
+    values = [f"{result.parameters.meaning(name)}: {text}" for name, text in _values(result)]
+    text = "; ".join(values)
+    return f"{text[0].upper()}{text[1:]}; intervals of {percent(result.confidence, 0)}."
 
 
 def _sentence(result: CalibrationResult) -> str:
@@ -163,8 +171,9 @@ def _with_interval(name: str, value: float, low: float, high: float) -> str:
 def _tables(result: CalibrationResult) -> list[_Table]:
     names = list(result.parameters.names)
     share = percent(result.confidence, 0)
+    fitted = [[result.parameters.meaning(name), name, text] for name, text in _values(result)]
     tables = [
-        _Table(f"Fitted values with intervals of {share}.", ["parameter", "value"], [list(row) for row in _values(result)]),
+        _Table(f"Fitted values with intervals of {share}.", ["noise", "key", "value"], fitted),
         _Table(
             "Correlations of the errors of the estimate: near 1 in magnitude, only a combination is known.",
             ["", *names],

@@ -27,6 +27,7 @@ from pydantic import Field
 from pipeline.change.difference import SurfaceRaster
 from scene.config import Config
 from scene.errors import InputError
+from scene.extras import how_to_install
 from scene.grid import Grid
 from scene.mesh import WALL, FloatArray, IntArray
 
@@ -35,7 +36,7 @@ _LEAST_POINTS = 2
 
 
 class M3c2Config(Config):
-    """M3C2 by py4dgeo (`pip install scarpsim[m3c2]`)."""
+    """M3C2 by py4dgeo (extra `m3c2`)."""
 
     core_step_px: int = Field(5, ge=1, description="core points: every so many pixels of the difference map, both ways")
     normal_radius_m: float = Field(0.25, gt=0, description="radius of the neighbourhood that normals are fitted in")
@@ -132,8 +133,6 @@ def _py4dgeo() -> Any:
     try:
         import py4dgeo
     except ImportError as error:
-        raise InputError(
-            f"needs py4dgeo, which does not load ({error})", where="m3c2", remedy="pip install 'scarpsim[m3c2]'"
-        ) from None
+        raise InputError(f"needs py4dgeo, which does not load ({error})", where="m3c2", remedy=how_to_install("m3c2")) from None
     logging.getLogger("py4dgeo").setLevel(logging.WARNING)
     return py4dgeo

@@ -19,6 +19,7 @@ from pipeline.cli import system_libraries
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options
 from scene.errors import InputError
+from scene.extras import how_to_install
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -126,7 +127,7 @@ def _extras() -> Iterator[Finding]:
         names = [each.name for each in marked if each.marker and each.marker.evaluate({"extra": extra})]
         absent = [name for name in names if not _is_installed(name)]
         found = f"{purpose}; " + (f"not installed: {', '.join(absent)}, {size} with what they need" if absent else "installed")
-        yield Finding(f"extra {extra}", None, found, f"pip install 'scarpsim[{extra}]'" if absent else "")
+        yield Finding(f"extra {extra}", None, found, how_to_install(extra) if absent else "")
 
 
 def _is_installed(name: str) -> bool:

@@ -37,10 +37,14 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.formats.atomic import empty_folder, new_folder
     from pipeline.planning.inspect import PLAN_FILE, inspect, write_plans
     from pipeline.planning.report import summary
+    from pipeline.report.progress import shown_progress
 
     config = load_config(config_path("sites", arguments.config), arguments.overrides, arguments.sensor, arguments.seed)
     sensors = [arguments.sensor] if arguments.sensor else config.sensor_names()
     out = empty_folder(arguments.out or new_folder(Path("runs"), "inspect"))
-    plans = inspect(config, sensors)
-    report = write_plans(out, config, plans)
+    with shown_progress(quiet=arguments.quiet) as progress:
+        progress.plan({"report": 6.0})
+        plans = inspect(config, sensors, progress)
+        with progress.stage("report"):
+            report = write_plans(out, config, plans)
     return Answer("\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]), recorded(report, PLAN_FILE))

@@ -33,7 +33,7 @@ The folder of a split is the folder of its images; `file_name` is relative to it
     import fiftyone as fo                                   # FiftyOne
     fo.Dataset.from_dir(dataset_type=fo.types.COCODetectionDataset, data_path="{split}", labels_path="{split}/annotations.json")
 
-    from pipeline.dataset.loaders import Tiles              # scarpsim: NumPy and tf.data
+    from pipeline import Tiles                              # scarpsim: NumPy and tf.data
     for sample in Tiles("{split}", noise="{noise}"): ...    # sample.image (h, w), sample.valid, sample.boxes, sample.masks
     Tiles("{split}").tf_dataset().shuffle(100).prefetch(2)
 """

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.dataset import standstill
 from pipeline.dataset.worker import Order, fill_run
 from scene.errors import InputError, OutsideError
+from scene.extras import how_to_install
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
@@ -82,8 +83,8 @@ def _require_distributed(where: str) -> None:
         import cryptography  # noqa: F401
         import distributed  # noqa: F401
     except ImportError as error:
-        remedy = "install them: pip install 'scarpsim[dataset]'"
-        raise InputError(f"needs Dask's distributed and cryptography ({error})", where=where, remedy=remedy) from None
+        problem = f"needs Dask's distributed and cryptography ({error})"
+        raise InputError(problem, where=where, remedy=how_to_install("dataset")) from None
 
 
 def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from scene.errors import InputError
+from scene.extras import how_to_install
 
 _MODULES = {"tensorflow": "tensorflow", "jax": "jax", "torch": "torch"}
 
@@ -38,7 +39,7 @@ def check_installed() -> str:
         raise InputError(
             f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not installed",
             where="the detector",
-            remedy="install the extra: uv sync --extra detect (in a checkout), or pip install 'scarpsim[detect]'",
+            remedy=how_to_install("detect"),
         )
     return backend
 

@@ -14,6 +14,7 @@ from pipeline.export.exported_set import splits_of
 from pipeline.formats.atomic import filling, write_text
 from pipeline.report.progress import Progress
 from scene.errors import InputError
+from scene.extras import how_to_install
 
 _TILES_A_FILE = 256
 _NAMES = {"train": "train", "val": "validation", "test": "test"}
@@ -80,7 +81,7 @@ def _library() -> Any:
         raise InputError(
             f"needs the library datasets, which does not load ({error})",
             where="export huggingface",
-            remedy="pip install 'scarpsim[huggingface]', or uv sync --extra huggingface in a checkout",
+            remedy=how_to_install("huggingface"),
         ) from None
     return datasets
 

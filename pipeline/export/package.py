@@ -22,11 +22,16 @@ _MEDIA = {
 def package(folder: Path) -> dict[str, Any]:
     """The package of all files in a folder but hidden ones and itself, by path: size, bytes, and SHA-256.
 
-    Raises InputError where there is nothing to list.
+    Raises InputError where there is nothing to list, and for a link to what lies outside: it would not come along.
     """
     if not folder.is_dir():
         raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_listed(path.relative_to(folder))]
+    found = [path for path in sorted(folder.rglob("*")) if _is_listed(path.relative_to(folder))]
+    for path in found:
+        if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+            problem = f"is a link out of the folder, to {path.resolve()}"
+            raise InputError(problem, where=str(path), remedy="put what it points to in its place, or take it away")
+    files = [path for path in found if path.is_file()]
     if not files:
         raise InputError("holds no file", where=str(folder), remedy="give the folder that a command filled")
     return {"$schema": _PROFILE, "name": _slug(folder.resolve().name), "resources": [_resource(folder, path) for path in files]}

@@ -23,7 +23,7 @@ from pipeline.report.page import litres, millimetres
 from pipeline.report.plain_text import plain_text
 from pipeline.report.progress import Progress
 from scene.errors import InputError
-from scene.mesh import FloatArray
+from scene.mesh import FloatArray, TriangleMesh
 
 _DPI = 100
 _TITLE_PX, _BAR_PX = 46, 78
@@ -38,15 +38,20 @@ _NIGHT, _BEAM = 26, np.array([255, 150, 30], dtype=np.uint8)
 
 def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -> None:
     """Write an epoch's wall as PNG, coloured by the difference, its largest blocks numbered as in the report."""
-    write_bytes(path, _png(_epoch_picture(run, number, _view(run, width), _limit(run, number))))
+    reference = run.surface(0)
+    view = PerspectiveView.on(reference.vertices, width)
+    drawn = _reference_picture(reference, view, run.limit_m(1)) if number == 0 else _epoch_picture(run, number, view)
+    write_bytes(path, _png(drawn))
 
 
 def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
     """Write the epochs, the reference first, as an animated GIF on one scale of colours."""
     numbers = range(1, run.last + 1)
-    view, limit = _view(run, _ANIMATED_PX), max(run.limit_m(number) for number in numbers)
+    limit = max(run.limit_m(number) for number in numbers)
     with progress.stage("reference"):
-        frames = [_epoch_picture(run, 0, view, limit)]
+        reference = run.surface(0)
+        view = PerspectiveView.on(reference.vertices, _ANIMATED_PX)
+        frames = [_reference_picture(reference, view, limit)]
     for number in numbers:
         with progress.stage(f"epoch {number}"):
             frames.append(_epoch_picture(run, number, view, limit))
@@ -93,17 +98,13 @@ def _cloud_pixels(view: PerspectiveView, places: FloatArray, start: int, end: in
     return pixels
 
 
-def _view(run: ExportedRun, width: int) -> PerspectiveView:
-    return PerspectiveView.on(run.surface(0).vertices, width)
+def _reference_picture(surface: TriangleMesh, view: PerspectiveView, limit: float) -> Image.Image:
+    return _framed(draw_wall(view, surface, None, None, limit), "Reference: before rocks fall", limit)
 
 
-def _limit(run: ExportedRun, number: int) -> float:
-    return run.limit_m(max(number, 1))
-
-
-def _epoch_picture(run: ExportedRun, number: int, view: PerspectiveView, limit: float) -> Image.Image:
-    if number == 0:
-        return _framed(draw_wall(view, run.surface(0), None, None, limit), "Reference: before rocks fall", limit)
+def _epoch_picture(run: ExportedRun, number: int, view: PerspectiveView, limit: float | None = None) -> Image.Image:
+    """limit: where the colours end, m; none: where those of the epoch's own map do."""
+    limit = run.limit_m(number) if limit is None else limit
     values, grid = run.difference(number)
     blocks = run.blocks(number)
     volume, noise = sum(block["volume_m3"] for block in blocks), millimetres(run.limit_m(number) / SCALE_SIGMAS)

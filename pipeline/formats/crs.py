@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from scene.errors import InputError
+from scene.extras import how_to_install
 
 
 def wkt_of(name: str, where: str) -> str:
@@ -14,7 +15,7 @@ def wkt_of(name: str, where: str) -> str:
         from pyproj import CRS
         from pyproj.exceptions import CRSError
     except ImportError:
-        raise InputError("needs pyproj, which is not installed", where=where, remedy="pip install 'scarpsim[crs]'") from None
+        raise InputError("needs pyproj, which is not installed", where=where, remedy=how_to_install("crs")) from None
     try:
         crs = CRS.from_user_input(name)
     except (CRSError, UnicodeError) as error:

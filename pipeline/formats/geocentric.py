@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from scene.errors import InputError
+from scene.extras import how_to_install
 from scene.mesh import FloatArray
 
 _EARTH_M = 6.3e6, 6.45e6
@@ -66,7 +67,7 @@ class Projection:
             raise InputError(
                 "holds poses in geocentric coordinates, and pyproj is not installed, which takes them to the survey's",
                 where=self.where,
-                remedy=f"pip install pyproj (the extra `crs`), or {_REMEDY}",
+                remedy=f"{how_to_install('crs')}, or {_REMEDY}",
             ) from None
         try:
             crs = CRS.from_user_input(self.text)

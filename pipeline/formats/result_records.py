@@ -39,10 +39,20 @@ _Row = Annotated[list[_Coordinate], Field(min_length=4, max_length=4)]
 class _Registration(_Record):
     rotation: _Rotation
     translation_m: _Vector
+    rms_m: float | None = None
+
+
+class _Differences(_Record):
+    """None: of no pixel."""
+
+    count: int
+    median_m: float | None
+    nmad_m: float | None
 
 
 class _Statistics(_Record):
     sigma_m: float = Field(gt=0, le=_FARTHEST_M)
+    outside_blocks: _Differences | None = None
 
 
 class _Block(_Record):
@@ -52,6 +62,7 @@ class _Block(_Record):
     volume_m3: float
     bbox_m: _Box
     position_m: _Vector
+    world_position_m: _Vector | None = None
     measured_area_m2: float
     measured_volume_m3: float
     measured_mean_depth_m: float | None
@@ -65,6 +76,7 @@ class _WallFrame(_Record):
 
 class _EpochRecord(_Record):
     epoch: int = Field(ge=0, le=9999)
+    points: int = Field(0, ge=0)
     registration: _Registration | None = None
     statistics: _Statistics | None = None
     blocks: list[_Block] = []
@@ -93,6 +105,21 @@ class _RunRecord(_Record):
     products: dict[Annotated[str, StringConstraints(pattern=r"^epoch_\d+$")], dict[str, str]] = {}
 
 
+class _RunImage(_Record):
+    id: int
+    epoch: int
+
+
+class _RunAnnotation(_Record):
+    image_id: int
+    block: int
+
+
+class _RunAnnotations(_Record):
+    images: list[_RunImage]
+    annotations: list[_RunAnnotation]
+
+
 class _Change(_Record):
     bbox_m: _Box
     volume_m3: float
@@ -118,6 +145,13 @@ def read_run(path: Path, remedy: str) -> dict[str, Any]:
     parse(_RunRecord, values, str(path))
     epochs = [{"blocks": [], **_without_null(each, "statistics")} for each in values.get("epochs", [])]
     return {**_without_null(values, "wall", "wall_frame"), "epochs": epochs}
+
+
+def read_annotations(path: Path) -> dict[str, Any]:
+    """annotations.json of a run, whose images know their epoch and annotations their block; raises InputError for others."""
+    values = read_json(path, remedy="make the run again")
+    parse(_RunAnnotations, values, str(path))
+    return dict(values)
 
 
 def _without_null(values: dict[str, Any], *names: str) -> dict[str, Any]:

@@ -12,16 +12,29 @@ from pipeline.formats.geotiff import write_geotiff
 from pipeline.planning.maps import Plan, plans
 from pipeline.planning.report import write_plan_report
 from pipeline.report.map_styles import quantity_style
+from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
 from pipeline.run.site import prepare_site
 from scene.keyed_random import KeyedRandom
 
 PLAN_FILE, REPORT_FILE = "plan.json", "report.html"
+_WALL_S, _MAPS_S = 2.0, 4.0
+"""Seconds that stages take, for the plan of the progress."""
 
 
-def inspect(config: SimulationConfig, sensors: Sequence[SensorName]) -> list[Plan]:
+def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: Progress | None = None) -> list[Plan]:
     """What each sensor promises on the config's wall; nothing is simulated."""
-    return [each for sensor in sensors for each in plans(config, prepare_site(config, sensor, KeyedRandom(config.seed)))]
+    progress = progress or Progress()
+    progress.plan(
+        {f"{sensor}: {stage}": seconds for sensor in sensors for stage, seconds in (("wall", _WALL_S), ("maps", _MAPS_S))}
+    )
+    found: list[Plan] = []
+    for sensor in sensors:
+        with progress.stage(f"{sensor}: wall"):
+            site = prepare_site(config, sensor, KeyedRandom(config.seed))
+        with progress.stage(f"{sensor}: maps"):
+            found += plans(config, site)
+    return found
 
 
 def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> Path:

@@ -20,6 +20,7 @@ from pydantic import Field
 
 from scene.config import Config
 from scene.errors import InputError
+from scene.extras import how_to_install
 from scene.mesh import FloatArray, IntArray, TriangleMesh, area_normals
 from sensors.observation import Observation
 
@@ -264,7 +265,7 @@ def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[Flo
     try:
         import open3d  # takes seconds to load and is needed here only
     except ImportError as error:
-        remedy = "uv sync --extra poisson in a checkout, or pip install 'scarpsim[poisson]'"
+        remedy = how_to_install("poisson")
         raise InputError(f"poisson needs Open3D, which does not load ({error})", where="surface.method", remedy=remedy) from None
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

@@ -24,6 +24,7 @@ from pipeline.surface.depth_maps import DepthMap, normals, pinhole
 from pipeline.surface.mesh import SurfaceConfig, labelled_surface, octree_depth
 from scene.config import Config
 from scene.errors import InputError
+from scene.extras import how_to_install
 from scene.mesh import FloatArray, IntArray, TriangleMesh
 
 Reconstruction = Literal["direct", "vertices", "colmap"]
@@ -111,8 +112,8 @@ def _pycolmap() -> Any:
     try:
         import pycolmap  # an extra, and needed here only
     except ImportError:
-        remedy = "uv sync --extra colmap, or pip install pycolmap"
-        raise InputError("needs the package pycolmap", where="reconstruction: colmap", remedy=remedy) from None
+        problem, where = "needs the package pycolmap", "reconstruction: colmap"
+        raise InputError(problem, where=where, remedy=how_to_install("colmap")) from None
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 

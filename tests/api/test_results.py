@@ -18,9 +18,11 @@ import trimesh
 import xarray
 
 from pipeline import Mesh, Points, Run, SimulationConfig, configure, detect, open_run, plan, simulate
+from pipeline.api import detecting, planning
 from pipeline.api.maps import raster_of
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.laz import read_laz
+from pipeline.report.progress import Progress
 from scene import InputError
 
 TINY: dict[str, Any] = {
@@ -151,6 +153,43 @@ def test_an_opened_run_is_the_same(run: Run, tmp_path: Path) -> None:
         run[2]
 
 
+@pytest.mark.parametrize(
+    ("file", "keys", "value", "problem", "use"),
+    [
+        ("run.json", ["sensor"], "sonar", r"run\.json: 'sensor': .* got 'sonar'", lambda run: run.sensor),
+        ("run.json", ["wall_frame", "origin_m"], [0, 0], r"wall_frame\.origin_m", lambda run: run.frame),
+        ("run.json", ["epochs", 1, "blocks", 0, "bbox_m"], "wide", r"bbox_m", lambda run: run.blocks),
+        ("run.json", ["epochs", 1, "statistics", "outside_blocks"], {"count": 3}, "median_m", lambda run: run.statistics),
+        ("run.json", ["epochs", 1, "statistics"], None, "no statistics", lambda run: run.statistics),
+        ("annotations.json", ["images", 0, "epoch"], "first", "epoch", lambda run: run.blocks),
+    ],
+)
+def test_a_record_is_checked_where_it_is_read(
+    run: Run, tmp_path: Path, file: str, keys: list[str | int], value: Any, problem: str, use: Any
+) -> None:
+    for name in ("run.json", "annotations.json"):
+        record = json.loads((run.folder / name).read_text())
+        if name == file:
+            part = record
+            for key in keys[:-1]:
+                part = part[key]
+            part[keys[-1]] = value
+        (tmp_path / name).write_text(json.dumps(record))
+    with pytest.raises(InputError, match=problem):
+        use(Run(tmp_path))
+
+
+def test_blocks_of_a_run_that_does_not_hold_their_place_in_the_world(run: Run, tmp_path: Path) -> None:
+    """As those before November 2026: told by the wall frame."""
+    record = json.loads((run.folder / "run.json").read_text())
+    for block in record["epochs"][1]["blocks"]:
+        del block["world_position_m"]
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    (tmp_path / "annotations.json").write_bytes((run.folder / "annotations.json").read_bytes())
+    place = ["world_x_m", "world_y_m", "world_z_m"]
+    assert np.allclose(Run(tmp_path).blocks[place], run.blocks[place], rtol=0, atol=1e-9)
+
+
 def test_detections_of_a_run_and_of_its_map_are_the_same(run: Run, tmp_path: Path) -> None:
     of_run = detect(run, "baseline", confidence=0.5, out=tmp_path / "found", progress=False)
     of_map = detect([run[1].difference], "baseline", confidence=0.5, progress=False)
@@ -166,8 +205,23 @@ def test_detections_of_a_run_and_of_its_map_are_the_same(run: Run, tmp_path: Pat
         detect(run, "baseline", confidence=1.5)
 
 
-def test_a_plan_says_where_which_block_is_seen() -> None:
-    found = plan(None, "tls", planning__gsd_m=0.2, **TINY)[0]
+def test_a_detector_says_what_it_waits_for(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Progress()
+
+    def stop(*_: Any) -> None:
+        raise InputError(shown.current)
+
+    monkeypatch.setattr(detecting, "python_progress", lambda show: shown)
+    monkeypatch.setattr(detecting, "_in_another_process", stop)
+    with pytest.raises(InputError, match="TensorFlow, which takes"):
+        detect(run)
+
+
+def test_a_plan_says_where_which_block_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Progress()
+    monkeypatch.setattr(planning, "python_progress", lambda show: shown if show else Progress())
+    found = plan(None, "tls", planning__gsd_m=0.2, progress=True, **TINY)[0]
+    assert list(shown.timings) == ["tls: wall", "tls: maps"]
     maps = found.maps
     assert maps.smallest_block_m.attrs["units"] == "m"
     assert maps.incidence_rad.attrs["units"] == "rad"
@@ -209,7 +263,7 @@ def test_mistakes_are_said_in_one_line(call: Any, problem: str, tmp_path: Path, 
 
 def test_a_missing_library_names_its_extra(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
     monkeypatch.setitem(sys.modules, "rioxarray", None)
-    with pytest.raises(InputError, match=r"pip install 'scarpsim\[notebook\]'"):
+    with pytest.raises(InputError, match="make setup EXTRAS=notebook"):
         _ = run[1].difference
 
 

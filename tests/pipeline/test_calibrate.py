@@ -17,7 +17,7 @@ from pipeline.calibration.calibrate import calibrate_material
 from pipeline.calibration.greedy import greedy
 from pipeline.calibration.inputs import CalibrationInputs
 from pipeline.calibration.maps import noise_map
-from pipeline.calibration.parameters import Parameters, parameters
+from pipeline.calibration.parameters import _ALLOWED, Parameters, parameters
 from pipeline.calibration.reobserve import Reobserver
 from pipeline.calibration.search import NoiseSearch
 from pipeline.calibration.signature import Signature
@@ -323,3 +323,14 @@ def test_known_noise_of_another_wall_and_seed_comes_back(seed: int) -> None:
     found = calibrate_material(config, "tls", material, Progress(), with_greedy=False).found
     off = (found.x - np.log(truth)) / ((found.high - found.low) / 2)
     assert np.abs(off).max() < 2
+
+
+def test_every_parameter_has_words() -> None:
+    stereo = StereoModel.model_validate({"noise": {"orientation": {"k1": {"sigma": 1e-5}}}})
+    allowed = {"tls": TlsModel(), "stereo": stereo}
+    for sensor, model in allowed.items():
+        names = _ALLOWED[sensor]
+        told = [Parameters(model, names, np.ones(len(names)), np.ones(len(names))).meaning(name) for name in names]
+        assert not any(text == name or "[" in text for text, name in zip(told, names, strict=True))
+    words = Parameters(stereo, ("orientation.k1",), np.ones(1), np.ones(1)).meaning("orientation.k1")
+    assert words == "standard deviation: radial distortion, r^2"

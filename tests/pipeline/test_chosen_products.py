@@ -87,5 +87,5 @@ def test_a_wrong_system_is_told_before_anything_is_simulated(crs: str, problem: 
 
 def test_without_pyproj_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyproj", None)
-    with pytest.raises(InputError, match=r"scarpsim\[crs\]"):
+    with pytest.raises(InputError, match="make setup EXTRAS=crs"):
         simulate(configure(products={"crs": "EPSG:28356"}), "tls", out=tmp_path / "run", progress=False)

@@ -48,7 +48,7 @@ def test_an_extra_that_is_not_there_is_no_problem_and_says_its_size(monkeypatch:
     found = {finding.name: finding for finding in doctor._extras()}
     assert found["extra detect"].ok is None
     assert "not installed: nonesuch, 2.0 GB" in found["extra detect"].found
-    assert found["extra detect"].remedy == "pip install 'scarpsim[detect]'"
+    assert found["extra detect"].remedy.startswith("make setup EXTRAS=detect, in /")
     assert found["extra crs"].found.endswith("installed")
     assert not found["extra crs"].remedy
 

@@ -27,6 +27,7 @@ from pipeline.export.yolo import grey_values, outline
 from pipeline.formats.atomic import write_json
 from pipeline.formats.geotiff import read_tiff, write_geotiff
 from pipeline.formats.ply import read_ply
+from pipeline.formats.run_files import RunFiles
 from pipeline.run.simulation import simulate
 from scene.config import parse
 from scene.grid import Grid
@@ -81,7 +82,11 @@ def test_a_run_as_picture_and_animations(run: Path, tmp_path: Path, monkeypatch:
     assert export(run, "picture", "--epoch", 2, "--width", 400, "--out", tmp_path / "a.png") == 0
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.width == 400
+    read: list[int] = []
+    surface = RunFiles.surface
+    monkeypatch.setattr(RunFiles, "surface", lambda self, number: read.append(number) or surface(self, number))
     assert export(run, "epochs", "--out", tmp_path / "a.gif") == 0
+    assert read == [0, 1, 2]
     with Image.open(tmp_path / "a.gif") as animation:
         assert animation.n_frames == 3  # the reference and two epochs
     assert export(run, "scan", "--out", tmp_path / "b.gif") == 0
@@ -124,6 +129,21 @@ def test_a_package_lists_every_file_with_its_checksum(run: Path, tmp_path: Path)
     assert listed["difference_001.tif"]["hash"] == f"sha256:{hashlib.sha256(data).hexdigest()}"
     assert listed["difference_001.tif"]["bytes"] == len(data)
     assert len({each["name"] for each in made["resources"]}) == len(listed)
+
+
+def test_a_package_refuses_links_out_of_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, other = tmp_path / "result", tmp_path / "other"
+    for each in (folder, other):
+        each.mkdir()
+        (each / "a.json").write_text("{}")
+    (folder / "b.json").symlink_to("a.json")
+    assert export(folder, "package") == 0
+    for name, target in (("c.json", other / "a.json"), ("d", other)):
+        link = folder / name
+        link.symlink_to(target)
+        assert export(folder, "package", "--out", tmp_path / "package.json") == 2
+        assert f"{link}: is a link out of the folder, to {target}" in capsys.readouterr().err
+        link.unlink()
 
 
 @pytest.mark.parametrize(
@@ -224,5 +244,5 @@ def test_hugging_face_without_its_library_is_told_in_one_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "datasets", None)
     assert export(tiles, "huggingface", "--out", tmp_path / "hub") == 2
-    assert "pip install 'scarpsim[huggingface]'" in capsys.readouterr().err
+    assert "make setup EXTRAS=huggingface" in capsys.readouterr().err
     assert not (tmp_path / "hub").exists()

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import get_args
+
+import numpy as np
 import pytest
 
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.report.advice import advice, page_of
-from pipeline.gap.report.in_words import decimal, number, rounded, with_unit
+from pipeline.gap.report.in_words import _COVARIATES, decimal, number, rounded, with_unit
+from pipeline.gap.residuals import stereo_residuals, tls_residuals
 from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
+from sensors.effects.angle_empirical import AngleEmpirical
 from sensors.effects.base import Effect
+from sensors.effects.disparity_empirical import DisparityEmpirical
+from sensors.effects.range_empirical import RangeEmpirical
 
 
 @pytest.mark.parametrize(
@@ -29,8 +37,24 @@ def test_rounding_goes_into_tables_and_leaves_all_but_fractions_alone() -> None:
 
 
 def test_covariates_have_the_unit_of_their_sensor() -> None:
-    assert [with_unit("edge_step", sensor) for sensor in ("tls", "stereo")] == ["edge_step, m", "edge_step, px"]
+    assert [with_unit("edge_step", sensor) for sensor in ("tls", "stereo")] == [
+        "step beside the point, m",
+        "step beside the point, px",
+    ]
     assert with_unit("zenith", "tls") == "zenith, rad"
+
+
+def test_every_covariate_has_words() -> None:
+    """Those of the residuals of both sensors, and those that empirical effects may be written along."""
+    one, axis = np.ones(3), np.tile([0.0, 0.0, 1.0], (3, 1))
+    rays = SimpleNamespace(range_m=one, azimuth=one, zenith=one, cos_incidence=one, power=one, line=one, share=one)
+    pixels = SimpleNamespace(point=axis, normal=axis, u=one, v=one, radius=one, disparity=one, found=one)
+    pair = SimpleNamespace(pair=SimpleNamespace(left=SimpleNamespace(position=np.zeros(3))))
+    names = {*tls_residuals._covariates(rays, one), *stereo_residuals._covariates(pair, pixels, one, one), "log_power"}
+    for kind in (RangeEmpirical, DisparityEmpirical, AngleEmpirical):
+        names |= set(get_args(kind.model_fields["covariate"].annotation))
+    assert names <= set(_COVARIATES)
+    assert not any("_" in words or "_" in unit for words, unit in _COVARIATES.values())
 
 
 @pytest.mark.parametrize("effect", [*TLS_EFFECTS, *STEREO_EFFECTS], ids=lambda effect: effect.__name__)

@@ -127,6 +127,6 @@ def test_without_pyproj_the_cause_and_both_ways_out_are_named(tmp_path: Path, mo
     monkeypatch.setattr(builtins, "__import__", absent)
     path = written(tmp_path / "cameras.xml", np.radians(9.0), UTM)
     with pytest.raises(
-        InputError, match=r"geocentric coordinates, and pyproj is not installed.*pip install pyproj.*convert the chunk"
+        InputError, match=r"geocentric coordinates, and pyproj is not installed.*make setup EXTRAS=crs.*convert the chunk"
     ):
         read_metashape(path)

@@ -66,4 +66,4 @@ def test_without_open3d_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "open3d", None)
     words = ["--seen-from", *map(str, STATION), "--out", str(tmp_path / "wall.ply")]
     assert cli.main(["surface", str(cloud), *words]) == 2
-    assert "scarpsim[poisson]" in capsys.readouterr().err
+    assert "make setup EXTRAS=poisson" in capsys.readouterr().err

@@ -17,11 +17,15 @@ from sensors.effects.base import ShowsIn
 _INSTRUMENTS = {"tls": "ranges of a laser scan", "stereo": "disparities of a stereo pair"}
 _STATISTICS = {"mean": "mean", "spread": "spread", "shape": "outliers", "missing": "lost returns"}
 _CLEAR = 0.01
-_UNITS = {
-    "range": "m", "depth": "m", "azimuth": "rad", "zenith": "rad", "incidence": "rad", "image_x": "px",
-    "image_y": "px", "radius": "px", "disparity": "px", "intensity": "ln of power over its median", "line": "number",
-    "time": "share of the scan", "disparity_fraction": "px", "log_power": "ln of relative power",
+_COVARIATES = {
+    "range": ("range", "m"), "depth": ("depth", "m"), "azimuth": ("azimuth", "rad"), "zenith": ("zenith", "rad"),
+    "incidence": ("incidence", "rad"), "image_x": ("image x", "px"), "image_y": ("image y", "px"),
+    "radius": ("distance from the image's middle", "px"), "disparity": ("disparity", "px"),
+    "disparity_fraction": ("fraction of the disparity", "px"), "intensity": ("intensity", "ln of power over its median"),
+    "line": ("scan line", "number"), "time": ("time", "share of the scan"),
+    "log_power": ("expected power", "ln of power over that at 100 m"), "edge_step": ("step beside the point", ""),
 }  # fmt: skip
+"""A covariate in words, and the unit of its values; "": the observable's."""
 
 
 def title(found: GapDiagnosis) -> str:
@@ -87,14 +91,14 @@ def _shown_most(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     first = (clear or rows)[0]
     statistic = _STATISTICS[first["statistic"]]
     if not found.effects:
-        what = first["covariate"].replace("_", " ")
+        what = in_words(first["covariate"])
         region = " to ".join(number(first["region"][key]) for key in ("from", "to"))
         size = f"{number(1e3 * abs(first['size_m']), 2)} mm"
         size = f"{100 * first['share_lost']:.0f} % lost" if first["statistic"] == "missing" else size
         return f"It shows most in the {statistic} against {what}, from {region}: {size} there."
     if not clear:
         return ""
-    seen = [row["covariate"].replace("_", " ") for row in clear[:3] if row["statistic"] == first["statistic"]]
+    seen = [in_words(row["covariate"]) for row in clear[:3] if row["statistic"] == first["statistic"]]
     return f"Before anything was named it showed most in the {statistic} against {listed(seen)}."
 
 
@@ -132,7 +136,13 @@ def listed(words: Sequence[str]) -> str:
 
 def with_unit(covariate: str, sensor: str) -> str:
     """A covariate as a report shows it, with the unit of its values."""
-    return f"{covariate}, {_UNITS.get(covariate, 'm' if sensor == 'tls' else 'px')}"
+    _, unit = _COVARIATES.get(covariate, ("", ""))
+    return f"{in_words(covariate)}, {unit or ('m' if sensor == 'tls' else 'px')}"
+
+
+def in_words(covariate: str) -> str:
+    """A covariate as a sentence has it."""
+    return _COVARIATES[covariate][0] if covariate in _COVARIATES else covariate.replace("_", " ")
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -180,7 +190,7 @@ def _effect(effect: Named) -> str:
 
 
 def _described(effect: Named) -> str:
-    covariates = [effect.entry[key] for key in ("covariate", "second") if effect.entry.get(key)]
+    covariates = [in_words(effect.entry[key]) for key in ("covariate", "second") if effect.entry.get(key)]
     if covariates:
         return f"depends on {listed(covariates)}"
     lost = effect.effect.shows_in == ShowsIn.RETURNS
