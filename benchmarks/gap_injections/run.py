@@ -32,10 +32,18 @@ from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.residuals.registration import registered, residuals_of
 from scene.errors import InputError
 
+_ROUNDS = 3
+_NOISES = {
+    "tls.range_noise": "range_sigma_m",
+    "tls.angle_noise": "angle_sigma_rad",
+    "stereo.parallax_noise": "parallax_sigma_px",
+}
+"""White noises that a model has as such."""
+
 
 def base_folder(name: str, out: Path) -> Path:
-    """The folder of a measurement without an effect, with the white noise that its own diagnosis proposes; made and diagnosed
-    the first time. What else that diagnosis says stays open."""
+    """The folder of a measurement without an effect, with the white noise that its own diagnoses propose; made and diagnosed the
+    first time. What else they say stays open."""
     folder = out / "bases" / name
     answer = out / "answers" / f"{name}.json"
     if folder.exists() and answer.exists():
@@ -43,27 +51,30 @@ def base_folder(name: str, out: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.parent.mkdir(parents=True, exist_ok=True)
     BASES[name].make(folder)
-    first = diagnosed(folder)
-    found = {"as_it_is": first}
     model = yaml.safe_load((folder / "model.yaml").read_text())
-    noise = _white_noise(first, model.get("noise", {}))
-    if noise:
-        (folder / "model.yaml").write_text(yaml.safe_dump({**model, "noise": {**model.get("noise", {}), **noise}}))
-        found |= {"noise": noise, "as_diagnosed": diagnosed(folder)}
+    said = diagnosed(folder)
+    found: Json = {"as_it_is": said, "noise": {}}
+    for _ in range(_ROUNDS):
+        noise = white_noise(said, model["noise"])
+        if not noise:
+            break
+        model["noise"] |= noise
+        (folder / "model.yaml").write_text(yaml.safe_dump(model))
+        said = diagnosed(folder)
+        found |= {"noise": found["noise"] | noise, "as_diagnosed": said}
     _write(answer, found)
     return folder
 
 
-def _white_noise(said: Json, believed: dict[str, float]) -> dict[str, float]:
+def white_noise(said: Json, believed: dict[str, float]) -> dict[str, float]:
     """Values of a model's noise by what was said of it: too large, or more white noise beside it."""
-    if said["lower_noise"]:
-        return said["lower_noise"]
+    found = dict(said["lower_noise"])
     for each in said["effects"]:
-        key = {"tls.range_noise": "range_sigma_m", "stereo.parallax_noise": "parallax_sigma_px"}.get(each["name"])
+        key = _NOISES.get(each["name"])
         if key:
-            more = each["parameters"][key.replace("range_", "").replace("parallax_", "")]["value"]
-            return {key: float(np.hypot(believed[key], more))}
-    return {}
+            more = [value["value"] for name, value in each["parameters"].items() if "sigma" in name]
+            found[key] = float(np.hypot(found.get(key, believed[key]), max(more)))
+    return found
 
 
 def diagnosed(folder: Path) -> Json:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from change_cases import SIGMA, Array, Box, Scan, draw_boxes, noise, scan
-from gap_cases import STEP, write_scan
+from gap_cases import STEP, smooth_noise, write_scan
 
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.report.report import to_dict
+from pipeline.gap.report.report import summary, to_dict
 from pipeline.gap.residuals.changes import SceneChange, find_changes
 from pipeline.gap.residuals.sight import Sight
 from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
@@ -133,3 +133,17 @@ def test_nine_small_rockfalls_of_a_whole_scan(tmp_path: Path) -> None:
         inside = (boxes[:, 0] < i * STEP) & (i * STEP < boxes[:, 3]) & (boxes[:, 2] < j * STEP) & (j * STEP < boxes[:, 5])
         assert inside.sum() == 1
         assert changes[int(np.argmax(inside))]["volume_m3"] == pytest.approx(depth * STEP**2, rel=0.35)
+
+
+def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Path) -> None:
+    """Every third node of the wall fell by 0.1 to 0.4 m, in clumps: the answer asks for stable areas."""
+    rng = np.random.default_rng(12)
+    clumps = smooth_noise((121, 86), 4.0, rng)
+    fallen = [(int(i), int(j), 0.15 + 0.2 * rng.uniform()) for i, j in np.argwhere(clumps > 0.35)]
+    write_scan(tmp_path, 9, blocks=fallen, step_rad=0.009)
+    found = diagnose(read_measurement(tmp_path))
+    assert found.verdict == "insufficient_data"
+    assert found.evidence.moved > 0.3
+    assert found.effects == ()
+    assert found.remaining["note"].index("name stable_areas") < 400
+    assert "stable_areas in measurement.yaml" in summary(found)

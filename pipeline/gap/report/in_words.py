@@ -32,6 +32,8 @@ def title(found: GapDiagnosis) -> str:
             return "No effect was found to be missing, but the model is too noisy"
         case "no_gap":
             return "No effect is missing"
+        case "insufficient_data" if found.evidence.much_moved:
+            return "Much of the wall moved: nothing can be said of the sensor"
         case "insufficient_data":
             return "Too few data to say what is missing"
         case "unknown" if not found.effects:

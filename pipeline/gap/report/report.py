@@ -112,6 +112,11 @@ def _summary(found: GapDiagnosis) -> str:
 
 def _request(found: GapDiagnosis) -> str:
     """What insufficient_data asks for."""
+    if found.evidence.much_moved:
+        return (
+            "stable_areas in measurement.yaml (boxes or polygons, wall frame, m) where nothing moved, or a reference of the same "
+            "time; what moved is measured as a difference of two epochs, not as an effect of the sensor."
+        )
     return (
         f"at least {found.decisions.points.fewest} points on smooth rock of stable ground, spread over the wall: scan or match "
         "more densely, take in more of the wall, or widen stable_areas (wall frame, m) where they leave out what did not move."

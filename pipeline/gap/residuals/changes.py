@@ -103,6 +103,20 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
     return _measured(label, limited, sight), beside
 
 
+def moved_share(residuals: Residuals, sight: Sight, eligible: BoolArray) -> float:
+    """Share of the eligible points (n,) that lie off the reference together with their neighbours, wherever and however far.
+
+    residuals: registered. White noise moves a median of nine by 0.4 sigma; a wrong pose, where much of the wall moved, counts too.
+    """
+    known = np.flatnonzero(eligible & np.isfinite(residuals.value))
+    if len(known) < NEIGHBOURS:
+        return 0.0
+    part = residuals.part(known)
+    around = sight.part(known).median_around(part.value / part.sigma)
+    far = np.abs(around) * part.sigma * part.unit_m > decided().changes.smallest
+    return float(np.mean(far & (np.abs(around) > decided().changes.moved_sigmas)))
+
+
 def _components(z: FloatArray, faint: FloatArray, sight: Sight, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
     """(n,) number of the change in which each point lies, -1 in none, and (n,) sigmas by which its neighbours bear it out.
 

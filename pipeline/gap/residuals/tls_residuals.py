@@ -148,12 +148,14 @@ def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArr
 
 
 def _order(measurement: TlsMeasurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
-    """Scan line (from the pattern, or counted in steps told by the gaps of the azimuths) and share of the duration."""
-    line = _lines(measurement.pattern, azimuth)
+    """Scan line (by the pattern, else of the points' channel `line`, else by the gaps of the azimuths) and share of the duration."""
+    stated = measurement.cloud.extra.get("line")
+    known = measurement.pattern is None and stated is not None and bool(np.isfinite(stated).all())
+    line = np.asarray(stated, dtype=np.float64) if known else _lines(measurement.pattern, azimuth)
     time = measurement.cloud.gps_time
     if time is not None and np.ptp(time) > 0:
         return line, _shares(time, measurement.epochs)
-    return line, None if line is None or line.max() == 0 else line / line.max()
+    return line, None if line is None or np.ptp(line) == 0 else (line - line.min()) / np.ptp(line)
 
 
 def _shares(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArray:
