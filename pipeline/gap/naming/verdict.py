@@ -135,7 +135,8 @@ def much_moved(evidence: Evidence, stable_areas: bool) -> list[str]:
     by = decided().changes
     said = (
         f"{100 * evidence.moved:.0f} % of the points lie off the reference together with their neighbours, by more than "
-        f"{by.moved_sigmas:g} predicted sigmas and {1e3 * by.smallest:g} mm: rock moved, or the reference is of another place or time"
+        f"{by.moved_sigmas:g} predicted sigmas and {1e3 * by.smallest:g} mm: rock moved, or the reference is of another place or "
+        "time"
     )
     remedy = "the stable_areas that were given are not stable" if stable_areas else "name stable_areas where nothing moved"
     return [f"{said}; {remedy}, or bring a reference of the same time"]

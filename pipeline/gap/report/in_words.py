@@ -75,7 +75,9 @@ def _asides(found: GapDiagnosis) -> list[str]:
     if found.changes:
         volume = sum(abs(change.volume_m3) for change in found.changes)
         regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
-        parts.append(f"{regions} where the rock itself moved ({volume:.2g} m\N{SUPERSCRIPT THREE} in all) were set aside.")
+        std = sum(change.volume_std_m3**2 for change in found.changes) ** 0.5
+        moved = f"{volume:.2g} \N{PLUS-MINUS SIGN} {std:.1g} m\N{SUPERSCRIPT THREE} in all"
+        parts.append(f"{regions} where the rock itself moved ({moved}) were set aside.")
     if found.remaining.get("note"):
         parts.append(f"Note: {found.remaining['note']}.")
     return parts

@@ -148,7 +148,7 @@ def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArr
 
 
 def _order(measurement: TlsMeasurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
-    """Scan line (by the pattern, else of the points' channel `line`, else by the gaps of the azimuths) and share of the duration."""
+    """Scan line (by the pattern, else the points' channel `line`, else gaps of the azimuths) and share of the duration."""
     stated = measurement.cloud.extra.get("line")
     known = measurement.pattern is None and stated is not None and bool(np.isfinite(stated).all())
     line = np.asarray(stated, dtype=np.float64) if known else _lines(measurement.pattern, azimuth)
