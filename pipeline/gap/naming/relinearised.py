@@ -92,9 +92,11 @@ class _Alone:
         """With its values moved by the slopes here."""
         candidate = _renewed(self.estimate.candidate, families_of(self.there, self.at))
         columns = np.concatenate([self.at.pose, candidate.columns], axis=1) / self.at.sigma[:, None]
-        known = np.concatenate([np.zeros(6), precision_of(candidate, candidate.columns.shape[1])])
+        known = np.concatenate([np.zeros(self.at.pose.shape[1]), precision_of(candidate, candidate.columns.shape[1])])
         step = np.linalg.solve(columns.T @ columns + np.diag(known), columns.T @ (self.at.value / self.at.sigma))
-        return _Alone.of(points, first, self.chosen, replace(self.estimate, values=self.estimate.values + step[6:]))
+        return _Alone.of(
+            points, first, self.chosen, replace(self.estimate, values=self.estimate.values + step[self.at.pose.shape[1] :])
+        )
 
 
 def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:

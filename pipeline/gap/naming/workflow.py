@@ -37,7 +37,7 @@ from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadTried, Tails, find_tails
 from pipeline.gap.other.stereo_shapes import find_shapes
 from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
-from pipeline.gap.residuals.changes import SceneChange, find_changes, moved_share
+from pipeline.gap.residuals.changes import SceneChange, find_changes, moved_share, once_each
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
@@ -66,7 +66,8 @@ class GapDiagnosis:
     """What was found.
 
     held_out: (n,) points never used in naming; before, after: (n,) residuals with registration taken off, in the observable's
-    unit; pose: (6,) shift (m) and turn (rad) of the sensor, wall frame; timings: s by step; decisions: what was decided by.
+    unit; pose: (6 k,) shift (m) and turn (rad) of the sensor in k set-ups, wall frame; timings: s by step; decisions: what was
+    decided by.
     """
 
     verdict: str
@@ -230,6 +231,8 @@ class _State:
         rough, _, scale = registered(residuals)
         sight = Sight.of(there, residuals)
         changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
+        if isinstance(there, TlsMeasurement) and there.scans:
+            changes = once_each(changes)
         rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
         held_out = held_points[residuals.index]

@@ -115,6 +115,16 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
     return _measured(label, limited, error, sight), beside
 
 
+def once_each(changes: list[SceneChange]) -> list[SceneChange]:
+    """Without those that another scan saw too: whose middle lies in a larger one's box."""
+    kept: list[SceneChange] = []
+    for change in changes:
+        middle = change.bounds.mean(axis=0)
+        if not any((each.bounds[0] < middle).all() and (middle < each.bounds[1]).all() for each in kept):
+            kept.append(change)
+    return kept
+
+
 def moved_share(residuals: Residuals, sight: Sight, eligible: BoolArray) -> float:
     """Share of the eligible points (n,) that lie off the reference together with their neighbours, wherever and however far.
 
