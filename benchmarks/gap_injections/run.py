@@ -155,8 +155,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=[], metavar="BASE", help="measurements to use (default: all)")
     parser.add_argument("--page", type=Path, help="write the table there")
+    parser.add_argument("--answered", action="store_true", help="make no further answers, judge those that are there")
     arguments = parser.parse_args()
-    rows = run(arguments.out, tuple(case for case in CASES if not arguments.only or case.base in arguments.only))
+    wanted = [case for case in CASES if not arguments.only or case.base in arguments.only]
+    if arguments.answered:
+        wanted = [case for case in wanted if (arguments.out / "answers" / f"{case.name}.json").exists()]
+    rows = run(arguments.out, tuple(wanted))
     bases = {name: json.loads((arguments.out / "answers" / f"{name}.json").read_text()) for name in {row["base"] for row in rows}}
     _write(arguments.out / "results.json", {"rows": rows, "bases": bases})
     if arguments.page:
