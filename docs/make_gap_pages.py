@@ -337,8 +337,11 @@ def verdicts() -> dict[str, Verdict]:
         ),
         "insufficient_data": Verdict(
             "Fewer than 800 points lie on smooth parts of the reference, where a residual has a meaning; or nothing was "
-            "named and too few of them are held out to measure a gap.",
-            "Scan more finely, or bring a reference that covers what was scanned.",
+            "named and too few of them are held out to measure a gap; or nothing closes the gap and 30 % of the points or "
+            "more lie off the reference together with their neighbours, by more than 3 predicted sigmas and 20 mm: much of "
+            "the wall moved, or the reference is of another place or time.",
+            "Scan more finely, or bring a reference that covers what was scanned. Where much moved: `stable_areas` where "
+            "nothing did, or a reference of the same time.",
             "A scan in steps of 0.05 rad.",
             _case(seed=1, step_rad=0.05),
         ),

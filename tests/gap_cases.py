@@ -93,7 +93,8 @@ class Scan:
 class ScanCase:
     """What a scan is like. angles: (azimuth, zenith, line) to recorded minus true angles; ranges: recorded ranges; lost: returns
     lost; fall: x, z and depth of a niche of 1.2 m that the reference does not have; blocks: column, row and depth of nodes that
-    lie deeper than in the reference: pyramids of volume depth x STEP^2."""
+    lie deeper than in the reference: pyramids of volume depth x STEP^2; scans: place and face of each of several scans, which are
+    of one pose where the place is the same."""
 
     angles: Callable[[Array, Array, Array], tuple[Array, Array]] | None = None
     ranges: Callable[[Scan], Array] | None = None
@@ -103,6 +104,7 @@ class ScanCase:
     step_rad: float = 0.0045
     intensity: bool = True
     epochs: int = 1
+    scans: Sequence[tuple[tuple[float, float, float], int]] = ()
     stable_areas: list[list[float]] | None = None
 
 
@@ -124,12 +126,18 @@ def write_scan(folder: Path, seed: int, **how: Any) -> None:
     zenith = np.arange(0.85, 1.63, case.step_rad)
     az, ze = (grid.ravel() for grid in np.meshgrid(azimuth, zenith, indexing="ij"))
     line = np.repeat(np.arange(len(azimuth)), len(zenith)).astype(float)
-    for epoch in range(case.epochs):
+    poses: dict[Any, Any] = {}
+    scans = case.scans or [(tuple(position), 1)] * case.epochs
+    for epoch, (place, face) in enumerate(scans):
+        position = np.array(place)
+        if face == 2:
+            az, ze = az + np.pi, 2 * np.pi - ze
         daz, dz = (np.zeros_like(az),) * 2 if case.angles is None else case.angles(az, ze, line)
         true_az, true_z = (
             nominal - error - ANGLE_SIGMA * rng.standard_normal(len(az)) for nominal, error in ((az, daz), (ze, dz))
         )
         pose = 0.002 * rng.standard_normal(3), 3e-5 * rng.standard_normal(3)
+        pose = poses.setdefault(place, pose) if case.scans else pose
         rotation = _turned(turn)
         skew = np.array([[0, -pose[1][2], pose[1][1]], [pose[1][2], 0, -pose[1][0]], [-pose[1][1], pose[1][0], 0]])
         true_range, cosine = wall.cast(position + pose[0], unit(true_az, true_z) @ (rotation.T @ (np.eye(3) + skew).T))
@@ -150,6 +158,8 @@ def write_scan(folder: Path, seed: int, **how: Any) -> None:
             ["x", "y", "z", "intensity", "gps_time"],
             case.intensity,
         )
+        if face == 2:
+            az, ze = az - np.pi, 2 * np.pi - ze
     Field(nodes + 0.0004 * smooth_noise(shape, 3.0, rng)).write(folder / "wall.ply")
     _yaml(
         folder / "model.yaml", {"sensor": "tls", "noise": {"range_sigma_m": SIGMA, "angle_sigma_rad": ANGLE_SIGMA}, "effects": []}
@@ -159,17 +169,25 @@ def write_scan(folder: Path, seed: int, **how: Any) -> None:
         {
             "sensor": "tls",
             "reference": "wall.ply",
-            "points": [f"scan_{epoch}.ply" for epoch in range(case.epochs)] if case.epochs > 1 else "scan_0.ply",
+            "points": [f"scan_{epoch}.ply" for epoch in range(len(scans))] if len(scans) > 1 else "scan_0.ply",
             "stable_areas": case.stable_areas or [],
             "frame": "scanner",
-            "scanner": {"position_m": position.tolist(), "rotation": rotation.tolist()},
-            "pattern": {
-                "azimuth_rad": [float(azimuth[0]), float(azimuth[-1]) + 1e-9, case.step_rad],
-                "zenith_rad": [float(zenith[0]), float(zenith[-1]) + 1e-9, case.step_rad],
-            },
+            **(_of_several(case.scans, rotation) if case.scans else _of_one(position, rotation, azimuth, zenith, case.step_rad)),
             "model": "model.yaml",
         },
     )
+
+
+def _of_one(position: Array, rotation: Array, azimuth: Array, zenith: Array, step_rad: float) -> dict[str, Any]:
+    sweeps = {"azimuth_rad": azimuth, "zenith_rad": zenith}
+    return {
+        "scanner": {"position_m": position.tolist(), "rotation": rotation.tolist()},
+        "pattern": {name: [float(each[0]), float(each[-1]) + 1e-9, step_rad] for name, each in sweeps.items()},
+    }
+
+
+def _of_several(scans: Sequence[Any], rotation: Array) -> dict[str, Any]:
+    return {"scanners": [{"position_m": list(place), "rotation": rotation.tolist(), "face": face} for place, face in scans]}
 
 
 def unit(azimuth: Array, zenith: Array) -> Array:

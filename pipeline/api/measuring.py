@@ -174,13 +174,15 @@ class Diagnosis:
 
     @property
     def changes(self) -> geopandas.GeoDataFrame:
-        """Regions where the scene itself moved: volume_m3, offset_m, place; geometry: the rectangle around, wall frame."""
+        """Regions where the scene itself moved: volume_m3 with volume_std_m3, offset_m, place; geometry: the rectangle around,
+        wall frame."""
         rows, bounds = [], []
         for each in self.found.changes:
             world = self.measurement.held.frame.to_world(each.corners.mean(axis=0))
-            rows.append({"volume_m3": each.volume_m3, "offset_m": each.offset_m, **spread_out("world", world.tolist())})
+            size = {"volume_m3": each.volume_m3, "volume_std_m3": each.volume_std_m3, "offset_m": each.offset_m}
+            rows.append({**size, **spread_out("world", world.tolist())})
             bounds.append([*each.bounds[0, :2], *each.bounds[1, :2]])
-        return boxes(rows, bounds, ("volume_m3", "offset_m", "world_x_m", "world_y_m", "world_z_m"))
+        return boxes(rows, bounds, ("volume_m3", "volume_std_m3", "offset_m", "world_x_m", "world_y_m", "world_z_m"))
 
     @property
     def residuals(self) -> Points:

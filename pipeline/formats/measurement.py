@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +32,7 @@ from pipeline.formats.measurement_checks import (
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
+from pipeline.formats.scanner_poses import Face, Pose, Scanned, ScannerPose, ScannerScan, set_ups
 from pipeline.registration.rigid import rotation_matrix
 from scene.config import Config, load_yaml, parse
 from scene.errors import InputError
@@ -39,34 +41,15 @@ from scene.imported import read_reference
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import RayCaster
 from scene.winding import check_near, facing
-from sensors.camera import Camera, CameraPair, Matrix3, Vector3, check_rotation
+from sensors.camera import Camera, CameraPair
 from sensors.effects.base import Sensor
 from sensors.model import StereoModel, TlsModel
 
 FILE = "measurement.yaml"
+SCAN = "scan"
+"""Channel of points: the number of the scan, of several."""
 MOST_EPOCHS = 1000
 _NAME_CAMERAS = "name cameras.yaml or a Metashape XML"
-_FEW_DIGITS, _ROUNDING = 0.005, 1e-9
-"""How far a rotation matrix may be from orthonormal for want of digits, and how far it is left as it stands."""
-
-
-class ScannerPose(Config):
-    """Where the scanner stood, as surveyed."""
-
-    position_m: Vector3 = Field(description="scanner's centre, world frame [m]")
-    rotation: Matrix3 = Field(description="scanner to world; scanner z is the vertical axis")
-
-    @field_validator("rotation")
-    @classmethod
-    def _orthonormal(cls, rotation: Matrix3) -> Matrix3:
-        """A rotation of few digits becomes the nearest one (`_mended` says so); one that is none is refused."""
-        rows = np.array(rotation)
-        if np.linalg.det(rows) <= 0 or np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS:
-            return check_rotation(rotation)
-        left, _, right = np.linalg.svd(rows)
-        first, second, third = ((float(row[0]), float(row[1]), float(row[2])) for row in left @ right)
-        nearest: Matrix3 = (first, second, third)
-        return rotation if np.abs(rows - left @ right).max() < _ROUNDING else nearest
 
 
 class ScanPattern(Config):
@@ -120,6 +103,9 @@ class MeasurementConfig(Config):
     points: Path | Annotated[list[Path], Field(max_length=MOST_EPOCHS)] = Field(description="point cloud; several epochs: a list")
     frame: Literal["scanner", "world"] = Field("world", description="of the points")
     scanner: ScannerPose | None = None
+    scanners: tuple[ScannerScan, ...] = Field(
+        (), description="instead of `scanner` where each file of `points` is a scan from a place or in a face of its own"
+    )
     pattern: ScanPattern | None = None
     cameras: Path | None = Field(None, description="cameras.yaml or a Metashape XML: the nominal calibration (stereo)")
     stable_areas: tuple[Area, ...] = Field(
@@ -139,6 +125,15 @@ class MeasurementConfig(Config):
             raise ValueError("names a file twice; give a path of its own for each epoch")
         return points
 
+    @model_validator(mode="after")
+    def _one_pose_each(self) -> Self:
+        files = [self.points] if isinstance(self.points, Path) else self.points
+        if self.scanners and len(self.scanners) != len(files):
+            raise ValueError(f"'scanners' has {len(self.scanners)} poses for {len(files)} files of points; give one for each")
+        if self.scanners and (self.scanner is not None or self.pattern is not None):
+            raise ValueError("'scanners' stands instead of 'scanner', and without 'pattern'")
+        return self
+
 
 def _kind(values: Any) -> str:
     return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
@@ -146,10 +141,6 @@ def _kind(values: Any) -> str:
 
 class _ModelFile(Config):
     sensor: Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_kind)]
-
-
-Pose = tuple[FloatArray, FloatArray]
-"""Position (3,) m and rotation (3, 3) of a sensor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,19 +212,51 @@ class MeasurementBase(ABC):
 class TlsMeasurement(MeasurementBase):
     """A laser scan, or epochs of it.
 
-    station: scanner to wall frame; pattern: the nominal directions, None where not known; order: each point's scan line and share
-    of the scan's duration (n,), None where not known, once they were counted (see `with_order`).
+    station: scanner to wall frame, of the first scan where there are several; face: in which it was scanned; scans: of several,
+    whose numbers are the points' channel `scan`, empty where there is one; pattern: the nominal directions, None where not known;
+    order: each point's scan line and share of the scan's duration (n,), None where not known, once they were counted (see
+    `with_order`).
     """
 
     sensor = "tls"
     model: TlsModel
     station: Pose
+    face: Face = 1
+    scans: tuple[Scanned, ...] = ()
     pattern: ScanPattern | None = None
     order: tuple[FloatArray | None, FloatArray | None] | None = None
 
     @property
     def viewpoint(self) -> FloatArray:
         return self.station[0]
+
+    @property
+    def scan_of(self) -> NDArray[np.int64]:
+        """(n,) number of each point's scan."""
+        return np.asarray(self.cloud.extra.get(SCAN, np.zeros(len(self.cloud.points))), dtype=np.int64)
+
+    def each_scan(self) -> Iterator[tuple[Scanned, NDArray[np.int64], Self]]:
+        """Of several scans each with its points' rows and its own measurement."""
+        for number, scan in enumerate(self.scans):
+            rows = np.flatnonzero(self.scan_of == number)
+            yield scan, rows, self.part(rows).changed(station=scan.pose, face=scan.face, scans=())
+
+    @property
+    def fit(self) -> PointFit:
+        several = self.each_scan()
+        fits = [PointFit.of(one.cloud.points, one.viewpoint, self.scene, self.sensor) for _, rows, one in several if len(rows)]
+        return min(fits, key=lambda each: (each.good, each.near)) if fits else super().fit
+
+    def moved(self, pose: FloatArray) -> Self:
+        """Of several scans each by the six values of its set-up: pose (6 k,)."""
+        if not self.scans:
+            return super().moved(pose)
+        points, scans = self.cloud.points.copy(), []
+        for scan, rows, one in self.each_scan():
+            there = one.moved(pose[6 * scan.set_up : 6 * scan.set_up + 6])
+            points[rows] = there.cloud.points
+            scans.append(replace(scan, pose=there.station))
+        return self.changed(cloud=replace(self.cloud, points=points), scans=tuple(scans), station=scans[0].pose)
 
     def part(self, rows: NDArray[np.int64]) -> Self:
         line, share = (None if values is None else values[rows] for values in self.order or (None, None))
@@ -339,12 +362,12 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     said = [(reference, (*material.notes, words))]
     for name, each in zip(material.points, clouds, strict=True):
         said.append((name, _rounding(each.points, config, model, cameras, name)))
-    cloud = _joined(clouds)
+    cloud = _joined(clouds, SCAN if config.scanners else "epoch")
     found = _of_sensor(
         config,
         material,
         where,
-        cloud=_in_wall_frame(cloud, config.frame, config.scanner, frame),
+        cloud=_all_in_wall_frame(config, clouds, cloud, frame),
         reference=local,
         frame=frame,
         stable_areas=config.stable_areas,
@@ -361,11 +384,20 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
             raise InputError("a stereo measurement needs `cameras`", where=where, remedy=_NAME_CAMERAS)
         return StereoMeasurement(model=material.model, cameras=material.cameras, **shared)
     pose, frame = _scanner_pose(config, where), shared["frame"]
-    station = frame.to_wall(np.array(pose.position_m)), frame.rotation @ np.array(pose.rotation)
-    return TlsMeasurement(model=material.model, station=station, pattern=config.pattern, **shared)
+    scans = tuple(
+        Scanned(_to_wall(each, frame), each.face, number)
+        for each, number in zip(config.scanners, set_ups(config.scanners), strict=True)
+    )
+    return TlsMeasurement(model=material.model, station=_to_wall(pose, frame), scans=scans, pattern=config.pattern, **shared)
+
+
+def _to_wall(pose: ScannerPose, frame: WallFrame) -> Pose:
+    return frame.to_wall(np.array(pose.position_m)), frame.rotation @ np.array(pose.rotation)
 
 
 def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
+    if config.scanners:
+        return config.scanners[0]
     if config.scanner is None:
         raise InputError("a TLS measurement needs `scanner`", where=where, remedy="give scanner: position_m and rotation")
     return config.scanner
@@ -413,7 +445,8 @@ def _viewpoints(config: MeasurementConfig, cameras: CameraPair | None, where: st
     """Where the sensors stand, by name, world frame."""
     if cameras is not None:
         return {"left camera": cameras.left.position, "right camera": cameras.right.position}
-    return {"scanner": np.array(_scanner_pose(config, where).position_m)}
+    scanners = {f"scanner {number}": np.array(each.position_m) for number, each in enumerate(config.scanners, start=1)}
+    return scanners or {"scanner": np.array(_scanner_pose(config, where).position_m)}
 
 
 def _rounding(
@@ -424,7 +457,7 @@ def _rounding(
     if not len(points):
         return ()
     if isinstance(model, TlsModel) or cameras is None:
-        viewpoint = np.zeros(3) if config.frame == "scanner" else _viewpoints(config, cameras, where)["scanner"]
+        viewpoint = np.zeros(3) if config.frame == "scanner" else np.array(_scanner_pose(config, where).position_m)
         noise = model.noise.range_sigma_m if isinstance(model, TlsModel) else np.inf
         return check_rounded_points(points, viewpoint, noise, where)
     left, right = cameras.left, cameras.right
@@ -435,17 +468,25 @@ def _rounding(
     return check_rounded_points(points, left.position, float(noise), where)
 
 
-def _joined(clouds: list[PointCloud]) -> PointCloud:
-    """One cloud of all epochs, with the channels that all have; `epoch` counts the files, whatever a file calls so."""
+def _all_in_wall_frame(config: MeasurementConfig, clouds: list[PointCloud], joined: PointCloud, frame: WallFrame) -> PointCloud:
+    """The joined cloud, of which each scan may be in a frame of its own."""
+    if not config.scanners:
+        return _in_wall_frame(joined, config.frame, config.scanner, frame)
+    parts = [_in_wall_frame(cloud, config.frame, pose, frame) for cloud, pose in zip(clouds, config.scanners, strict=True)]
+    return replace(joined, points=np.concatenate([part.points for part in parts]))
+
+
+def _joined(clouds: list[PointCloud], counted: str) -> PointCloud:
+    """One cloud of all files, with the channels that all have; a channel `counted` counts the files, whatever a file calls so."""
     if len(clouds) == 1:
-        return replace(clouds[0], extra={name: values for name, values in clouds[0].extra.items() if name != "epoch"})
+        return replace(clouds[0], extra={name: values for name, values in clouds[0].extra.items() if name not in ("epoch", SCAN)})
     shared = set.intersection(*(set(cloud.extra) for cloud in clouds))
     columns: dict[str, Any] = {}
     for name in ("intensity", "gps_time"):
         parts = [getattr(cloud, name) for cloud in clouds]
         columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
-    extra = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in sorted(shared)}
-    extra["epoch"] = np.repeat(np.arange(len(clouds)), [len(cloud.points) for cloud in clouds])
+    extra = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in sorted(shared - {"epoch", SCAN})}
+    extra[counted] = np.repeat(np.arange(len(clouds)), [len(cloud.points) for cloud in clouds])
     return PointCloud(np.concatenate([cloud.points for cloud in clouds]), extra=extra, **columns)
 
 

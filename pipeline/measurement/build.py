@@ -24,7 +24,7 @@ from scene.rounding import rounded_axes
 from sensors.model import StereoModel, TlsModel
 
 _ONE_PLACE_M = 0.05
-"""Stations that stand nearer to each other than this are one, set up again."""
+"""Stations that stand nearer to each other than this are one, set up again: its scans are epochs."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ def build(request: Request, out: Path) -> Understood:
     model, noise_words = _with_known_errors(model, scans[0], station, reference)
     about = {
         "scan": tuple(f"{scan.name}: {len(scan.cloud.points):,} points{_said(scan)}" for scan in scans) + echo_words,
-        "scanner": station.words,
+        "scanner": station.words + _of_others(scans, stations),
         "reference": reference.words,
         "cannot show": reference.limits,
         "model": (*model_words, *noise_words),
     }
-    keys: dict[str, Any] = {"scanner": {"position_m": station.position.tolist(), "rotation": station.rotation.tolist()}}
-    if station.pattern is not None and request.reference != HALF and not echo_words:
+    keys = _where_from(stations)
+    if "scanner" in keys and station.pattern is not None and request.reference != HALF and not echo_words:
         keys["pattern"] = station.pattern
     clouds = [_for_file(scan, each) for scan, each in zip(scans, stations, strict=True)]
     content = Content("tls", clouds, reference.mesh, model, _eye(station), ", ".join(scan.name for scan in scans), keys=keys)
@@ -137,17 +137,38 @@ def _scans(request: Request) -> list[RawScan]:
 
 
 def _stations(scans: list[RawScan], request: Request) -> list[Station]:
-    """The station of each scan; all have to stand in one place."""
+    """The station of each scan; one half of a scan can be the reference of no other place."""
     position = None if request.position is None else np.array(request.position)
     stations = [find_station(scan, position) for scan in scans]
     for scan, station in zip(scans[1:], stations[1:], strict=True):
-        away = float(np.linalg.norm(station.position - stations[0].position))
-        if away > _ONE_PLACE_M:
+        if request.reference == HALF and (away := _away(station, stations[0])) > _ONE_PLACE_M:
             raise InputError(
-                f"stands {away:.3g} m from the place of {scans[0].name}", where=scan.name,
-                allowed="epochs from one place", remedy="build a folder for each place; --scan N picks one scan of a file",
+                f"stands {away:.3g} m from the place of {scans[0].name}, whose half is the reference", where=scan.name,
+                remedy="name a mesh, a cloud or a DEM; --scan N picks one scan of a file",
             )  # fmt: skip
     return stations
+
+
+def _of_others(scans: list[RawScan], stations: list[Station]) -> tuple[str, ...]:
+    """Words for scans from other places than the first's."""
+    pairs = zip(scans[1:], stations[1:], strict=True)
+    return tuple(
+        f"{scan.name}: {each.words[0]}, {_away(each, stations[0]):.3g} m from the first: with a pose of its own"
+        for scan, each in pairs
+        if _away(each, stations[0]) > _ONE_PLACE_M
+    )
+
+
+def _away(station: Station, other: Station) -> float:
+    """How far apart two stations stand, m."""
+    return float(np.linalg.norm(station.position - other.position))
+
+
+def _where_from(stations: list[Station]) -> dict[str, Any]:
+    """`scanner` of epochs from one place, `scanners` of scans from places of their own."""
+    poses = [{"position_m": each.position.tolist(), "rotation": each.rotation.tolist()} for each in stations]
+    one = all(_away(each, stations[0]) <= _ONE_PLACE_M for each in stations[1:])
+    return {"scanner": poses[0]} if one else {"scanners": poses}
 
 
 def _given(request: Request, scan: RawScan, position: FloatArray, rotation: FloatArray) -> Reference:

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.gap.decisions import Decisions
 from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verdict import Evidence, lower_noise, too_noisy, verdict_of
+from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, verdict_of
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.report.in_words import paragraph, title
 from pipeline.gap.report.report import summary
@@ -155,6 +155,21 @@ def test_too_much_noise_is_said_with_less_that_would_do() -> None:
         if evidence.spread < 1.0:
             assert "range_sigma_m 0.00033" in said
             assert "too noisy" in said or found.verdict != "no_gap"
+
+
+@pytest.mark.parametrize("gap", GAPS)
+@pytest.mark.parametrize("p_value", P_VALUES)
+def test_a_wall_much_of_which_moved_says_nothing_of_the_sensor(gap: Gap | None, p_value: float | None) -> None:
+    """Nothing is named then; 30 % of the wall are much."""
+    found: Any = _Found((), Evidence(gap, p_value, moved=0.41))
+    said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summary(found)} {'; '.join(much_moved(found.evidence, False))}"
+    assert found.verdict == "insufficient_data"
+    assert "41 % of the points lie off the reference together with their neighbours" in said
+    assert "name stable_areas" in said
+    assert "too few" not in said.lower()
+    assert verdict_of((), Evidence(gap, p_value, moved=0.29)) == verdict_of((), Evidence(gap, p_value))
+    assert much_moved(Evidence(gap, p_value, moved=0.29), False) == []
+    assert "are not stable" in much_moved(found.evidence, True)[0]
 
 
 def test_nothing_found_and_nothing_measured_is_no_answer() -> None:

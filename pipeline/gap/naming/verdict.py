@@ -27,6 +27,7 @@ STILL_OPEN = (
     "Effects were named, but most of the gap stays open: the model is rejected with them too, and nothing else explains it."
 )
 NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
+MUCH_MOVED = "Much of the wall is not where the reference has it: of what is left nothing can be said of the sensor."
 TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
 
 
@@ -36,13 +37,20 @@ class Evidence:
 
     gap: on held-out points, None where there are too few; p_value: of what remains, None where it was not drawn; spread: share of
     the predicted standard deviation that the residuals have where that is clearly less, else 1; far: share of points far out all
-    over the wall, 0 where they are as few as noise leaves.
+    over the wall, 0 where they are as few as noise leaves; moved: of points that lie off the reference together with their
+    neighbours, where that was asked.
     """
 
     gap: Gap | None
     p_value: float | None
     spread: float = 1.0
     far: float = 0.0
+    moved: float = 0.0
+
+    @property
+    def much_moved(self) -> bool:
+        """Whether too much of the wall is not where the reference has it for anything to be said of the sensor."""
+        return self.moved >= decided().changes.moved_share
 
     @property
     def rejects(self) -> bool:
@@ -71,6 +79,8 @@ class Evidence:
 
 def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
     """What the effects that were named, and the numbers, come to."""
+    if evidence.much_moved:
+        return "insufficient_data"
     if not named:
         if evidence.gap is None and not evidence.rejects:
             return "insufficient_data"
@@ -84,6 +94,8 @@ def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
 
 def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> str:
     """A verdict in words."""
+    if evidence.much_moved:
+        return MUCH_MOVED
     if verdict in ("no_gap", "unknown") and evidence.only_too_noisy(named):
         return TOO_NOISY
     if verdict == "unknown" and not any(item.kind == "empirical" for item in named):
@@ -114,6 +126,20 @@ def lower_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float
         return {}
     values = model.noise.model_dump(include=set(_NOISES))
     return {key: float(f"{spread * value:.3g}") for key, value in values.items() if value > 0}
+
+
+def much_moved(evidence: Evidence, stable_areas: bool) -> list[str]:
+    """Words for a wall much of which moved, with what to do. stable_areas: whether the measurement names some."""
+    if not evidence.much_moved:
+        return []
+    by = decided().changes
+    said = (
+        f"{100 * evidence.moved:.0f} % of the points lie off the reference together with their neighbours, by more than "
+        f"{by.moved_sigmas:g} predicted sigmas and {1e3 * by.smallest:g} mm: rock moved, or the reference is of another place or "
+        "time"
+    )
+    remedy = "the stable_areas that were given are not stable" if stable_areas else "name stable_areas where nothing moved"
+    return [f"{said}; {remedy}, or bring a reference of the same time"]
 
 
 def too_noisy(spread: float, lower: dict[str, float]) -> list[str]:

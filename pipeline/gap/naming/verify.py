@@ -19,7 +19,7 @@ from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals
-from pipeline.gap.residuals.scan_simulation import simulate_ranges
+from pipeline.gap.residuals.several_scans import simulate_departures
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
@@ -109,8 +109,8 @@ def simulated(measurement: Measurement, model: TlsModel | StereoModel, residuals
     measurement: with its sensor where it stood, against which `residuals` may be those of another place.
     """
     match measurement, model, residuals:
-        case TlsMeasurement(), TlsModel(), TlsResiduals(geometry=rays):
-            return simulate_ranges(measurement, model, rays, random) - np.asarray(rays.range_m)
+        case TlsMeasurement(), TlsModel(), TlsResiduals():
+            return simulate_departures(measurement, model, residuals, random)
         case StereoMeasurement(), StereoModel(), StereoResiduals():
             return _simulated_disparities(measurement, model, residuals, random)
     raise TypeError("measurement, model and residuals are of different sensors")

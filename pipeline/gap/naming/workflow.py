@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,8 +28,8 @@ from pipeline.gap.naming.families import believes
 from pipeline.gap.naming.held_out import score_effects
 from pipeline.gap.naming.naming import Naming, name_effects
 from pipeline.gap.naming.splitting import with_splits
-from pipeline.gap.naming.verdict import Evidence, lower_noise, too_noisy, verdict_of
-from pipeline.gap.naming.verification import Showing
+from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, verdict_of
+from pipeline.gap.naming.verification import Showing, Shown
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
 from pipeline.gap.other.mixed_pixels import find_footprint
@@ -37,7 +37,7 @@ from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadTried, Tails, find_tails
 from pipeline.gap.other.stereo_shapes import find_shapes
 from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
-from pipeline.gap.residuals.changes import SceneChange, find_changes
+from pipeline.gap.residuals.changes import SceneChange, find_changes, moved_share, once_each
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
@@ -66,7 +66,8 @@ class GapDiagnosis:
     """What was found.
 
     held_out: (n,) points never used in naming; before, after: (n,) residuals with registration taken off, in the observable's
-    unit; pose: (6,) shift (m) and turn (rad) of the sensor, wall frame; timings: s by step; decisions: what was decided by.
+    unit; pose: (6 k,) shift (m) and turn (rad) of the sensor in k set-ups, wall frame; timings: s by step; decisions: what was
+    decided by.
     """
 
     verdict: str
@@ -90,7 +91,8 @@ class GapDiagnosis:
     @property
     def evidence(self) -> Evidence:
         """The numbers that the verdict and its words rest on."""
-        return Evidence(self.gap, self.remaining["p_value"], self.remaining["spread"], self.remaining["far"])
+        return Evidence(self.gap, self.remaining["p_value"], self.remaining["spread"], self.remaining["far"],
+                        self.remaining["moved"])  # fmt: skip
 
     @property
     def mended(self) -> bool:
@@ -150,7 +152,10 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     shown, harmful = showing.show(named)
     notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *wide, *dropped, *harmful]
     far = tails.share if tails is not None and tails.even else 0.0
-    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far)
+    evidence = _with_moved(Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far), there, state, shown)
+    if evidence.much_moved:
+        shown, _ = replace(showing, lower={}).show([])
+        notes = [*much_moved(evidence, bool(there.stable_areas)), *naming.notes]
     value = plain.value - plain.pose @ showing.pose
     clock.lap("verification")
     return GapDiagnosis(
@@ -166,12 +171,20 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         gap=shown.gap,
         tried=naming.tried,
         spread_tried=naming.spread_tried,
-        remaining=_remaining(evidence, notes, shown.lower),
+        remaining=_remaining(evidence, _found_first(notes, plain.notes), shown.lower),
         identifiability=naming.identifiability,
         seconds=clock.total,
         timings=clock.laps,
         decisions=decided(),
     )
+
+
+def _with_moved(evidence: Evidence, there: Measurement, state: _State, shown: Shown) -> Evidence:
+    """With the share of the wall that moved, where that may be why nothing was named that closes the gap."""
+    if verdict_of(shown.named, evidence) != "unknown" or (shown.named and not evidence.stays_open):
+        return evidence
+    after = replace(state.residuals, value=shown.value)
+    return replace(evidence, moved=moved_share(after, Sight.of(there, after), state.residuals.smooth & ~state.changed))
 
 
 def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
@@ -218,6 +231,8 @@ class _State:
         rough, _, scale = registered(residuals)
         sight = Sight.of(there, residuals)
         changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
+        if isinstance(there, TlsMeasurement) and there.scans:
+            changes = once_each(changes)
         rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
         held_out = held_points[residuals.index]
@@ -415,14 +430,20 @@ class _Clock:
 
 def _remaining(evidence: Evidence, notes: list[str], lower_noise: dict[str, float]) -> dict[str, Any]:
     """As gap.json holds it. spread: share of the predicted one that the residuals have where that is clearly less; far: share of
-    points far out all over the wall."""
+    points far out all over the wall; moved: of points off the reference with their neighbours, 0 where that was not asked."""
     return {
         "p_value": evidence.p_value,
         "note": "; ".join(notes),
         "spread": evidence.spread,
         "far": evidence.far,
+        "moved": evidence.moved,
         "lower_noise": lower_noise,
     }
+
+
+def _found_first(notes: list[str], of_data: Sequence[str]) -> list[str]:
+    """What was found before what the data cannot show."""
+    return [*(each for each in notes if each not in of_data), *(each for each in notes if each in of_data)]
 
 
 def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> GapDiagnosis:

@@ -36,6 +36,8 @@ def title(found: GapDiagnosis) -> str:
             return "No effect was found to be missing, but the model is too noisy"
         case "no_gap":
             return "No effect is missing"
+        case "insufficient_data" if found.evidence.much_moved:
+            return "Much of the wall moved: nothing can be said of the sensor"
         case "insufficient_data":
             return "Too few data to say what is missing"
         case "unknown" if not found.effects:
@@ -77,7 +79,9 @@ def _asides(found: GapDiagnosis) -> list[str]:
     if found.changes:
         volume = sum(abs(change.volume_m3) for change in found.changes)
         regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
-        parts.append(f"{regions} where the rock itself moved ({volume:.2g} m\N{SUPERSCRIPT THREE} in all) were set aside.")
+        std = sum(change.volume_std_m3**2 for change in found.changes) ** 0.5
+        moved = f"{volume:.2g} \N{PLUS-MINUS SIGN} {std:.1g} m\N{SUPERSCRIPT THREE} in all"
+        parts.append(f"{regions} where the rock itself moved ({moved}) were set aside.")
     if found.remaining.get("note"):
         parts.append(f"Note: {found.remaining['note']}.")
     return parts

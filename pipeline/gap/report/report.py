@@ -33,6 +33,7 @@ from pipeline.gap.report.in_words import (
     with_unit,
 )
 from pipeline.report.page import p_value_in_words, template
+from scene.mesh import FloatArray
 
 _MOST_TRIED = 25
 
@@ -44,8 +45,7 @@ def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
 
 
 def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    shift, turn = found.pose[:3], found.pose[3:]
-    axes = measurement.frame.rotation
+    poses = [_registration(found.pose[start : start + 6], measurement) for start in range(0, len(found.pose), 6)]
     return {
         "schema": 1,
         "verdict": found.verdict,
@@ -53,13 +53,20 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
         "where": where(found),
         "scene_changes": [change.to_dict(measurement.frame) for change in found.changes],
         "sensor": measurement.sensor,
-        "registration": {"translation_m": (axes.T @ shift).tolist(), "rotation_rad": (axes.T @ turn).tolist()},
+        "registration": poses[0],
+        **({"further_registrations": poses[1:]} if len(poses) > 1 else {}),
         "identifiability": found.identifiability,
         "gap": found.gap.to_dict() if found.gap else None,
         "remaining": found.remaining,
         "decisions": found.decisions.model_dump(),
         "seconds": round(found.seconds, 2),
     }
+
+
+def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
+    """A set-up's pose (6,), wall frame, in the world frame."""
+    axes = measurement.frame.rotation
+    return {"translation_m": (axes.T @ pose[:3]).tolist(), "rotation_rad": (axes.T @ pose[3:]).tolist()}
 
 
 def write(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
@@ -112,6 +119,11 @@ def _summary(found: GapDiagnosis) -> str:
 
 def _request(found: GapDiagnosis) -> str:
     """What insufficient_data asks for."""
+    if found.evidence.much_moved:
+        return (
+            "stable_areas in measurement.yaml (boxes or polygons, wall frame, m) where nothing moved, or a reference of the same "
+            "time; what moved is measured as a difference of two epochs, not as an effect of the sensor."
+        )
     return (
         f"at least {found.decisions.points.fewest} points on smooth rock of stable ground, spread over the wall: scan or match "
         "more densely, take in more of the wall, or widen stable_areas (wall frame, m) where they leave out what did not move."

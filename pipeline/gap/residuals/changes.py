@@ -13,7 +13,10 @@ Volume of a component, the prism of each ray between both surfaces, with the sol
 
     V = |sum (R^3 - R0^3) / 3 dO|,  to first order |sum R0^2 dR sin z daz dz|
 
-with no departure more than the neighbours' bear out, so that an outlier in it does not count.
+with no departure more than the neighbours' bear out, so that an outlier in it does not count. Its standard deviation has four
+parts: the noise of each ray; what the surroundings are off in common, from how much more medians of neighbours spread than white
+noise makes them; the rim, of which each straight side, of sqrt(m) points, is in it or not: sqrt(4 / 12) / sqrt(m) of the volume
+and, as on simulated blocks, a fifth more; and what is seen of its sides from aside.
 """
 
 from __future__ import annotations
@@ -52,6 +55,10 @@ _EDGE_STEPS = 3
 """Points at edges of the reference that a change may go on over."""
 _LEAST_AROUND = 0.4
 """Standard deviation of medians of nine points at the least, of sigmas: 1.25 / 3 by white noise."""
+_BY_WHITE = 0.418
+"""Standard deviation of medians of nine standard normal values."""
+_RIM, _SIDES = 0.7, 0.03
+"""Shares of a volume: times one over the root of its points, and whatever they are (see above)."""
 _ROUNDS = 3
 _SAMPLE, _ALMOST_ALL = 4000, 5.0
 
@@ -59,10 +66,11 @@ _SAMPLE, _ALMOST_ALL = 4000, 5.0
 @dataclass(frozen=True)
 class SceneChange:
     """A region that moved. corners: (k, 3) outline of the rock that went or came, before and after, wall frame, m; volume_m3 of
-    it; offset_m: median along the ray, positive where rock is missing."""
+    it, known to volume_std_m3; offset_m: median along the ray, positive where rock is missing."""
 
     corners: FloatArray
     volume_m3: float
+    volume_std_m3: float
     offset_m: float
 
     @property
@@ -73,7 +81,8 @@ class SceneChange:
     def to_dict(self, frame: WallFrame) -> dict[str, Any]:
         """As gap.json holds it: the box that holds the region in the world frame."""
         world = frame.to_world(self.corners)
-        return {"bbox_m": [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()], "volume_m3": self.volume_m3}
+        return {"bbox_m": [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()], "volume_m3": self.volume_m3,
+                "volume_std_m3": self.volume_std_m3}  # fmt: skip
 
 
 def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
@@ -83,7 +92,7 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
     and how much residuals spread, is learned again without the changes found, until there are no more.
     """
     beside = np.zeros(len(residuals), dtype=bool)
-    departure = np.zeros(len(residuals))
+    departure, error = np.zeros(len(residuals)), np.zeros((2, len(residuals)))
     label = np.full(len(residuals), -1)
     if eligible.sum() < NEIGHBOURS:
         return [], beside
@@ -92,7 +101,10 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
         quiet = eligible & ~beside
         departure, z = standardized(residuals, sight.even_plane, quiet)
         around = sight.median_around(np.where(eligible, z, 0.0))
-        faint = around / np.maximum(spread(residuals, around, quiet), _LEAST_AROUND)
+        scatter = spread(residuals, around, quiet)
+        shared = np.sqrt(np.maximum(scatter**2 - _BY_WHITE**2, 0.0))
+        error = np.stack([np.abs(departure / np.where(z == 0, np.inf, z)), shared * residuals.sigma]) * residuals.unit_m
+        faint = around / np.maximum(scatter, _LEAST_AROUND)
         faint[np.abs(around) * residuals.sigma * residuals.unit_m < decided().changes.smallest] = 0.0
         label, limit = _components(z, faint, sight, eligible)
         members = np.flatnonzero(label >= 0)
@@ -100,7 +112,31 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
         if not (beside & ~before).any():
             break
     limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
-    return _measured(label, limited, sight), beside
+    return _measured(label, limited, error, sight), beside
+
+
+def once_each(changes: list[SceneChange]) -> list[SceneChange]:
+    """Without those that another scan saw too: whose middle lies in a larger one's box."""
+    kept: list[SceneChange] = []
+    for change in changes:
+        middle = change.bounds.mean(axis=0)
+        if not any((each.bounds[0] < middle).all() and (middle < each.bounds[1]).all() for each in kept):
+            kept.append(change)
+    return kept
+
+
+def moved_share(residuals: Residuals, sight: Sight, eligible: BoolArray) -> float:
+    """Share of the eligible points (n,) that lie off the reference together with their neighbours, wherever and however far.
+
+    residuals: registered. White noise moves a median of nine by 0.4 sigma; a wrong pose, where much moved, counts too.
+    """
+    known = np.flatnonzero(eligible & np.isfinite(residuals.value))
+    if len(known) < NEIGHBOURS:
+        return 0.0
+    part = residuals.part(known)
+    around = sight.part(known).median_around(part.value / part.sigma)
+    far = np.abs(around) * part.sigma * part.unit_m > decided().changes.smallest
+    return float(np.mean(far & (np.abs(around) > decided().changes.moved_sigmas)))
 
 
 def _components(z: FloatArray, faint: FloatArray, sight: Sight, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
@@ -245,22 +281,30 @@ def _compact(label: NDArray[np.int64], sight: Sight, points: int) -> NDArray[np.
     return np.where(np.isin(label, label[order][starts][compact]), label, -1)
 
 
-def _measured(label: NDArray[np.int64], departure: FloatArray, sight: Sight) -> list[SceneChange]:
-    """The changes by their volume, the largest first."""
+def _measured(label: NDArray[np.int64], departure: FloatArray, error: FloatArray, sight: Sight) -> list[SceneChange]:
+    """The changes by their volume, the largest first. error: (2, n) of each ray's departure, and of all in common, m."""
     rows = np.flatnonzero(label >= 0)
     if not len(rows):
         return []
     solid = sight.solid_angles(rows)
     near, far = sight.reference_m[rows], sight.range_with(rows, departure[rows])
     volume = (far**3 - near**3) / 3 * solid
-    width = 0.5 * near * np.sqrt(solid)
+    area = near**2 * solid
+    width = 0.5 * np.sqrt(area)
+    own, common = error[:, rows] * area
     surfaces = [sight.points_at(rows, each) for each in (near, far)]
     order = np.argsort(label[rows], kind="stable")
     found = []
     for part in np.split(order, np.flatnonzero(np.diff(label[rows][order])) + 1):
         corners = np.concatenate([_box(surface[part], width[part]) for surface in surfaces])
         moved = float(np.median((far - near)[part]))
-        found.append(SceneChange(corners, abs(_mean_of_epochs(volume[part], sight.epoch[rows[part]])), moved))
+        epochs = sight.epoch[rows[part]]
+        whole = abs(_mean_of_epochs(volume[part], epochs))
+        each = len(part) / len(np.unique(epochs))
+        white = float(np.sqrt(np.sum(own[part] ** 2))) * each / len(part)
+        rim, sides = whole * _RIM / np.sqrt(each), whole * _SIDES
+        std = float(np.linalg.norm([white, common[part].sum() * each / len(part), rim, sides]))
+        found.append(SceneChange(corners, whole, std, moved))
     return sorted(found, key=lambda change: -change.volume_m3)
 
 

@@ -12,6 +12,7 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.several_scans import scans_residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
 from scene.mesh import FloatArray
@@ -22,9 +23,10 @@ _FAR_M, _MOST_MOVES = 0.002, 3
 
 
 def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
-    """(n,) residuals after a robust registration, the pose (6,), and how many predicted sigmas their spread is (at least 1)."""
+    """(n,) residuals after a robust registration, the pose (6 k,) of k set-ups, and how many predicted sigmas their spread is (at
+    least 1)."""
     kept, scale = residuals.smooth.copy(), 1.0
-    value, pose = residuals.value, np.zeros(6)
+    value, pose = residuals.value, np.zeros(residuals.pose.shape[1])
     for _ in range(_ROUNDS):
         pose = pose_of(residuals, kept)
         value = residuals.value - residuals.pose @ pose
@@ -44,7 +46,9 @@ def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatA
 
 def raw_residuals(measurement: Measurement) -> Residuals:
     """The raw residuals of either sensor."""
-    return tls_residuals(measurement) if isinstance(measurement, TlsMeasurement) else stereo_residuals(measurement)
+    if not isinstance(measurement, TlsMeasurement):
+        return stereo_residuals(measurement)
+    return scans_residuals(measurement) if measurement.scans else tls_residuals(measurement)
 
 
 def residuals_of(measurement: Measurement) -> Residuals:
@@ -76,7 +80,7 @@ def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None, 
     first place no longer serve.
     """
     found = residuals_of(measurement) if found is None else found
-    total = np.zeros(6)
+    total = np.zeros(found.pose.shape[1])
     for _ in range(_MOST_MOVES):
         pose = registered(_only(found, trusted))[1]
         if not _is_far(pose, found):
@@ -94,5 +98,9 @@ def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
 
 
 def _is_far(pose: FloatArray, residuals: Residuals) -> bool:
-    turn, shift = (float(np.linalg.norm(residuals.pose[:, columns], axis=1).mean()) for columns in (slice(3, 6), slice(3)))
-    return float(np.linalg.norm(pose[:3]) + turn / shift * np.linalg.norm(pose[3:])) > _FAR_M
+    for start in range(0, len(pose), 6):
+        own, columns = pose[start : start + 6], residuals.pose[:, start : start + 6]
+        turn, shift = (float(np.linalg.norm(columns[:, part], axis=1).mean()) for part in (slice(3, 6), slice(3)))
+        if shift > 0 and np.linalg.norm(own[:3]) + turn / shift * np.linalg.norm(own[3:]) > _FAR_M:
+            return True
+    return False

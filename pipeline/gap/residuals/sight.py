@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
-from pipeline.formats.measurement import Measurement, StereoMeasurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.residuals import Residuals, Rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -31,8 +31,9 @@ class Sight:
     """How the sensor saw n points.
 
     plane: (n, 2) direction as the sensor counts it, rad (azimuth, zenith) or px (column, row), in any units; epoch: (n,); origin:
-    (3,) of the rays, wall frame, m; ray: (n, 3) unit vectors, wall frame; reference_m: (n,) range on the reference along them;
-    disparity: (n,) of the reference less that of infinity, px, None where ranges are measured.
+    (3,) of the rays, or (n, 3) of several scans, which lie apart in `plane`, m; ray: (n, 3) unit vectors, wall frame;
+    reference_m: (n,) range on the reference along them; disparity: (n,) of the reference less that of infinity, px, None where
+    ranges are measured.
     """
 
     plane: FloatArray
@@ -50,14 +51,17 @@ class Sight:
             case StereoMeasurement(), StereoResiduals(geometry=pixels):
                 towards = pixels.point - origin
                 disparity = pixels.disparity - NominalPair.of(measurement).geometry.offset
-            case _, TlsResiduals(geometry=rays):
+            case TlsMeasurement(), TlsResiduals(geometry=rays):
+                origin = _origins(measurement, residuals.index) if measurement.scans else origin
                 towards, reference = measurement.cloud.points[residuals.index] - origin, rays.range_m
             case _:
                 raise TypeError("measurement and residuals are of different sensors")
         length = np.linalg.norm(towards, axis=1)
-        epoch = measurement.epochs[residuals.index]
+        epoch, plane = measurement.epochs[residuals.index], residuals.geometry.plane
+        if isinstance(measurement, TlsMeasurement) and measurement.scans:
+            plane = _apart_by_scan(plane, measurement.scan_of[residuals.index])
         reference = length if reference is None else reference
-        return cls(residuals.geometry.plane, epoch, origin, towards / length[:, None], reference, disparity)
+        return cls(plane, epoch, origin, towards / length[:, None], reference, disparity)
 
     def part(self, rows: Rows) -> Sight:
         """Of some of the points."""
@@ -66,6 +70,7 @@ class Sight:
             plane=self.plane[rows],
             epoch=self.epoch[rows],
             ray=self.ray[rows],
+            origin=self.origin if self.origin.ndim == 1 else self.origin[rows],
             reference_m=self.reference_m[rows],
             disparity=None if self.disparity is None else self.disparity[rows],
         )
@@ -78,7 +83,8 @@ class Sight:
 
     def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
         """(m, 3) places on the rays of some points, wall frame, m."""
-        return np.asarray(self.origin + range_m[:, None] * self.ray[rows])
+        origin = self.origin if self.origin.ndim == 1 else self.origin[rows]
+        return np.asarray(origin + range_m[:, None] * self.ray[rows])
 
     @cached_property
     def even_plane(self) -> FloatArray:
@@ -147,6 +153,23 @@ class Sight:
             area = np.minimum(area, _LARGEST_CELL * np.median(area[touching]))
             total += np.bincount(corners.ravel(), np.repeat(area / 3, 3), len(total))
         return total[rows]
+
+
+def _origins(measurement: TlsMeasurement, index: NDArray[np.int64]) -> FloatArray:
+    """(n, 3) where the rays of points begin."""
+    return np.stack([scan.pose[0] for scan in measurement.scans])[measurement.scan_of[index]]
+
+
+def _apart_by_scan(plane: FloatArray, scan: NDArray[np.int64]) -> FloatArray:
+    """(n, 2) directions with those of each scan beside those of the one before it: what is near in them is near on the wall."""
+    found, start = plane.copy(), 0.0
+    for number in np.unique(scan):
+        rows = scan == number
+        width = float(np.ptp(plane[rows, 0]))
+        found[rows, 0] += start - plane[rows, 0].min()
+        found[rows, 1] -= plane[rows, 1].min()
+        start += 1.25 * width + 1e-6
+    return found
 
 
 def _apart(plane: FloatArray) -> FloatArray:

@@ -106,7 +106,21 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
 
 def with_order(measurement: TlsMeasurement) -> TlsMeasurement:
     """With scan lines and times of all points, so that a part of them keeps them."""
+    if measurement.scans:
+        found = [(rows, with_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
+        line, share = (_scattered([(rows, order[which]) for rows, order in found], len(measurement.scan_of)) for which in (0, 1))
+        return measurement.changed(order=(line, share))
     return measurement.changed(order=_order(measurement, _recorded(measurement)[0]))
+
+
+def _scattered(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: int) -> FloatArray | None:
+    """(count,) values of some rows each; None where some have none."""
+    found = np.zeros(count)
+    for rows, values in parts:
+        if values is None:
+            return None
+        found[rows] = values
+    return found
 
 
 def log_over_median(power: FloatArray) -> FloatArray:
@@ -116,12 +130,13 @@ def log_over_median(power: FloatArray) -> FloatArray:
 
 
 def _recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(n,) azimuth, without jumps, and zenith (rad), and range (m)."""
+    """(n,) azimuth, without jumps, and zenith (rad), as the face counts them, and range (m)."""
     position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
     measured, azimuth, zenith = polar(local)
     middle = np.angle(np.mean(np.exp(1j * azimuth)))  # whichever side of pi the points lie on
-    return middle + np.angle(np.exp(1j * (azimuth - middle))), zenith, measured
+    around = middle + np.angle(np.exp(1j * (azimuth - middle)))
+    return (around, zenith, measured) if measurement.face == 1 else (around + np.pi, 2 * np.pi - zenith, measured)
 
 
 def _surface(scene: RayCaster, position: FloatArray, axes: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -148,12 +163,14 @@ def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArr
 
 
 def _order(measurement: TlsMeasurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
-    """Scan line (from the pattern, or counted in steps told by the gaps of the azimuths) and share of the duration."""
-    line = _lines(measurement.pattern, azimuth)
+    """Scan line (by the pattern, else the points' channel `line`, else gaps of the azimuths) and share of the duration."""
+    stated = measurement.cloud.extra.get("line")
+    known = measurement.pattern is None and stated is not None and bool(np.isfinite(stated).all())
+    line = np.asarray(stated, dtype=np.float64) if known else _lines(measurement.pattern, azimuth)
     time = measurement.cloud.gps_time
     if time is not None and np.ptp(time) > 0:
         return line, _shares(time, measurement.epochs)
-    return line, None if line is None or line.max() == 0 else line / line.max()
+    return line, None if line is None or np.ptp(line) == 0 else (line - line.min()) / np.ptp(line)
 
 
 def _shares(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArray:

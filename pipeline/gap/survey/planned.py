@@ -168,13 +168,18 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
         pair = StereoView(seen.part(_thinned(seen, most)), int(seen.smooth.sum()), 0, measurement)
         return StereoSurvey((pair,), centre, _pair_observer("medium"))
     measurement = measurement.changed(order=None)
-    found = tls_residuals(measurement)
-    view = TlsView(found.part(_thinned(found, most)), int(found.smooth.sum()), 0, measurement)
+    several = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
+    found, *others = [(number, one, tls_residuals(one)) for number, one in several or [(0, measurement)]]
+    views = tuple(
+        TlsView(each.part(_thinned(each, most)), int(each.smooth.sum()), number, one) for number, one, each in (found, *others)
+    )
+    _, measurement, residuals = found
+    view = views[0]
     step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.whole, 1)))
-    reach = float(np.median(found.geometry.range_m))
+    reach = float(np.median(residuals.geometry.range_m))
     steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than a scan where the wall is near
     scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
-    return TlsSurvey((view,), centre, _scan_observer(scanner))
+    return TlsSurvey(views, centre, _scan_observer(scanner))
 
 
 def _thinned(found: Residuals, most: int) -> NDArray[np.int64]:

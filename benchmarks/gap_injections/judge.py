@@ -1,0 +1,79 @@
+"""What is right and wrong in an answer."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+Json = dict[str, Any]
+SIZES = {
+    "range_offset": "offset_m", "range_scale": "scale_ppm", "range_cyclic": "amplitude_m",
+    "range_incidence_bias": "coefficient_m",
+    "range_intensity_bias": "coefficient_m", "range_quantization": "step_m", "range_noise": "sigma_m",
+    "range_noise_proportional": "ppm", "range_noise_incidence": "sigma_m", "range_noise_intensity": "a_m",
+    "vertical_index": "offset_rad", "vertical_eccentricity": "amplitude_rad", "horizontal_eccentricity": "amplitude_rad",
+    "collimation": "angle_rad", "trunnion_tilt": "angle_rad", "wobble": "amplitude_rad", "angle_noise": "zenith_sigma_rad",
+    "principal_point_x": "delta_px", "focal_length": "delta_px", "radial_distortion": "k1", "row_jitter": "amplitude_px",
+    "pixel_locking": "amplitude_px", "parallax_noise": "sigma_px", "regularization_noise": "sigma_px", "smoothing": "sigma_px",
+    "edge_fattening": "radius_px",
+}  # fmt: skip
+"""The parameter by which an effect's size is told."""
+_SIGMAS, _SHARE = 3.0, 0.15
+
+
+def judged(answer: Json) -> Json:
+    """A row of the table.
+
+    judgement: right (named, of the size that was put in, nothing else blamed), class (among those that cannot be told apart),
+    size (named, of another size), wrong (another effect is blamed, beside it or alone), missed (no effect of the catalogue is
+    named, with `described` whether an empirical term is there), refused. Off the catalogue: right where no name is given.
+    """
+    case = answer["case"]
+    effect, said = case["effect"], answer["effects"]
+    physical = [each for each in said if each["kind"] == "physical"]
+    own = next((each for each in physical if _bare(each["name"]) == effect), None)
+    alike = any(effect in map(_bare, each["cannot_be_told_from"]) for each in physical)
+    others = [each for each in physical if each is not own and effect not in map(_bare, each["cannot_be_told_from"])]
+    return {
+        "number": case["number"],
+        "base": case["base"],
+        "effect": effect,
+        "values": case["values"],
+        "strength": answer["strength"],
+        "verdict": answer["verdict"],
+        "named": [_bare(each["name"]) for each in said],
+        "found": None if own is None else _size(own, effect),
+        "judgement": _judgement(answer, effect, own, alike, others),
+        "described": any(each["kind"] == "empirical" for each in said),
+        "gap": answer.get("gap"),
+        "cpu_s": answer.get("cpu_s"),
+    }
+
+
+def _judgement(answer: Json, effect: str, own: Json | None, alike: bool, others: list[Json]) -> str:
+    if answer["verdict"] in ("refused", "error"):
+        return answer["verdict"]
+    if others:
+        return "wrong"
+    if effect.startswith("off_"):
+        return "right" if answer["verdict"] == "unknown" else "missed"
+    if own is None:
+        return "class" if alike else "missed"
+    return "right" if _of_size(own, effect, answer["case"]["values"]) else "size"
+
+
+def _bare(name: str) -> str:
+    return name.partition(".")[2] or name
+
+
+def _size(said: Json, effect: str) -> Json:
+    return said["parameters"][SIZES[effect]]
+
+
+def _of_size(said: Json, effect: str, values: Json) -> bool:
+    """Whether the size is within three standard errors or 15 % of what was put in, and a period within 5 %."""
+    size, true = _size(said, effect), values[SIZES[effect]]
+    off = abs(size["value"] - true)
+    near = off <= max(_SIGMAS * (size["std"] or 0.0), _SHARE * abs(true))
+    periods = [key for key in ("period_m", "lines_per_cycle", "rows_per_cycle") if key in values]
+    return near and all(math.isclose(said["parameters"][key]["value"], values[key], rel_tol=0.05) for key in periods)

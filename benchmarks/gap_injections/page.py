@@ -1,0 +1,129 @@
+"""The table of injections as a page of the documentation."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+from benchmarks.gap_injections.bases import BASES
+from benchmarks.gap_injections.judge import SIZES, Json
+
+_KINDS = ("right", "class", "size", "missed", "wrong", "refused", "error")
+_CLEAR, _STRONG = 8.0, 30.0
+
+_HEAD = """# Known effects put into real scans
+
+Made by
+
+    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections --page docs/gap/injections.md
+
+(by this command, not by hand). Each row is a real measurement of ../shared/data into whose ranges, angles or disparities a known
+effect was put by a closed form (`benchmarks/gap_injections/formulas.py`, NumPy and SciPy alone), diagnosed as `scarpsim gap` does
+it. The measurements have disagreements of their own, which no generator makes: edges, twigs, relief between points, rounding. The
+table beside it, of [the challenge](../gap_challenge.md), has measurements that a generator made.
+
+- **right**: the effect is named, within 3 standard errors or 15 % of what was put in (a period within 5 %), and no other effect
+  is blamed. Of an effect of no catalogue (`off_...`): the answer is `unknown`, and no effect of the catalogue is blamed.
+- **class**: it is among those that the answer says cannot be told apart.
+- **size**: it alone is named, with another size.
+- **missed**: no effect of the catalogue is named (an empirical term may describe it); off the catalogue: no `unknown`.
+- **wrong**: another effect is blamed, alone or beside it.
+
+S/N is that of what the effect does to the residuals beyond what a pose takes up, in white noise of the measurement's own spread
+(means), or of their larger variance (noise); real errors, which neighbours share, make it smaller."""
+
+
+def page(rows: list[Json], bases: dict[str, Json]) -> str:
+    """docs/gap/injections.md."""
+    parts = [
+        _HEAD,
+        "## The measurements as they are\n\n" + _bases(bases),
+        "## In short\n\n" + _counts(rows),
+        _because_of_the_base(rows),
+        "## All injections\n\n" + _rows(rows),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    names = list(head)
+    lines = [names, ["---"] * len(names), *([str(cell) for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _bases(bases: dict[str, Json]) -> str:
+    rows = []
+    for name in [each for each in BASES if each in bases]:
+        found = bases[name]
+        last = found.get("as_diagnosed", found["as_it_is"])
+        rows.append([f"`{name}`", BASES[name].about, f"{last['points']:,}", _verdict(found["as_it_is"]), _base_words(found)])
+    return _table(
+        ("name", "what", "points", "answer", "with the noise that it proposes, which is what effects are put into"), rows
+    )
+
+
+def _base_words(found: Json) -> str:
+    if "as_diagnosed" not in found:
+        return "no other noise proposed: as it is"
+    noise = ", ".join(f"{key} {value:.3g}" for key, value in found["noise"].items())
+    return f"{noise}: {_verdict(found['as_diagnosed'])}"
+
+
+def _verdict(said: Json) -> str:
+    names = ", ".join(each["name"].partition(".")[2] for each in said["effects"])
+    gap = said.get("gap")
+    figures = "" if gap is None else f" ({1e3 * gap['before']:.2g} mm before, {1e3 * gap['floor']:.2g} mm floor)"
+    return f"{said['verdict']}{': ' + names if names else ''}{figures}"
+
+
+def _counts(rows: list[Json]) -> str:
+    groups: list[tuple[str, list[Json]]] = [("all", rows)]
+    groups.append((f"S/N {_STRONG:g} and more", [row for row in rows if (row["strength"] or 0) >= _STRONG]))
+    groups.append((f"S/N {_CLEAR:g} to {_STRONG:g}", [row for row in rows if _CLEAR <= (row["strength"] or 0) < _STRONG]))
+    groups.append((f"S/N below {_CLEAR:g}", [row for row in rows if (row["strength"] or 0) < _CLEAR]))
+    groups += [(f"`{base}`", [row for row in rows if row["base"] == base]) for base in dict.fromkeys(row["base"] for row in rows)]
+    lines = []
+    for name, group in groups:
+        kinds = Counter(row["judgement"] for row in group)
+        lines.append([name, len(group), *(kinds.get(kind, 0) for kind in _KINDS)])
+    return _table(("injections", "number", *_KINDS), lines)
+
+
+def _because_of_the_base(rows: list[Json]) -> str:
+    right = [row for row in rows if row["judgement"] in ("right", "class") and not row["effect"].startswith("off_")]
+    spoiled = [row for row in right if row["verdict"] == "unknown"]
+    return (
+        f"Of the {len(right)} injections of the catalogue that were named right or within their class, the verdict is `unknown` "
+        f"all the same in {len(spoiled)}: what the measurement had before stays open."
+    )
+
+
+def _rows(rows: list[Json]) -> str:
+    lines = [
+        [
+            row["number"],
+            f"`{row['base']}`",
+            row["effect"],
+            _values(row["values"]),
+            "" if row["strength"] is None else f"{row['strength']:.3g}",
+            row["judgement"],
+            row["verdict"],
+            ", ".join(row["named"]) or "nothing",
+            _found(row),
+        ]
+        for row in rows
+    ]
+    return _table(("", "measurement", "put in", "values", "S/N", "judged", "verdict", "named", "size found"), lines)
+
+
+def _values(values: Json) -> str:
+    return ", ".join(f"{key} {value:g}" for key, value in values.items())
+
+
+def _found(row: Json) -> str:
+    found = row["found"]
+    if found is None:
+        return ""
+    error = "" if found["std"] is None else f" ± {found['std']:.2g}"
+    return f"{SIZES[row['effect']]} {found['value']:.3g}{error}"

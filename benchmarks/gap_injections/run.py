@@ -1,0 +1,171 @@
+"""Known effects put into real measurements, each diagnosed as `scarpsim gap` does it, and judged.
+
+    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections [--page docs/gap/injections.md]
+
+Interrupted, it goes on where it was. Under --out: bases/ (the measurements as they are), cases/ (with an effect put into them;
+each is a folder that `scarpsim gap` takes), answers/ and results.json. The data lie in ../shared/data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import time
+import traceback
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.gap_injections.bases import BASES
+from benchmarks.gap_injections.cases import CASES, Case
+from benchmarks.gap_injections.judge import Json, judged
+from benchmarks.gap_injections.page import page
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
+from pipeline.gap.residuals.registration import registered, residuals_of
+from scene.errors import InputError
+
+_ROUNDS = 3
+_NOISES = {
+    "tls.range_noise": "range_sigma_m",
+    "tls.angle_noise": "angle_sigma_rad",
+    "stereo.parallax_noise": "parallax_sigma_px",
+}
+"""White noises that a model has as such."""
+
+
+def base_folder(name: str, out: Path) -> Path:
+    """The folder of a measurement without an effect, with the white noise that its own diagnoses propose; made and diagnosed the
+    first time. What else they say stays open."""
+    folder = out / "bases" / name
+    answer = out / "answers" / f"{name}.json"
+    if folder.exists() and answer.exists():
+        return folder
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    BASES[name].make(folder)
+    model = yaml.safe_load((folder / "model.yaml").read_text())
+    said = diagnosed(folder)
+    found: Json = {"as_it_is": said, "noise": {}}
+    for _ in range(_ROUNDS):
+        noise = white_noise(said, model["noise"])
+        if not noise:
+            break
+        model["noise"] |= noise
+        (folder / "model.yaml").write_text(yaml.safe_dump(model))
+        said = diagnosed(folder)
+        found |= {"noise": found["noise"] | noise, "as_diagnosed": said}
+    _write(answer, found)
+    return folder
+
+
+def white_noise(said: Json, believed: dict[str, float]) -> dict[str, float]:
+    """Values of a model's noise by what was said of it: too large, or more white noise beside it."""
+    found = dict(said["lower_noise"])
+    for each in said["effects"]:
+        key = _NOISES.get(each["name"])
+        if key:
+            more = [value["value"] for name, value in each["parameters"].items() if "sigma" in name]
+            found[key] = float(np.hypot(found.get(key, believed[key]), max(more)))
+    return found
+
+
+def diagnosed(folder: Path) -> Json:
+    """What the diagnosis of a folder says, as gap.json has it, with the processor time."""
+    start = time.process_time()
+    try:
+        return {**told(diagnose(read_measurement(folder))), "cpu_s": time.process_time() - start}
+    except InputError as error:
+        return {"verdict": "refused", "error": str(error), "effects": [], "lower_noise": {}}
+    except Exception:
+        return {"verdict": "error", "error": traceback.format_exc()[-2000:], "effects": [], "lower_noise": {}}
+
+
+def told(found: GapDiagnosis) -> Json:
+    gap = found.gap
+    return {
+        "verdict": found.verdict,
+        "effects": [each.to_dict() for each in found.effects],
+        "changes": len(found.changes),
+        "points": len(found.residuals),
+        "p_value": found.remaining["p_value"],
+        "note": found.remaining["note"],
+        "lower_noise": found.remaining["lower_noise"],
+        "gap": None if gap is None else {key: getattr(gap, key) for key in ("before", "after", "floor", "closed")},
+    }
+
+
+def strength(base: Path, folder: Path) -> float | None:
+    """Signal-to-noise of what was put in, in white noise: of the change of the residuals' mean beyond what a pose takes, or of
+    their variance, whichever is larger; None where a folder cannot be read."""
+    try:
+        before, after = (residuals_of(read_measurement(each)) for each in (base, folder))
+    except InputError:
+        return None
+    value, _, scale = registered(before)
+    wider = registered(after)[2]
+    there = after.of_points(after.value, before.index)
+    used = before.smooth & np.isfinite(there) & (np.abs(value) < 4 * scale * before.sigma)
+    change, sigma = (there - before.value)[used], scale * before.sigma[used]
+    if not used.any():
+        return None
+    steady = change - before.pose[used] @ np.linalg.lstsq(before.pose[used] / sigma[:, None], change / sigma, rcond=None)[0]
+    mean = float(np.sqrt(np.sum((steady / sigma) ** 2)))
+    spread = float(abs((wider / scale) ** 2 - 1) * np.sqrt(used.sum() / 2))
+    random = np.median(np.abs(np.diff(steady))) > 0.5 * np.median(np.abs(steady - np.median(steady)))
+    return spread if random else max(mean, spread)
+
+
+def answered(case: Case, out: Path) -> Json:
+    """The answer to a case, kept under `out`."""
+    path = out / "answers" / f"{case.name}.json"
+    if path.exists():
+        return json.loads(path.read_text())
+    base, folder = base_folder(case.base, out), out / "cases" / case.name
+    BASES[case.base].put(base, folder, case.effect, case.values, case.number)
+    found = {"case": asdict(case), "strength": strength(base, folder), **diagnosed(folder)}
+    _write(path, found)
+    return found
+
+
+def _write(path: Path, values: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(values, indent=1, default=float))
+
+
+def run(out: Path, cases: tuple[Case, ...] = CASES) -> list[Json]:
+    """Answers with what is right and wrong in them."""
+    found = []
+    for case in cases:
+        row = judged(answered(case, out))
+        print(f"{case.name} {case.base} {case.effect} {row['judgement']}: {row['verdict']} {row['named']}", flush=True)
+        found.append(row)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", default=[], metavar="BASE", help="measurements to use (default: all)")
+    parser.add_argument("--page", type=Path, help="write the table there")
+    parser.add_argument("--answered", action="store_true", help="make no further answers, judge those that are there")
+    arguments = parser.parse_args()
+    wanted = [case for case in CASES if not arguments.only or case.base in arguments.only]
+    if arguments.answered:
+        wanted = [case for case in wanted if (arguments.out / "answers" / f"{case.name}.json").exists()]
+    rows = run(arguments.out, tuple(wanted))
+    bases = {name: json.loads((arguments.out / "answers" / f"{name}.json").read_text()) for name in {row["base"] for row in rows}}
+    _write(arguments.out / "results.json", {"rows": rows, "bases": bases})
+    if arguments.page:
+        arguments.page.write_text(page(rows, bases))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Several scans with one instrument as one set of residuals: one set of effects, and a pose for each set-up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.measurement import TlsMeasurement
+from pipeline.gap.residuals.scan_simulation import simulate_ranges
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.model import TlsModel
+
+
+def scans_residuals(measurement: TlsMeasurement) -> TlsResiduals:
+    """Residuals of all scans, in the order of the measurement's points. pose: (n, 6 k), six columns for each of k set-ups."""
+    count = 1 + max((scan.set_up for scan in measurement.scans), default=0)
+    parts = []
+    for scan, rows, one in measurement.each_scan():
+        found = tls_residuals(one)
+        pose = np.zeros((len(found), 6 * count))
+        pose[:, 6 * scan.set_up : 6 * scan.set_up + 6] = found.pose
+        parts.append(replace(found, pose=pose, index=rows[found.index]))
+    whole = _joined(parts)
+    return whole.part(np.argsort(whole.index, kind="stable"))
+
+
+def _joined(parts: Sequence[TlsResiduals]) -> TlsResiduals:
+    """One set of them, with the covariates that all have."""
+    arrays = ("value", "sigma", "unit_m", "smooth", "even", "pose", "at", "index")
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    shared = [name for name in parts[0].covariates if all(name in part.covariates for part in parts)]
+    columns["covariates"] = {name: np.concatenate([part.covariates[name] for part in parts]) for name in shared}
+    geometries = [part.geometry for part in parts]
+    pulses: dict[str, Any] = {}
+    for field in fields(geometries[0]):
+        values = [getattr(each, field.name) for each in geometries]
+        pulses[field.name] = None if any(value is None for value in values) else np.concatenate(values)
+    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    return replace(parts[0], **columns, geometry=replace(geometries[0], **pulses), notes=notes)
+
+
+def simulate_departures(measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom) -> FloatArray:
+    """(n,) simulated minus geometric range of the residuals' points, of one scan or several, NaN without a return."""
+    rays = residuals.geometry
+    if not measurement.scans:
+        return simulate_ranges(measurement, model, rays, random) - np.asarray(rays.range_m)
+    scan_of, found = measurement.scan_of[residuals.index], np.full(len(residuals), np.nan)
+    for number, scan in enumerate(measurement.scans):
+        rows = np.flatnonzero(scan_of == number)
+        if len(rows):
+            one, seen = measurement.changed(station=scan.pose, face=scan.face, scans=()), rays.part(rows)
+            found[rows] = simulate_ranges(one, model, seen, random.child("scan", number)) - seen.range_m
+    return found

@@ -1,0 +1,134 @@
+"""Several scans of one instrument in one diagnosis: a pose for each set-up, one set of effects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from gap_cases import WIDTH, write_scan
+from numpy.testing import assert_allclose
+
+from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.gap.naming.workflow import diagnose
+from pipeline.gap.report.report import to_dict
+from pipeline.gap.residuals.registration import registered, residuals_of
+from pipeline.gap.residuals.several_scans import simulate_departures
+from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, with_order
+from scene.errors import InputError
+from scene.keyed_random import KeyedRandom
+from sensors.model import TlsModel
+
+HERE, NEAR = (WIDTH * 0.42, -34.0, 2.5), (WIDTH * 0.55, -20.0, 1.0)
+
+
+def index(offset_rad: float) -> Any:
+    """An error of the vertical index."""
+    return lambda azimuth, zenith, line: (0 * azimuth, offset_rad + 0 * zenith)
+
+
+def of(folder: Path, *scans: Any, **how: Any) -> TlsMeasurement:
+    folder.mkdir()
+    write_scan(folder, 5, scans=scans, **how)
+    found = read_measurement(folder)
+    assert isinstance(found, TlsMeasurement)
+    return found
+
+
+def rows_of(found: TlsResiduals, measurement: TlsMeasurement, number: int) -> Any:
+    return measurement.scan_of[found.index] == number
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> TlsMeasurement:
+    """From two places, without an effect."""
+    return with_order(of(tmp_path_factory.mktemp("scans") / "pair", (HERE, 1), (NEAR, 1), step_rad=0.02))
+
+
+@pytest.fixture(scope="module")
+def residuals(pair: TlsMeasurement) -> TlsResiduals:
+    found = residuals_of(pair)
+    assert isinstance(found, TlsResiduals)
+    return found
+
+
+def test_each_scan_has_the_residuals_that_it_has_alone(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
+    for number, (_, rows, one) in enumerate(pair.each_scan()):
+        alone = residuals_of(one)
+        here = residuals.part(rows_of(residuals, pair, number))
+        assert_allclose(here.value, alone.value)
+        assert (here.index == rows[alone.index]).all()
+        assert_allclose(here.pose[:, 6 * number : 6 * number + 6], alone.pose)
+        assert not here.pose[:, 6 - 6 * number : 12 - 6 * number].any()
+
+
+def test_every_set_up_is_registered_for_itself(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
+    """Moved by its own pose, each scan's residuals are what slopes said, to second order."""
+    pose = np.array([0.004, -0.003, 0.002, 1e-5, 2e-5, -3e-5, -0.002, 0.001, 0.003, -2e-5, 1e-5, 4e-5])
+    moved = residuals_of(pair.moved(pose))
+    common = np.isin(residuals.index, moved.index) & residuals.smooth
+    change = moved.of_points(moved.value, residuals.index)[common] - residuals.value[common]
+    assert_allclose(np.quantile(np.abs(change + residuals.pose[common] @ pose), 0.95), 0, atol=3e-4)
+    assert len(registered(residuals)[1]) == 12
+
+
+def test_simulation_stands_where_each_scan_did(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
+    quiet = TlsModel(noise={"range_sigma_m": 0.0, "angle_sigma_rad": 0.0})
+    found = simulate_departures(pair, quiet, residuals, KeyedRandom(1))
+    assert_allclose(found[residuals.smooth], 0, atol=1e-5)
+
+
+def test_scans_lie_apart_as_the_scanner_sees_them(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
+    sight = Sight.of(pair, residuals)
+    first, second = (sight.plane[rows_of(residuals, pair, number), 0] for number in (0, 1))
+    assert first.max() < second.min()
+    assert_allclose(sight.points_at(np.arange(len(residuals)), sight.reference_m)[:, :2], residuals.at, atol=0.05)
+
+
+def test_the_second_face_counts_angles_on(tmp_path: Path) -> None:
+    """Azimuth turned by pi, zenith angle 2 pi less: slopes by the zenith turn their sign, those by the pose stay."""
+    both = of(tmp_path / "faces", (HERE, 1), (HERE, 2), step_rad=0.02)
+    found = residuals_of(both)
+    assert isinstance(found, TlsResiduals)
+    assert found.pose.shape[1] == 6
+    first, second = (found.part(rows_of(found, both, number)) for number in (0, 1))
+    assert first.geometry.zenith.max() < np.pi < second.geometry.zenith.min()
+    assert_allclose(np.median(second.geometry.azimuth) - np.median(first.geometry.azimuth), np.pi, atol=0.02)
+    assert_allclose(np.median(second.geometry.by_zenith), -np.median(first.geometry.by_zenith), rtol=0.05)
+    assert_allclose(np.median(second.pose, axis=0), np.median(first.pose, axis=0), rtol=0.1, atol=0.05)
+
+
+@pytest.mark.slow
+def test_an_ambiguous_effect_is_named_with_both_faces(tmp_path: Path) -> None:
+    """A vertical index, which a window of one face shows no better than a vertical eccentricity; the other is asked for."""
+    how = {"step_rad": 0.008, "angles": index(2e-4)}
+    alone = diagnose(of(tmp_path / "one", (HERE, 1), **how))
+    assert alone.verdict == "ambiguous"
+    assert {alone.effects[0].name, *alone.effects[0].alike} == {"tls.vertical_index", "tls.vertical_eccentricity"}
+    assert "second face" in alone.effects[0].split_by
+    measurement = of(tmp_path / "faces", (HERE, 1), (HERE, 2), **how)
+    found = diagnose(measurement)
+    assert found.verdict == "named"
+    assert found.effects[0].name == "tls.vertical_index"
+    assert found.effects[0].alike == ()
+    assert found.effects[0].entry["offset_rad"] == pytest.approx(2e-4, abs=3 * found.effects[0].std["offset_rad"])
+    assert "further_registrations" not in to_dict(found, measurement)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"scanners": [{"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}]}, "1 poses for 2 files"),
+        ({"scanner": {"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}}, "stands instead of 'scanner'"),
+        ({"scanners": [{"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist(), "face": 3}] * 2}, "face"),
+    ],
+)
+def test_poses_that_are_not_one_for_each_file_are_refused(keys: dict[str, Any], said: str, tmp_path: Path) -> None:
+    write_scan(tmp_path, 5, scans=[(HERE, 1), (HERE, 2)], step_rad=0.05)
+    path = tmp_path / "measurement.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | keys))
+    with pytest.raises(InputError, match=said):
+        read_measurement(tmp_path)
