@@ -19,7 +19,7 @@ from pathlib import Path
 
 from measure import bare_cast, empty_kernel_cache, medians, peak_memory_gb, seconds
 
-from pipeline.formats.measurement import Measurement, read_measurement
+from pipeline.formats.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.registration import residuals_of
 from scene.upload import vectors_on_device
@@ -47,8 +47,7 @@ def report(folder: Path) -> None:
 
 def bare(measurement: Measurement) -> Callable[[], None]:
     """The bare cast of one ray to every point."""
-    if measurement.cameras is None:
-        assert measurement.station is not None
+    if isinstance(measurement, TlsMeasurement):
         origin = measurement.station[0]
     else:
         origin = measurement.cameras.in_wall_frame(measurement.frame).left.position
