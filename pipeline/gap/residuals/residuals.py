@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
@@ -87,6 +88,11 @@ class Residuals(ABC):
     def observed(self) -> FloatArray:
         """(n,) measured minus geometric observable, without any effect of the model, as if all epochs had one place."""
         return self.geometry.departure if self.away is None else self.geometry.departure - self.away
+
+    @cached_property
+    def orders(self) -> dict[str, NDArray[np.int32]]:
+        """(n,) rows by the value of each covariate, rising, and where that is the same as they are."""
+        return {name: np.argsort(values, kind="stable").astype(np.int32) for name, values in self.covariates.items()}
 
     def of_points(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
         """(m,) values (n,) of these residuals at the measurement's points `index` (m,); NaN where there is no residual."""

@@ -122,14 +122,22 @@ class Sight:
     def median_around(self, z: FloatArray) -> FloatArray:
         """(n,) median of each point and its ring of neighbours."""
         found = np.empty(len(z))
-        for group, tree in self._trees:
-            near = tree.query(self.even_plane[group], min(NEIGHBOURS + 1, len(group)))[1]
+        for group, near in self._rings:
             found[group] = np.median(z[group][near], axis=1)
         return found
 
+    @cached_property
+    def _rings(self) -> list[tuple[NDArray[np.int64], NDArray[np.int32]]]:
+        """Of each epoch: its points, and for each of them itself and its ring of neighbours, by their place among those."""
+        counts = [min(NEIGHBOURS + 1, len(group)) for group, _ in self._trees]
+        return [
+            (group, tree.query(self.even_plane[group], count, workers=-1)[1].astype(np.int32))
+            for (group, tree), count in zip(self._trees, counts, strict=True)
+        ]
+
     def beside(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
         """(n,) points within some spacings of any of `rows`, whatever their epoch."""
-        distance = cKDTree(self.even_plane[rows]).query(self.even_plane, distance_upper_bound=spacings)[0]
+        distance = cKDTree(self.even_plane[rows]).query(self.even_plane, distance_upper_bound=spacings, workers=-1)[0]
         return np.asarray(np.isfinite(distance))
 
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:

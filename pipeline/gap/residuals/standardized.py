@@ -30,10 +30,9 @@ def standardized(residuals: Residuals, plane: FloatArray, quiet: NDArray[np.bool
 
 def spread(residuals: Residuals, z: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:
     """(n,) largest NMAD that z has, of quiet points, among those of about the same value of one of the covariates."""
-    known = np.flatnonzero(quiet)
-    scale = np.full(len(z), nmad(z[known], 0.0))
-    for values in residuals.covariates.values():
-        scale = np.maximum(scale, _spread_along(values, z, known))
+    scale = np.full(len(z), nmad(z[quiet], 0.0))
+    for name, order in residuals.orders.items():
+        scale = np.maximum(scale, _spread_along(residuals.covariates[name], z, order[quiet[order]]))
     return scale
 
 
@@ -67,9 +66,8 @@ def medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int)
     return found
 
 
-def _spread_along(values: FloatArray, z: FloatArray, known: NDArray[np.int64]) -> FloatArray:
-    """(n,) NMAD of z among the known points with about the same value of a covariate."""
-    order = known[np.argsort(values[known], kind="stable")]
+def _spread_along(values: FloatArray, z: FloatArray, order: NDArray[np.int32]) -> FloatArray:
+    """(n,) NMAD of z among the known points with about the same value of a covariate. order: those points by that, rising."""
     groups = np.array_split(order, int(np.clip(len(order) // _BIN_POINTS, 1, _MOST_BINS)))
     found = np.array([nmad(z[group], 0.0) for group in groups])
     borders = np.array([values[group[0]] for group in groups[1:]])
