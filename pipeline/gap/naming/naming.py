@@ -134,7 +134,7 @@ def name_effects(
     moving = [from_mean(each, found.at) for each in found.estimates]
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
-    share = 1.0 if spread else share_of_spread(found.at, design.cells, left)
+    share = 1.0 if spread else share_of_spread(found.at, design.cells, left, random)
     notes = (*part.notes, *_words(left_out), *filter(None, [words]), *_repeats(found.estimates))
     p_value = found.search.p_value(found.tried[0].score) if found.tried else None
     alone = first.tried(()) if moving else ()

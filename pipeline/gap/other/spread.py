@@ -22,6 +22,8 @@ from sensors.effects.base import Effect, ShowsIn
 DRAWS = 1999
 _LEAST_LEFT = 0.3
 """Share of a point's variance that its cell's plane must leave."""
+_LEAST_OWN, _SHARE_DRAWS = 0.02, 10
+"""Share of a point's variance that counts as its own where a model says there is none; draws of noise that neighbours share."""
 _BINS = 8
 _CUT = 12.0
 """Sigmas at which a far residual is cut off."""
@@ -227,18 +229,33 @@ def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray
     return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * more))
 
 
-def share_of_spread(residuals: Residuals, cells: Cells, value: FloatArray) -> float:
+def share_of_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> float:
     """How many of the predicted standard deviations the residuals really spread where that is clearly less, else 1.
 
     No effect takes noise away: the model's own is too large.
     """
     z = standardised(residuals, cells, value)
     kept = np.isfinite(z)
-    squared = np.minimum(z[kept] ** 2, _CUT**2)
+    squared = np.minimum(z[kept] ** 2, _CUT**2) / _expected_square(residuals, cells, random)
     means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
     below = float(means.sum()) < -decided().spread.block_sigmas * float(np.linalg.norm(means))
     share = float(np.sqrt(squared.mean()))
     return share if below and share < decided().spread.too_noisy else 1.0
+
+
+def _expected_square(residuals: Residuals, cells: Cells, random: KeyedRandom) -> float:
+    """Mean square of standardised deviations from cells where the model is right: of noise that neighbours share, planes take
+    away more than of white noise, by draws of it."""
+    field = residuals.shared_noise.field(len(residuals))
+    if not field.weights.shape[1]:
+        return 1.0
+    own = np.sqrt(np.maximum(residuals.sigma**2 - field.variance, _LEAST_OWN * residuals.sigma**2))
+    root, draws = np.linalg.cholesky(field.covariance), random.child("share").generator()
+    squares = []
+    for _ in range(_SHARE_DRAWS):
+        shared = field.weights @ (root @ draws.standard_normal(len(root)))
+        squares.append(np.nanmean(standardised(residuals, cells, shared + own * draws.standard_normal(len(own))) ** 2))
+    return float(np.mean(squares))
 
 
 def _best_variants(tried: list[SpreadTried]) -> list[SpreadTried]:
