@@ -19,7 +19,7 @@ from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.atomic import new_folder
 from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.result_records import RUN_FILE, read_annotations
-from pipeline.formats.run_files import RunFiles
+from pipeline.formats.run_files import RunFiles, epoch_folder
 from pipeline.report.notebook_progress import python_progress
 from pipeline.report.page import millimetres
 from scene.errors import InputError
@@ -167,7 +167,7 @@ class Epoch:
     @property
     def folder(self) -> Path:
         """Of the epoch's own files."""
-        return self.run._files.epoch_folder(self.number)
+        return epoch_folder(self.run.folder, self.number)
 
     def file(self, kind: str, suffix: str) -> Path:
         """A file of the epoch in the run's folder; raises InputError where the run has none."""

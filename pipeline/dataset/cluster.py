@@ -10,6 +10,7 @@ import logging
 import multiprocessing.resource_tracker
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -159,6 +160,7 @@ def _local(stack: ExitStack, count: int) -> LocalCluster:
     import dask
     from distributed import LocalCluster, Security
 
+    stack.enter_context(_script_kept_from_workers())
     stack.enter_context(
         dask.config.set(
             {
@@ -183,6 +185,22 @@ def _local(stack: ExitStack, count: int) -> LocalCluster:
         raise _LostError(f"the workers do not start ({error})") from None
     stack.callback(_closed, cluster)
     return cluster
+
+
+@contextmanager
+def _script_kept_from_workers() -> Iterator[None]:
+    """Within it new processes do not run the user's script, which would make the set once more in each of them.
+
+    Processes that are spawned import the main module by its name or file; nothing that a worker does is in it.
+    """
+    main = sys.modules["__main__"]
+    held: dict[str, Any] = {name: vars(main)[name] for name in ("__spec__", "__file__") if name in vars(main)}
+    main.__spec__ = None
+    vars(main).pop("__file__", None)
+    try:
+        yield
+    finally:
+        vars(main).update(held)
 
 
 def _client(stack: ExitStack, cluster: LocalCluster) -> Client:

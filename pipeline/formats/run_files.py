@@ -22,6 +22,11 @@ from scene.mesh import TriangleMesh
 RESUME = "go on with it by simulate --resume"
 
 
+def epoch_folder(run: Path, number: int) -> Path:
+    """The folder of an epoch's own files in that of a run."""
+    return run / f"epoch_{number:03d}"
+
+
 @dataclass(frozen=True)
 class RunFiles:
     """A run's folder, read and checked when it is asked for. Raises InputError there for what is no run or was not written."""
@@ -32,10 +37,6 @@ class RunFiles:
     def record(self) -> dict[str, Any]:
         """run.json, as `read_run` gives it."""
         return read_run(self.folder / RUN_FILE, RESUME)
-
-    def epoch_folder(self, number: int) -> Path:
-        """Of an epoch's own files."""
-        return self.folder / f"epoch_{number:03d}"
 
     def surface(self, number: int, name: str = "surface") -> TriangleMesh:
         """The measured surface of an epoch, wall frame; with the name `truth` the wall as it really is."""
@@ -50,7 +51,7 @@ class RunFiles:
 
         In the wall's own coordinates where the run wrote those, else in the wall frame.
         """
-        world = self.epoch_folder(number) / "points_world.laz"
+        world = epoch_folder(self.folder, number) / "points_world.laz"
         if not world.is_file():
             return self.points(number), ""
         crs = (self.record["config"].get("products") or {}).get("crs")
@@ -61,7 +62,7 @@ class RunFiles:
         return read_geotiff(self.folder / f"difference_{number:03d}.tif")
 
     def _written(self, number: int, name: str) -> Path:
-        path = self.epoch_folder(number) / name
+        path = epoch_folder(self.folder, number) / name
         if not path.is_file():
             raise InputError(f"the run did not write {name}", where=str(path.parent), remedy="see `products` in the config")
         return path

@@ -24,12 +24,12 @@ from scipy import stats
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.result_files import read_surface
 from pipeline.formats.result_records import RUN_FILE, read_run
+from pipeline.formats.run_files import epoch_folder
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, fit, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
-from pipeline.run.products import epoch_folder
 from pipeline.run.site import prepare_site
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom

@@ -33,6 +33,7 @@ from pipeline.formats.laz import LazHeader, PulseChannels, write_laz
 from pipeline.formats.pcd import write_pcd
 from pipeline.formats.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.run_files import epoch_folder
 from pipeline.formats.xyz import write_xyz
 from pipeline.report.figures import (
     SCALE_SIGMAS,
@@ -59,10 +60,6 @@ Checksums = dict[str, str]
 """SHA-256 of files, by their names relative to the run's folder."""
 M3C2_ANNOTATIONS = "annotations_m3c2"
 """Key of an epoch's record, and the name of the run's file."""
-
-
-def epoch_folder(out: Path, number: int) -> Path:
-    return out / f"epoch_{number:03d}"
 
 
 def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:

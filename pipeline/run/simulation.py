@@ -21,6 +21,7 @@ from pipeline.formats.crs import wkt_of
 from pipeline.formats.lock import is_free, locked
 from pipeline.formats.own_folders import require_own_folder
 from pipeline.formats.result_records import RUN_FILE, read_run
+from pipeline.formats.run_files import epoch_folder
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
 from pipeline.run.epoch import STAGES, observe_epoch, observe_reference
@@ -28,7 +29,6 @@ from pipeline.run.products import (
     EPOCH_RECORD,
     M3C2_ANNOTATIONS,
     Checksums,
-    epoch_folder,
     is_whole,
     write_epoch,
     write_reference,

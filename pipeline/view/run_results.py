@@ -16,8 +16,8 @@ from pipeline.formats.geotiff import read_geotiff
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.result_files import read_own_points, read_surface
 from pipeline.formats.result_records import RUN_FILE, read_run
+from pipeline.formats.run_files import epoch_folder
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
-from pipeline.run.products import epoch_folder
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, centres, cut, inside
 from scene.errors import InputError
 from scene.grid import Grid

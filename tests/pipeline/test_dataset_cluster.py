@@ -11,6 +11,8 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from importlib.machinery import ModuleSpec
+from multiprocessing.spawn import get_preparation_data
 from pathlib import Path
 from typing import Any
 
@@ -220,3 +222,16 @@ def test_an_interrupt_reaches_the_job_and_prints_no_traceback(tmp_path: Path) ->
     assert process.returncode == 130
     assert "Traceback" not in error
     assert "interrupted" in error
+
+
+def test_workers_do_not_run_the_script_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a spawned process is told of the main module: neither its file nor its name while workers start."""
+    main = sys.modules["__main__"]
+    for spec, file in ((None, "/tmp/my_script.py"), (ModuleSpec("my_package.__main__", None), "/tmp/my_package/__main__.py")):
+        monkeypatch.setattr(main, "__spec__", spec, raising=False)
+        monkeypatch.setattr(main, "__file__", file, raising=False)
+        before = get_preparation_data("worker")
+        assert {"init_main_from_path", "init_main_from_name"} & set(before)
+        with cluster._script_kept_from_workers():
+            assert not {"init_main_from_path", "init_main_from_name"} & set(get_preparation_data("worker"))
+        assert get_preparation_data("worker") == before

@@ -321,7 +321,7 @@ def test_without_a_sensor_the_configs_own_are_inspected(config: Path) -> None:
 def test_a_mistake_is_one_line_and_exit_2(
     words: list[str], message: str, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["inspect", str(config), "--out", str(tmp_path / "plan"), *words]) == 2
+    assert cli.main(["inspect", str(config), "--out", str(tmp_path / "plan"), *words, "--quiet"]) == 2
     output = capsys.readouterr().err
     assert message in output
     assert output.count("\n") == 1
