@@ -101,6 +101,7 @@ OFFSET = {"offset_m": 0.01}
         ([said("range_scale", "scale_ppm", 9.0, 1.0, ["tls.range_offset"])], "class"),
         ([said("range_offset", "offset_m", 0.01, 1e-4), said("wobble", "amplitude_rad", 1.0, 0.1)], "wrong"),
         ([said("range_offset", "offset_m", 0.01, 1e-4), said("range_empirical", "bins", 1.0, 0.1, (), "empirical")], "right"),
+        ([said("range_offset", "offset_m", 0.011, 1e-4, (), "empirical")], "described"),
         ([said("range_empirical", "bins", 1.0, 0.1, (), "empirical")], "missed"),
         ([], "missed"),
     ],

@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.gap_injections.bases import BASES
 from benchmarks.gap_injections.judge import SIZES, Json
 
-_KINDS = ("right", "class", "size", "missed", "wrong", "refused", "error")
+_KINDS = ("right", "class", "described", "size", "missed", "wrong", "refused", "error")
 _CLEAR, _STRONG = 8.0, 30.0
 
 _HEAD = """# Known effects put into real scans
@@ -26,6 +26,7 @@ table beside it, of [the challenge](../gap_challenge.md), has measurements that 
 - **right**: the effect is named, within 3 standard errors or 15 % of what was put in (a period within 5 %), and no other effect
   is blamed. Of an effect of no catalogue (`off_...`): the answer is `unknown`, and no effect of the catalogue is blamed.
 - **class**: it is among those that the answer says cannot be told apart.
+- **described**: it is there with its size, but as an empirical term: the answer gives it for a description, not for the cause.
 - **size**: it alone is named, with another size.
 - **missed**: no effect of the catalogue is named (an empirical term may describe it); off the catalogue: no `unknown`.
 - **wrong**: another effect is blamed, alone or beside it.
