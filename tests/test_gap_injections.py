@@ -110,6 +110,12 @@ def test_answers_are_judged_by_name_and_size(effects: Any, expected: str) -> Non
     assert judged(answer("range_offset", OFFSET, *effects))["judgement"] == expected
 
 
+def test_what_was_there_before_is_not_blamed_on_the_injection() -> None:
+    both = answer("range_offset", OFFSET, said("range_offset", "offset_m", 0.01, 1e-4), said("wobble", "amplitude_rad", 1.0, 0.1))
+    assert judged(both, frozenset(["wobble"]))["judgement"] == "right"
+    assert judged(both, frozenset(["collimation"]))["judgement"] == "wrong"
+
+
 def test_what_is_in_no_catalogue_is_right_where_nothing_is_blamed() -> None:
     assert judged(answer("off_jump", {"size_m": 0.01}, verdict="unknown"))["judgement"] == "right"
     assert judged(answer("off_jump", {"size_m": 0.01}, verdict="no_gap"))["judgement"] == "missed"

@@ -21,8 +21,8 @@ SIZES = {
 _SIGMAS, _SHARE = 3.0, 0.15
 
 
-def judged(answer: Json) -> Json:
-    """A row of the table.
+def judged(answer: Json, before: frozenset[str] = frozenset()) -> Json:
+    """A row of the table. before: effects that the measurement is said to have without an injection, which are not blamed for it.
 
     judgement: right (named, of the size that was put in, nothing else blamed), class (among those that cannot be told apart),
     size (named, of another size), wrong (another effect is blamed, beside it or alone), missed (no effect of the catalogue is
@@ -34,7 +34,8 @@ def judged(answer: Json) -> Json:
     physical = [each for each in said if each["kind"] == "physical"]
     own = next((each for each in physical if _bare(each["name"]) == effect), None)
     alike = any(effect in map(_bare, each["cannot_be_told_from"]) for each in physical)
-    others = [each for each in physical if each is not own and effect not in map(_bare, each["cannot_be_told_from"])]
+    new = [each for each in physical if _bare(each["name"]) not in before]
+    others = [each for each in new if each is not own and effect not in map(_bare, each["cannot_be_told_from"])]
     return {
         "number": case["number"],
         "base": case["base"],
@@ -76,7 +77,8 @@ def _size(said: Json, effect: str) -> Json:
 def _of_size(said: Json, effect: str, values: Json) -> bool:
     """Whether the size is within three standard errors or 15 % of what was put in, and a period within 5 %."""
     size, true = _size(said, effect), values[SIZES[effect]]
-    turned = said["parameters"].get("camera", {}).get("value") == "right"  # the other camera the other way is the same disparity
+    # the other camera the other way is the same disparity; of a wave that is its phase
+    turned = said["parameters"].get("camera", {}).get("value") == "right" and not SIZES[effect].startswith("amplitude")
     off = abs((-size["value"] if turned else size["value"]) - true)
     near = off <= max(_SIGMAS * (size["std"] or 0.0), _SHARE * abs(true))
     periods = [key for key in ("period_m", "lines_per_cycle", "rows_per_cycle") if key in values]

@@ -142,6 +142,13 @@ def answered(case: Case, out: Path) -> Json:
     return found
 
 
+def named_before(base: str, out: Path) -> frozenset[str]:
+    """Effects of the catalogue that a measurement is said to have as it is."""
+    found = json.loads((out / "answers" / f"{base}.json").read_text())
+    last = found.get("as_diagnosed", found["as_it_is"])
+    return frozenset(each["name"].partition(".")[2] for each in last["effects"] if each["kind"] == "physical")
+
+
 def _write(path: Path, values: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(values, indent=1, default=float))
@@ -151,7 +158,7 @@ def run(out: Path, cases: tuple[Case, ...] = CASES) -> list[Json]:
     """Answers with what is right and wrong in them."""
     found = []
     for case in cases:
-        row = judged(answered(case, out))
+        row = judged(answered(case, out), named_before(case.base, out))
         print(f"{case.name} {case.base} {case.effect} {row['judgement']}: {row['verdict']} {row['named']}", flush=True)
         found.append(row)
     return found
