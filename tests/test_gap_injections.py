@@ -101,12 +101,19 @@ OFFSET = {"offset_m": 0.01}
         ([said("range_scale", "scale_ppm", 9.0, 1.0, ["tls.range_offset"])], "class"),
         ([said("range_offset", "offset_m", 0.01, 1e-4), said("wobble", "amplitude_rad", 1.0, 0.1)], "wrong"),
         ([said("range_offset", "offset_m", 0.01, 1e-4), said("range_empirical", "bins", 1.0, 0.1, (), "empirical")], "right"),
+        ([said("range_offset", "offset_m", 0.011, 1e-4, (), "empirical")], "described"),
         ([said("range_empirical", "bins", 1.0, 0.1, (), "empirical")], "missed"),
         ([], "missed"),
     ],
 )
 def test_answers_are_judged_by_name_and_size(effects: Any, expected: str) -> None:
     assert judged(answer("range_offset", OFFSET, *effects))["judgement"] == expected
+
+
+def test_what_was_there_before_is_not_blamed_on_the_injection() -> None:
+    both = answer("range_offset", OFFSET, said("range_offset", "offset_m", 0.01, 1e-4), said("wobble", "amplitude_rad", 1.0, 0.1))
+    assert judged(both, frozenset(["wobble"]))["judgement"] == "right"
+    assert judged(both, frozenset(["collimation"]))["judgement"] == "wrong"
 
 
 def test_what_is_in_no_catalogue_is_right_where_nothing_is_blamed() -> None:

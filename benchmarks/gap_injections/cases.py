@@ -80,7 +80,7 @@ _ROCKS: list[tuple[str, str, Values]] = [
     ("rocks", "range_incidence_bias", {"coefficient_m": 4e-2}),
     ("rocks", "range_noise", {"sigma_m": 3e-2}),
     ("rocks", "range_noise", {"sigma_m": 8e-2}),
-    ("rocks", "range_noise_intensity", {"a_m": 3e-2, "exponent": -0.7}),
+    ("rocks", "range_noise_intensity", {"a_m": 3e-2 * 201**0.7, "exponent": -0.7}),
     ("rocks", "trunnion_tilt", {"angle_rad": 5e-3}),
     ("rocks", "vertical_index", {"offset_rad": 2e-3}),
     ("rocks", "off_jump", {"size_m": 3e-2}),

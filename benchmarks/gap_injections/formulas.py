@@ -81,7 +81,7 @@ def scanned(name: str, p: Values, scan: Scan, rng: np.random.Generator) -> Scan:
         case "range_noise_incidence":
             R = R + p["sigma_m"] * slant * rng.standard_normal(n)
         case "range_noise_intensity":
-            R = R + p["a_m"] * (power / np.median(power)) ** p["exponent"] * rng.standard_normal(n)
+            R = R + p["a_m"] * power ** p["exponent"] * rng.standard_normal(n)
         case "vertical_index":
             ze = ze + p["offset_rad"]
         case "vertical_eccentricity":

@@ -21,19 +21,21 @@ SIZES = {
 _SIGMAS, _SHARE = 3.0, 0.15
 
 
-def judged(answer: Json) -> Json:
-    """A row of the table.
+def judged(answer: Json, before: frozenset[str] = frozenset()) -> Json:
+    """A row of the table. before: effects that the measurement is said to have without an injection, which are not blamed for it.
 
     judgement: right (named, of the size that was put in, nothing else blamed), class (among those that cannot be told apart),
     size (named, of another size), wrong (another effect is blamed, beside it or alone), missed (no effect of the catalogue is
-    named, with `described` whether an empirical term is there), refused. Off the catalogue: right where no name is given.
+    named), described (the effect is there with its size, but as an empirical term, not as the cause), refused. Off the catalogue:
+    right where no name is given.
     """
     case = answer["case"]
     effect, said = case["effect"], answer["effects"]
     physical = [each for each in said if each["kind"] == "physical"]
     own = next((each for each in physical if _bare(each["name"]) == effect), None)
     alike = any(effect in map(_bare, each["cannot_be_told_from"]) for each in physical)
-    others = [each for each in physical if each is not own and effect not in map(_bare, each["cannot_be_told_from"])]
+    new = [each for each in physical if _bare(each["name"]) not in before]
+    others = [each for each in new if each is not own and effect not in map(_bare, each["cannot_be_told_from"])]
     return {
         "number": case["number"],
         "base": case["base"],
@@ -42,9 +44,8 @@ def judged(answer: Json) -> Json:
         "strength": answer["strength"],
         "verdict": answer["verdict"],
         "named": [_bare(each["name"]) for each in said],
-        "found": None if own is None else _size(own, effect),
+        "found": next((_size(each, effect) for each in said if _bare(each["name"]) == effect), None),
         "judgement": _judgement(answer, effect, own, alike, others),
-        "described": any(each["kind"] == "empirical" for each in said),
         "gap": answer.get("gap"),
         "cpu_s": answer.get("cpu_s"),
     }
@@ -58,6 +59,9 @@ def _judgement(answer: Json, effect: str, own: Json | None, alike: bool, others:
     if effect.startswith("off_"):
         return "right" if answer["verdict"] == "unknown" else "missed"
     if own is None:
+        described = [each for each in answer["effects"] if _bare(each["name"]) == effect]
+        if described and _of_size(described[0], effect, answer["case"]["values"]):
+            return "described"
         return "class" if alike else "missed"
     return "right" if _of_size(own, effect, answer["case"]["values"]) else "size"
 
@@ -73,7 +77,9 @@ def _size(said: Json, effect: str) -> Json:
 def _of_size(said: Json, effect: str, values: Json) -> bool:
     """Whether the size is within three standard errors or 15 % of what was put in, and a period within 5 %."""
     size, true = _size(said, effect), values[SIZES[effect]]
-    off = abs(size["value"] - true)
+    # the other camera the other way is the same disparity; of a wave that is its phase
+    turned = said["parameters"].get("camera", {}).get("value") == "right" and not SIZES[effect].startswith("amplitude")
+    off = abs((-size["value"] if turned else size["value"]) - true)
     near = off <= max(_SIGMAS * (size["std"] or 0.0), _SHARE * abs(true))
     periods = [key for key in ("period_m", "lines_per_cycle", "rows_per_cycle") if key in values]
     return near and all(math.isclose(said["parameters"][key]["value"], values[key], rel_tol=0.05) for key in periods)

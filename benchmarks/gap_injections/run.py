@@ -14,7 +14,8 @@ import shutil
 import sys
 import time
 import traceback
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,11 @@ from benchmarks.gap_injections.bases import BASES
 from benchmarks.gap_injections.cases import CASES, Case
 from benchmarks.gap_injections.judge import Json, judged
 from benchmarks.gap_injections.page import page
+from pipeline.change.robust import nmad
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.residuals.registration import registered, residuals_of
+from pipeline.gap.residuals.residuals import Residuals
 from scene.errors import InputError
 
 _ROUNDS = 3
@@ -102,25 +105,29 @@ def told(found: GapDiagnosis) -> Json:
     }
 
 
-def strength(base: Path, folder: Path) -> float | None:
-    """Signal-to-noise of what was put in, in white noise: of the change of the residuals' mean beyond what a pose takes, or of
-    their variance, whichever is larger; None where a folder cannot be read."""
+def strength(effect: str, base: Path, folder: Path) -> float | None:
+    """Signal-to-noise of what was put in, in white noise: of the change of the residuals' mean beyond what a pose takes, or, of
+    noise, of the change of their variance; None where a folder cannot be read."""
     try:
-        before, after = (residuals_of(read_measurement(each)) for each in (base, folder))
+        before, after = registered_residuals(base), registered_residuals(folder)
     except InputError:
         return None
-    value, _, scale = registered(before)
-    wider = registered(after)[2]
-    there = after.of_points(after.value, before.index)
-    used = before.smooth & np.isfinite(there) & (np.abs(value) < 4 * scale * before.sigma)
-    change, sigma = (there - before.value)[used], scale * before.sigma[used]
+    there, spread = after.of_points(after.value, before.index), nmad(before.value[before.smooth] / before.sigma[before.smooth])
+    used = before.smooth & np.isfinite(there) & (np.abs(before.value) < 4 * spread * before.sigma)
     if not used.any():
         return None
-    steady = change - before.pose[used] @ np.linalg.lstsq(before.pose[used] / sigma[:, None], change / sigma, rcond=None)[0]
-    mean = float(np.sqrt(np.sum((steady / sigma) ** 2)))
-    spread = float(abs((wider / scale) ** 2 - 1) * np.sqrt(used.sum() / 2))
-    random = np.median(np.abs(np.diff(steady))) > 0.5 * np.median(np.abs(steady - np.median(steady)))
-    return spread if random else max(mean, spread)
+    sigma = spread * before.sigma[used]
+    if "noise" in effect:
+        return float(abs(nmad(there[used] / sigma) ** 2 - nmad(before.value[used] / sigma) ** 2) * np.sqrt(used.sum() / 2))
+    columns, change = before.pose[used] / sigma[:, None], (there - before.value)[used] / sigma
+    return float(np.linalg.norm(change - columns @ np.linalg.lstsq(columns, change, rcond=None)[0]))
+
+
+@cache
+def registered_residuals(folder: Path) -> Residuals:
+    """Of a measurement's folder."""
+    found = residuals_of(read_measurement(folder))
+    return replace(found, value=registered(found)[0])
 
 
 def answered(case: Case, out: Path) -> Json:
@@ -130,9 +137,16 @@ def answered(case: Case, out: Path) -> Json:
         return json.loads(path.read_text())
     base, folder = base_folder(case.base, out), out / "cases" / case.name
     BASES[case.base].put(base, folder, case.effect, case.values, case.number)
-    found = {"case": asdict(case), "strength": strength(base, folder), **diagnosed(folder)}
+    found = {"case": asdict(case), "strength": strength(case.effect, base, folder), **diagnosed(folder)}
     _write(path, found)
     return found
+
+
+def named_before(base: str, out: Path) -> frozenset[str]:
+    """Effects of the catalogue that a measurement is said to have as it is."""
+    found = json.loads((out / "answers" / f"{base}.json").read_text())
+    last = found.get("as_diagnosed", found["as_it_is"])
+    return frozenset(each["name"].partition(".")[2] for each in last["effects"] if each["kind"] == "physical")
 
 
 def _write(path: Path, values: Any) -> None:
@@ -144,7 +158,7 @@ def run(out: Path, cases: tuple[Case, ...] = CASES) -> list[Json]:
     """Answers with what is right and wrong in them."""
     found = []
     for case in cases:
-        row = judged(answered(case, out))
+        row = judged(answered(case, out), named_before(case.base, out))
         print(f"{case.name} {case.base} {case.effect} {row['judgement']}: {row['verdict']} {row['named']}", flush=True)
         found.append(row)
     return found

@@ -11,13 +11,19 @@ import yaml
 from gap_cases import WIDTH, write_scan
 from numpy.testing import assert_allclose
 
+from pipeline.formats.e57 import E57Scan, write_e57
 from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points import read_points
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
 from pipeline.gap.residuals.registration import registered, residuals_of
 from pipeline.gap.residuals.several_scans import simulate_departures
 from pipeline.gap.residuals.sight import Sight
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, with_order
+from pipeline.gap.survey.identifiability import identifiability
+from pipeline.gap.survey.planned import TlsSurvey, measured_survey
+from pipeline.measurement.build import Request, build
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from sensors.model import TlsModel
@@ -103,12 +109,11 @@ def test_the_second_face_counts_angles_on(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_an_ambiguous_effect_is_named_with_both_faces(tmp_path: Path) -> None:
-    """A vertical index, which a window of one face shows no better than a vertical eccentricity; the other is asked for."""
+    """A vertical index, which a window of one face shows no better than a vertical eccentricity."""
     how = {"step_rad": 0.008, "angles": index(2e-4)}
     alone = diagnose(of(tmp_path / "one", (HERE, 1), **how))
     assert alone.verdict == "ambiguous"
     assert {alone.effects[0].name, *alone.effects[0].alike} == {"tls.vertical_index", "tls.vertical_eccentricity"}
-    assert "second face" in alone.effects[0].split_by
     measurement = of(tmp_path / "faces", (HERE, 1), (HERE, 2), **how)
     found = diagnose(measurement)
     assert found.verdict == "named"
@@ -132,3 +137,34 @@ def test_poses_that_are_not_one_for_each_file_are_refused(keys: dict[str, Any], 
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | keys))
     with pytest.raises(InputError, match=said):
         read_measurement(tmp_path)
+
+
+def test_raw_scans_from_two_places_are_one_measurement(tmp_path: Path) -> None:
+    """As E57 with their poses: `scanners` in the folder, and a word; a half of one is no reference for the other."""
+    write_scan(tmp_path, 5, scans=[(HERE, 1), (NEAR, 1)], step_rad=0.02)
+    files = []
+    for number, pose in enumerate(yaml.safe_load((tmp_path / "measurement.yaml").read_text())["scanners"]):
+        cloud, rotation = read_points(tmp_path / f"scan_{number}.ply"), np.array(pose["rotation"])
+        files.append(tmp_path / f"{number}.e57")
+        write_e57(files[-1], [E57Scan("one", PointCloud(cloud.points, cloud.intensity), np.array(pose["position_m"]), rotation)])
+    found = build(Request(files, str(tmp_path / "wall.ply"), "riegl_vz400i"), tmp_path / "out")
+    assert "with a pose of its own" in found.summary()
+    measurement = read_measurement(tmp_path / "out")
+    assert isinstance(measurement, TlsMeasurement)
+    assert len(measurement.scans) == 2
+    assert measurement.fit.near > 0.95
+    with pytest.raises(InputError, match="whose half is the reference"):
+        build(Request(files, "half", "riegl_vz400i"), tmp_path / "halves")
+
+
+def test_a_place_from_which_too_little_is_seen_is_not_asked_for(pair: TlsMeasurement, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is no reason to give no answer."""
+
+    def nothing(*_: Any) -> Any:
+        raise InputError("240 of 358 points lie on smooth parts of the wall, 300 are needed", where="station")
+
+    monkeypatch.setattr(TlsSurvey, "moved", nothing)
+    found = identifiability(measured_survey(pair, 600))
+    names = [each.name for each in found.extensions]
+    assert names[0] == "the scan repeated in the second face"
+    assert len(names) == 2

@@ -14,6 +14,8 @@ not average away. Of effects with an amplitude and a phase the amplitude is that
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +26,7 @@ from pipeline.gap.survey.known_points import KnownPoints, known_points
 from pipeline.gap.survey.planned import Survey, View
 from pipeline.gap.survey.spread_identifiability import OtherEffect, others
 from pipeline.gap.survey.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE, SurveyDesign, families_of, label, signatures
+from scene.errors import InputError
 from scene.mesh import FloatArray
 
 NAMED_AT = 8.0
@@ -176,13 +179,18 @@ def table(found: Identifiability) -> str:
 
 
 def _extended(survey: Survey) -> list[tuple[str, tuple[View, ...], KnownPoints | None]]:
-    """The survey with one more measurement each: its name, all views, known points."""
+    """The survey with one more measurement each: its name, all views, known points. What would see too little of the wall is no
+    measurement to ask for."""
     number = max(view.station for view in survey.views) + 1
-    near, aside = survey.moved(0.5, 0.0, number), survey.moved(1.0, np.radians(40.0), number)
-    points, (again, repeated) = known_points(survey.views[0]), survey.repeated(number)
-    return [
-        (f"a second {survey.place} at half the range", (*survey.views, near), None),
-        (f"a second {survey.place} at the same range, 40 degrees aside", (*survey.views, aside), None),
-        (again, (*survey.views, repeated), None),
-        (points.title, survey.views, points),
+    wanted: list[Callable[[], tuple[str, View]]] = [
+        lambda: (f"a second {survey.place} at half the range", survey.moved(0.5, 0.0, number)),
+        lambda: (f"a second {survey.place} at the same range, 40 degrees aside", survey.moved(1.0, np.radians(40.0), number)),
+        lambda: survey.repeated(number),
     ]
+    found: list[tuple[str, tuple[View, ...], KnownPoints | None]] = []
+    for observed in wanted:
+        with suppress(InputError):
+            name, view = observed()
+            found.append((name, (*survey.views, view), None))
+    points = known_points(survey.views[0])
+    return [*found, (points.title, survey.views, points)]
