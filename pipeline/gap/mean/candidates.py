@@ -34,16 +34,26 @@ _DIRECTIONS = (30, 60, 120, 150)
 
 @dataclass(frozen=True)
 class Wave:
-    """A searched sine: columns factor * sin, factor * cos of 2 pi x / period. key: the parameter that holds the period."""
+    """A searched sine: columns factor * sin, factor * cos of 2 pi x / period.
+
+    key: the parameter that holds the period; least: the lowest frequency that is tried.
+    """
 
     key: str
     factor: FloatArray
     x: FloatArray
+    least: float = 0.0
 
     def columns(self, period: float) -> FloatArray:
         """(n, 2) the two columns at one period."""
         angle = 2 * np.pi / period * self.x
         return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+    def refined(self, period: float, change: float) -> float:
+        """A period whose frequency is changed: by a third of what the reach of x tells apart at a time, and not below the lowest that
+        is tried, where a sine is not told from a slope."""
+        step = 0.3 / float(np.ptp(self.x))
+        return 1 / max(1 / period + float(np.clip(change, -step, step)), self.least)
 
     def with_slope(self, period: float, coefficients: FloatArray) -> FloatArray:
         """(n, 3) the two columns, and the change of their sum, weighted by `coefficients` (2,), by the frequency 1 / period."""
@@ -53,7 +63,7 @@ class Wave:
 
     def part(self, rows: Rows) -> Wave:
         """The wave on some of the points."""
-        return Wave(self.key, self.factor[rows], self.x[rows])
+        return Wave(self.key, self.factor[rows], self.x[rows], self.least)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +200,7 @@ def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> l
         _free(covariate, "parabola", smooth[:, :2]),
         _free(covariate, "smooth", smooth),
         *(_free(covariate, "step", (x > place).astype(np.float64)[:, None]) for place in steps),
-        *(SineGrid(covariate, "amplitude", Wave("period", np.ones_like(x), x), tried, {}, True) for tried in waves),
+        *(SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True) for tried in waves),
     ]
 
 
@@ -204,7 +214,7 @@ def angle_forms(angle: str, covariate: str, values: FloatArray, lever: FloatArra
     smooth = _smooth(x) * lever[:, None]
     forms = [_free(covariate, "line", smooth[:, :1]), _free(covariate, "smooth", smooth)]
     waves = _waves(x, _MOST_CYCLES_OF_A_CIRCLE) if angle == covariate else []
-    found = [SineGrid(covariate, "amplitude", Wave("period", lever, x), tried, {}, True, angle) for tried in waves]
+    found = [SineGrid(covariate, "amplitude", _wave(lever, x, tried), tried, {}, True, angle) for tried in waves]
     return [*(replace(form, angle=angle) for form in forms), *found]
 
 
@@ -227,6 +237,10 @@ def _waves(x: FloatArray, most_cycles: float, highest: float = np.inf) -> list[F
     tried = frequencies(0.8 / reach, most_cycles / reach, 0.5 / reach)
     tried = tried[tried < highest]
     return [tried] if len(tried) > 1 else []
+
+
+def _wave(factor: FloatArray, x: FloatArray, tried: FloatArray) -> Wave:
+    return Wave("period", factor, x, float(tried[0]))
 
 
 def moved_to(candidate: Candidate, period: float) -> Candidate:

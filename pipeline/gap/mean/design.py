@@ -192,9 +192,7 @@ class Design:
                     if candidate.wave is None:
                         continue
                     if slopes[index] is not None and number:
-                        reach = 0.3 / float(np.ptp(candidate.wave.x))
-                        period = 1 / (1 / candidate.period + float(np.clip(values[2], -reach, reach)))
-                        found[index] = moved_to(candidate, period)
+                        found[index] = moved_to(candidate, candidate.wave.refined(candidate.period, float(values[2])))
                     slopes[index] = values[:2]
         return found, self.fit(found, slopes)
 

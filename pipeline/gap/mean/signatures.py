@@ -88,9 +88,8 @@ def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: d
     angle = 2 * np.pi * x / search.shortest
     columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
     factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
-    yield SineGrid(
-        effect.tag(), amplitude, Wave(search.period, factor, x), frequencies(low, 1 / search.shortest, 0.3 / reach), fixed
-    )
+    tried = frequencies(low, 1 / search.shortest, 0.3 / reach)
+    yield SineGrid(effect.tag(), amplitude, Wave(search.period, factor, x, low), tried, fixed)
 
 
 def _of_cameras(
@@ -135,7 +134,7 @@ def _locking(geometry: PixelGeometry) -> list[SineGrid]:
     reach = max(float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99]))), 1.0)
     one = np.ones_like(geometry.disparity)
     return [
-        SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity), tried)
+        SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity, float(tried[0])), tried)
         for reduction in _REDUCTIONS
         if (tried := frequencies((1 - _SCALE_UNKNOWN) / reduction, (1 + _SCALE_UNKNOWN) / reduction, 0.3 / reach, 80)).size
     ]
