@@ -29,7 +29,7 @@ from pipeline.formats.measurement_checks import (
     check_seen,
     finite,
 )
-from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.point_cloud import SCAN, PointCloud, joined
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
 from pipeline.formats.scanner_poses import Face, Pose, Scanned, ScannerPose, ScannerScan, set_ups
@@ -46,8 +46,6 @@ from sensors.effects.base import Sensor
 from sensors.model import StereoModel, TlsModel
 
 FILE = "measurement.yaml"
-SCAN = "scan"
-"""Channel of points: the number of the scan, of several."""
 MOST_EPOCHS = 1000
 _NAME_CAMERAS = "name cameras.yaml or a Metashape XML"
 
@@ -362,7 +360,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     said = [(reference, (*material.notes, words))]
     for name, each in zip(material.points, clouds, strict=True):
         said.append((name, _rounding(each.points, config, model, cameras, name)))
-    cloud = _joined(clouds, SCAN if config.scanners else "epoch")
+    cloud = joined(clouds, SCAN if config.scanners else "epoch")
     found = _of_sensor(
         config,
         material,
@@ -474,20 +472,6 @@ def _all_in_wall_frame(config: MeasurementConfig, clouds: list[PointCloud], join
         return _in_wall_frame(joined, config.frame, config.scanner, frame)
     parts = [_in_wall_frame(cloud, config.frame, pose, frame) for cloud, pose in zip(clouds, config.scanners, strict=True)]
     return replace(joined, points=np.concatenate([part.points for part in parts]))
-
-
-def _joined(clouds: list[PointCloud], counted: str) -> PointCloud:
-    """One cloud of all files, with the channels that all have; a channel `counted` counts the files, whatever a file calls so."""
-    if len(clouds) == 1:
-        return replace(clouds[0], extra={name: values for name, values in clouds[0].extra.items() if name not in ("epoch", SCAN)})
-    shared = set.intersection(*(set(cloud.extra) for cloud in clouds))
-    columns: dict[str, Any] = {}
-    for name in ("intensity", "gps_time"):
-        parts = [getattr(cloud, name) for cloud in clouds]
-        columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
-    extra = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in sorted(shared - {"epoch", SCAN})}
-    extra[counted] = np.repeat(np.arange(len(clouds)), [len(cloud.points) for cloud in clouds])
-    return PointCloud(np.concatenate([cloud.points for cloud in clouds]), extra=extra, **columns)
 
 
 def _in_wall_frame(

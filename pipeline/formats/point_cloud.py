@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from scene.mesh import FloatArray
+
+SCAN = "scan"
+"""Channel of points: the number of the scan, of several."""
+_COUNTERS = ("epoch", SCAN)
 
 
 @dataclass(frozen=True)
@@ -31,3 +36,17 @@ class PointCloud:
             gps_time=None if self.gps_time is None else self.gps_time[rows],
             extra={name: values[rows] for name, values in self.extra.items()},
         )
+
+
+def joined(clouds: list[PointCloud], counted: str) -> PointCloud:
+    """One cloud of all files, with the channels that all have; a channel `counted` counts the files, whatever a file calls so."""
+    if len(clouds) == 1:
+        return replace(clouds[0], extra={name: values for name, values in clouds[0].extra.items() if name not in _COUNTERS})
+    shared = set.intersection(*(set(cloud.extra) for cloud in clouds))
+    columns: dict[str, Any] = {}
+    for name in ("intensity", "gps_time"):
+        parts = [getattr(cloud, name) for cloud in clouds]
+        columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
+    extra = {name: np.concatenate([cloud.extra[name] for cloud in clouds]) for name in sorted(shared - set(_COUNTERS))}
+    extra[counted] = np.repeat(np.arange(len(clouds)), [len(cloud.points) for cloud in clouds])
+    return PointCloud(np.concatenate([cloud.points for cloud in clouds]), extra=extra, **columns)
