@@ -50,8 +50,10 @@ class Wave:
         return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
     def refined(self, period: float, change: float) -> float:
-        """A period whose frequency is changed: by a third of what the reach of x tells apart at a time, not below the lowest that is
-        tried, where a sine is not told from a slope."""
+        """A period whose frequency is changed: by a third of what the reach of x tells apart at a time.
+
+        It stays at the lowest that is tried, below which a sine is not told from a slope.
+        """
         step = 0.3 / float(np.ptp(self.x))
         return 1 / max(1 / period + float(np.clip(change, -step, step)), self.least)
 
