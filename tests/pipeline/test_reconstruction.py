@@ -155,7 +155,7 @@ def test_maps_that_disagree_are_an_error(pycolmap: Any) -> None:
 def test_without_pycolmap_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     left, right = maps()
-    with pytest.raises(InputError, match="uv sync --extra colmap"):
+    with pytest.raises(InputError, match="make setup EXTRAS=colmap"):
         colmap_surface(left, right, *labels(left), SurfaceConfig(), FusionConfig())
 
 
