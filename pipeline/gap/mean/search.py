@@ -159,7 +159,7 @@ class MeanSearch:
         """A candidate by itself."""
         best = next(item for item in self.tried(()) if item.name == candidate.name and not item.empirical)
         item = replace(best, candidate=candidate)
-        return Choice(self).chosen((item,), item)
+        return Choice(self).chosen((item,), item, {})
 
 
 def _of_one_kind(one: Tried, other: Tried) -> bool:

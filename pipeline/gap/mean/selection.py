@@ -36,6 +36,8 @@ class Tried:
 
 Members = tuple[Tried, ...]
 """Effects that stand together."""
+Scores = dict[frozenset[str], float]
+"""Of sets of effects, by their names."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,13 @@ def class_margin(gain: float) -> float:
     return max(decided().mean.class_margin, decided().mean.class_share * gain)
 
 
+def _in_its_place(names: frozenset[str], name: str, margin: float, scores: Scores) -> list[str]:
+    """Names in the place of which a set would score as well, best first."""
+    others, least = names - {name}, scores.get(names, math.inf) - margin
+    as_good = [each for each, score in scores.items() if others < each and len(each) == len(names) and score > least]
+    return [other for each in sorted(as_good, key=lambda each: -scores[each]) for other in each - others if other != name]
+
+
 def _weak(form: Tried | None) -> float:
     """Score of a free form that is too weak to be said, and that a weak effect of the catalogue has to do better than; else 0."""
     return form.score if form is not None and form.score < decided().mean.least_free_score else 0.0
@@ -135,44 +144,45 @@ class Choice:
     def select(self) -> tuple[list[Chosen], tuple[Tried, ...]]:
         """Explanations, and what was tried beside all of them."""
         empty = _Set((), 0.0, self.search.tried(()))
-        levels = [[empty]]
+        levels, scores = [[empty]], Scores()
         while len(levels) <= decided().mean.most_effects:
-            grown = self._grown(levels[-1])
+            grown, of_sets = self._grown(levels[-1])
             if not grown or not self._significant(grown[0].score - levels[-1][0].score):
                 break
             levels.append(grown)
+            scores |= of_sets
         best = levels[-1][0]
         members, form = self._free(levels) or ((), None)
         form = None if form is None else self.search.folded(members, form)
         if form is not None and not self.search.may_be_the_reference(members, form):
-            chosen = [self.chosen(members, item) for item in members]
+            chosen = [self.chosen(members, item, scores) for item in members]
             chosen.append(Chosen(form.candidate, (), self.search.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.search.tried(members)
-        best, chosen = self._beyond_places(best)
+        best, chosen = self._beyond_places(best, scores)
         if best.score <= max(empty.decoy, _weak(empty.free)):  # no effect of the catalogue says it as well
             return [], empty.tried
         return chosen, best.tried
 
-    def _beyond_places(self, found: _Set) -> tuple[_Set, list[Chosen]]:
+    def _beyond_places(self, found: _Set, scores: Scores) -> tuple[_Set, list[Chosen]]:
         """A set without effects that, beside its others, say no more than mere places do beside all of them."""
-        chosen = [self.chosen(found.members, item) for item in found.members]
+        chosen = [self.chosen(found.members, item, scores) for item in found.members]
         least = min(chosen, key=lambda each: each.score, default=None)
         if least is None or least.score > found.decoy:
             return found, chosen
         members = tuple(item for item, each in zip(found.members, chosen, strict=True) if each is not least)
-        return self._beyond_places(_Set(members, found.score - least.score, self.search.tried(members)))
+        return self._beyond_places(_Set(members, found.score - least.score, self.search.tried(members)), scores)
 
-    def _grown(self, level: list[_Set]) -> list[_Set]:
-        """The best sets of one effect more, best first."""
+    def _grown(self, level: list[_Set]) -> tuple[list[_Set], Scores]:
+        """The best sets of one effect more, best first, and what each set that was looked at scores."""
         found: dict[frozenset[str], Members] = {}
-        scores: dict[frozenset[str], float] = {}
+        scores = Scores()
         for each in level:
             for item in each.catalogue[:_WIDTH]:
                 names, score = each.names | {item.name}, each.score + item.score
                 if score > scores.get(names, -math.inf):
                     scores[names], found[names] = score, (*each.members, item)
         ranked = sorted(scores, key=lambda names: -scores[names])[:_WIDTH]
-        return [_Set(found[names], scores[names], self.search.tried(found[names])) for names in ranked]
+        return [_Set(found[names], scores[names], self.search.tried(found[names])) for names in ranked], scores
 
     def _free(self, levels: list[list[_Set]]) -> tuple[Members, Tried] | None:
         """A free form that the data ask for beside or in place of effects of the catalogue, and the effects it stands beside."""
@@ -209,14 +219,19 @@ class Choice:
         ]
         return score > len(state.members) * max([0.0, *second])
 
-    def chosen(self, among: Members, item: Tried) -> Chosen:
-        """An effect with those that would do as well in its place beside the others."""
+    def chosen(self, among: Members, item: Tried, scores: Scores) -> Chosen:
+        """An effect with those that would do as well in its place beside the others.
+
+        scores: of sets with other variants of the others, as of another camera, beside which they may do as well.
+        """
         others = tuple(member for member in among if member is not item)
         beside = [each for each in self.search.tried(others) if not each.empirical and each.name not in {o.name for o in others}]
         mine = next(each for each in beside if each.name == item.name)
-        least = mine.score - class_margin(mine.gain)
-        alike = tuple(each.name for each in beside if each is not mine and each.score > least)
-        return Chosen(item.candidate, alike, self.search.p_value(mine.score), mine.gain, mine.score, self.search.tried(others))
+        margin, p_value = class_margin(mine.gain), self.search.p_value(mine.score)
+        alike = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
+        alike += _in_its_place(frozenset(member.name for member in among), item.name, margin, scores)
+        tried = self.search.tried(others)
+        return Chosen(item.candidate, tuple(dict.fromkeys(alike)), p_value, mine.gain, mine.score, tried)
 
     def _significant(self, score: float) -> bool:
         return score >= decided().mean.least_score and self.search.p_value(score) <= decided().mean.significance

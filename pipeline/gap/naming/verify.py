@@ -3,6 +3,7 @@
 Measure: the continuous ranked probability score of measured patches of the wall against an ensemble of simulated ones, in metres;
 a proper score, which neither a wrong mean nor an inflated spread can lower (Gneiting & Raftery 2007, eq. 21, fair ensemble form).
 A patch is scored twice, by the mean and by the standard deviation of its residuals: in single points either drowns in noise.
+Measured and simulated residuals are cut off alike, far out, so that a few points at depth steps do not stand for the wall.
 Floor: the same score of draws of the model itself; no higher than the score after, below which one draw may chance to fall.
 """
 
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
@@ -153,10 +155,14 @@ def measure_gap(
     versions = [_draws(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
     truth, measured = _draws(measurement, after, residuals, random.child("floor")), residuals.observed
     usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
-    reach = largest * residuals.sigma
-    off = np.min([np.abs(measured - np.median(draws, axis=0)) for draws in versions], axis=0)
-    usable &= off < reach
-    versions, truth = [_near(draws, reach) for draws in versions], _near(truth, reach)
+    middles, sigma = [np.median(draws, axis=0) for draws in versions], residuals.sigma
+    off = np.min([np.abs(measured - middle) for middle in middles], axis=0)
+    usable &= off < largest * sigma
+    if not usable.any():
+        return None
+    spread = max(largest, decided().points.outlier * nmad((measured - middles[0])[usable] / sigma[usable], 0.0))
+    low, high = middles[0] - spread * sigma, middles[0] + spread * sigma
+    measured, truth, *versions = (np.clip(each, low, high) for each in (measured, truth, *versions))
     usable &= np.isin(patch, np.flatnonzero(np.bincount(patch[usable], minlength=patch.max() + 1) >= _FEWEST_POINTS))
     if not usable.any():
         return None
@@ -204,12 +210,6 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
         measure=LOSS_MEASURE,
         unit="1",
     )
-
-
-def _near(draws: FloatArray, reach: FloatArray) -> FloatArray:
-    """Draws (d, n) cut off at a reach (n,) from their median: an early return from a drop is no part of the wall."""
-    middle = np.median(draws, axis=0)
-    return np.asarray(np.clip(draws, middle - reach, middle + reach))
 
 
 def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
