@@ -37,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="P",
         help="lowest score that counts, may be given several times (default: 0.9 0.95 0.99)",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for scores.json and scores.csv (default: only print)")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for scores.json, scores.csv and reliability.png (default: only print)"
+    )
     add_output_options(parser)
 
 

@@ -107,6 +107,24 @@ def evaluate(
     return result
 
 
+def matched_scores(
+    truth: Mapping[str, Any],
+    predictions: Sequence[Mapping[str, Any]],
+    images: Iterable[int],
+    threshold: float,
+    kind: Overlap = "segm",
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """(p,) scores of all predictions of some images, and whether each is matched to a block, as `evaluate` matches them all."""
+    blocks, found = _by_image(truth["annotations"]), _by_image(predictions)
+    scores: list[float] = []
+    right: list[bool] = []
+    for image in images:
+        pairs = _image_pairs(blocks.get(image, []), found.get(image, []), 0.0, kind)
+        scores += sorted((item["score"] for item in found.get(image, [])), reverse=True)
+        right += list(matches(pairs.overlap, threshold) >= 0)
+    return np.array(scores, dtype=np.float64), np.array(right, dtype=bool)
+
+
 def coco_metrics(truth: Mapping[str, Any], predictions: Sequence[Mapping[str, Any]], kind: Overlap = "segm") -> dict[str, float]:
     """pycocotools' twelve figures (average precision and recall by overlap, area and count), by name; -1 where undefined."""
     names = (

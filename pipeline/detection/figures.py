@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.detection.detections import Detection
 from pipeline.detection.normalisation import nmad
+from pipeline.detection.reliability import Reliability
 from pipeline.formats.atomic import writing
 from pipeline.report.plain_text import plain_text
 from scene.grid import Grid
@@ -83,6 +84,23 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
         ylabel="y up the wall, m",
         title=title or f"{len(found)} blocks found; numbers as in the table",
     )
+    _write(figure, path)
+
+
+def write_reliability(groups: Sequence[Reliability], path: Path) -> None:
+    """The share of blocks among the detections of about a score against that score, with standard errors; the diagonal is that of
+    scores that are probabilities."""
+    figure = Figure(figsize=(6.4, 5.6), dpi=110, layout="constrained")
+    axes = figure.subplots()
+    axes.plot((0, 1), (0, 1), color="#808080", linestyle="--", linewidth=1, label="a probability")
+    for each in groups:
+        x, y, error = ([getattr(one, name) for one in each.classes] for name in ("score", "precision", "error"))
+        count = sum(one.detections for one in each.classes)
+        axes.errorbar(x, y, error, marker="o", markersize=4, linewidth=1, capsize=2, label=f"{each.group} ({count:,})")
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="score", ylabel="share that are blocks")
+    axes.set_title(f"What a score means (in brackets: detections; overlap by {groups[0].iou:g})", fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
     _write(figure, path)
 
 

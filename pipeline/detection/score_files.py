@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ import numpy as np
 
 from pipeline.change.annotate import STANDS_OUT
 from pipeline.detection.evaluate import CONFIDENCES, Overlap, Score, coco_metrics, evaluate
+from pipeline.detection.figures import write_reliability
+from pipeline.detection.reliability import EDGES, OVERLAP, Reliability, reliability
 from pipeline.formats.atomic import write_json, write_text
 from pipeline.formats.coco import read_coco, read_detections
 from scene.errors import InputError, nearest
@@ -27,15 +30,17 @@ _KINDS: dict[Overlap, str] = {"segm": "masks", "bbox": "boxes"}
 class Assessment:
     """Scores of every group, by overlap of masks and of boxes, and pycocotools' figures over all images.
 
-    coco: by overlap of masks, of boxes where there are no masks.
+    coco, reliability: by overlap of masks, of boxes where there are no masks.
     """
 
     scores: list[Score]
     coco: dict[str, float]
+    reliability: list[Reliability]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON types."""
-        return {"scores": [score.to_dict() for score in self.scores], "coco": self.coco}
+        scores, reliable = ([each.to_dict() for each in found] for found in (self.scores, self.reliability))
+        return {"scores": scores, "coco": self.coco, "reliability": reliable}
 
 
 def assess(
@@ -57,7 +62,8 @@ def assess(
     _check_pairs(reference.annotations, found, str(predictions))
     groups = _groups(reference.images, keys, str(path))
     scores = [score for kind in kinds for score in evaluate(reference.to_dict(), found, groups, confidences, kind=kind)]
-    return Assessment(scores, coco_metrics(reference.to_dict(), found, kinds[0]))
+    reliable = reliability(reference.to_dict(), found, groups, kinds[0])
+    return Assessment(scores, coco_metrics(reference.to_dict(), found, kinds[0]), reliable)
 
 
 def _check_pairs(truth: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]], where: str) -> None:
@@ -90,12 +96,25 @@ def as_text(assessment: Assessment) -> str:
             lines.append(f"{title:<12}" + "".join(_cell(getattr(score, name)) for score in scores))
         if kind == by_group[0][0][1] and not np.isnan(scores[0].stand_out):
             lines.append(f"blocks that stand out from the noise (S/N > {STANDS_OUT:g}): {100 * scores[0].stand_out:.1f} %")
+    lines += ["", *_what_scores_mean(assessment.reliability)]
     coco = "  ".join(f"{name} {value:.3f}" for name, value in assessment.coco.items() if value >= 0)
     return "\n".join([*lines[1:], "", f"COCO: {coco}"])
 
 
+def _what_scores_mean(groups: Sequence[Reliability]) -> Iterator[str]:
+    """The share of blocks among the detections of each class of scores, a line for each group."""
+    yield f"of detections with a score, how many are blocks ({_KINDS[groups[0].kind]} overlap by {OVERLAP:g})"
+    heads = [f"{low:g}-{high:g}" for low, high in pairwise(EDGES)]
+    width = max(len(each.group) for each in groups) + 2
+    yield " " * width + "".join(f"{head:>11}" for head in heads)
+    for each in groups:
+        shares = {one.low: one.precision for one in each.classes}
+        yield f"{each.group:<{width}}" + "".join(f"  {_cell(shares.get(low, float('nan')))}" for low in EDGES[:-1])
+
+
 def write(assessment: Assessment, folder: Path) -> None:
-    """scores.json and scores.csv."""
+    """scores.json, scores.csv and reliability.png."""
+    write_reliability(assessment.reliability, folder / "reliability.png")
     write_json(folder / "scores.json", assessment.to_dict())
     text = io.StringIO()
     rows = [score.to_dict() for score in assessment.scores]

@@ -85,6 +85,12 @@ def test_files_by_name_and_tables(truth, found, tmp_path):
     assert "57.1 %" in as_text(assessment)
     write(assessment, tmp_path / "scores")
     assert len((tmp_path / "scores" / "scores.csv").read_text().splitlines()) == 1 + 2 * 18
+    assert [each["group"] for each in json.loads((tmp_path / "scores" / "scores.json").read_text())["reliability"]] == [
+        "all",
+        "noise high",
+        "noise low",
+    ]
+    assert (tmp_path / "scores" / "reliability.png").stat().st_size > 5000
 
 
 def test_the_tables_say_how_many_blocks_stand_out_where_the_truth_knows(truth, found, tmp_path):
@@ -96,7 +102,7 @@ def test_the_tables_say_how_many_blocks_stand_out_where_the_truth_knows(truth, f
     (tmp_path / "found.json").write_text(json.dumps(found))
     lines = as_text(assess(tmp_path, tmp_path / "found.json")).splitlines()
     assert lines.count("blocks that stand out from the noise (S/N > 4): 50.0 %") == 1
-    assert [line for line in lines if line.startswith("all")] == ["all, IoU of masks", "all, IoU of boxes"]
+    assert [line for line in lines if line.startswith("all,")] == ["all, IoU of masks", "all, IoU of boxes"]
 
 
 @pytest.mark.parametrize(
