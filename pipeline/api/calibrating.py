@@ -100,4 +100,5 @@ class Calibration:
     def _repr_html_(self) -> str:
         table = self.parameters
         rows = {name: f"{row.value:.4g} ({row.low:.4g} to {row.high:.4g})" for name, row in table.iterrows()}
-        return html_table("Calibrated noise", rows | {"note": " ".join(self.warnings) or "none"}, self.plot())
+        notes = {"note": " ".join(self.warnings)} if self.warnings else {}
+        return html_table("Calibrated noise", rows | notes, self.plot())

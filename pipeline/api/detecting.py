@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _COMMAND = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))"
 _WRONG_INPUT = 2
+_SHOWN = 10
+"""Blocks in a notebook's view."""
 _WAITING = "the detector, after TensorFlow, which takes ten seconds and more to load"
 
 
@@ -91,14 +93,17 @@ class Detections:
 
     def summary(self) -> str:
         """One line."""
-        return f"{len(self)} blocks with a score of {self.confidence:g} or more, {self.volume_m3:.3g} m3"
+        return f"{len(self)} blocks with a score of {self.confidence:g} or more, {self.volume_m3:.3g} m³"
 
     def __repr__(self) -> str:
         return f"<Detections: {self.summary()}>"
 
     def _repr_html_(self) -> str:
-        rows = {f"{each.image}, {each.number}": f"{each.volume_m3:.3g} m3, score {each.score:.2f}" for each in self.found[:10]}
-        return html_table(self.summary(), rows, self.plot())
+        rows = {
+            f"{each.image}, {each.number}": f"{each.volume_m3:.3g} m³, score {each.score:.2f}" for each in self.found[:_SHOWN]
+        }
+        more = {"and": f"{len(self) - _SHOWN} more, in .events"} if len(self) > _SHOWN else {}
+        return html_table(self.summary(), rows | more, self.plot())
 
 
 def _several(maps: Any) -> list[Any]:

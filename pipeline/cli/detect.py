@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     with shown_progress(quiet=arguments.quiet) as progress:
         found = detect(arguments.model, arguments.inputs, out, confidences, not arguments.no_pictures, progress)
     volume = sum(item.volume_m3 for item in found)
-    told = f"{len(found)} blocks with a score of {min(confidences):g} or more, {volume:.3g} m3"
+    told = f"{len(found)} blocks with a score of {min(confidences):g} or more, {volume:.3g} m³"
     document = {
         "folder": str(out),
         "confidence": min(confidences),
