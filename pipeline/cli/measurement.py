@@ -53,7 +53,10 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
     )
     parser.add_argument(
-        "--cameras", type=Path, metavar="FILE", help="the points are from photographs: cameras.yaml, Metashape XML, COLMAP folder"
+        "--cameras",
+        type=Path,
+        metavar="FILE",
+        help="the points are from photographs: cameras.yaml, Metashape XML or .psx, COLMAP",
     )
     parser.add_argument("--pair", type=pair, metavar="LEFT,RIGHT", help="which two cameras of a project")
     parser.add_argument("--scan", type=at_least(1), metavar="N", help="take one scan of a file that holds several")

@@ -46,7 +46,7 @@ SensorName = Literal["stereo", "tls"]
 class CamerasFile(Config):
     """A stereo pair out of a file: the project's cameras.yaml, Metashape's camera XML or COLMAP's text model."""
 
-    file: Path = Field(description="cameras.yaml, a Metashape camera XML, or the folder of a COLMAP text model")
+    file: Path = Field(description="cameras.yaml, a Metashape camera XML or project (.psx), or the folder of a COLMAP text model")
     left: str | None = Field(
         None, description="label or image name of the left camera; none: of the only pair, told by where they stand"
     )

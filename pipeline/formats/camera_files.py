@@ -6,8 +6,10 @@ import warnings
 from pathlib import Path
 
 from pipeline.formats.colmap import read_colmap
-from pipeline.formats.metashape import MetashapeCameras, read_calibration, read_metashape, read_root
+from pipeline.formats.metashape import MetashapeCameras, read_calibration, read_metashape
+from pipeline.formats.metashape_project import is_project, project_files
 from pipeline.formats.opencv import read_opencv, read_opencv_text
+from pipeline.formats.xml_file import read_root
 from scene.errors import InputError
 from scene.regular_file import check_file
 from sensors.camera import Camera, CameraPair
@@ -16,7 +18,7 @@ _COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 
 
 def read_oriented(path: Path) -> MetashapeCameras | None:
-    """Cameras with poses by label: Metashape's camera XML, or COLMAP's text model (its folder or a file of it).
+    """Cameras with poses by label: Metashape's camera XML or project, or COLMAP's text model (its folder or a file of it).
 
     None where the file is of another kind, such as the project's cameras.yaml. Raises InputError for a calibration alone.
     """
@@ -35,11 +37,11 @@ def read_oriented(path: Path) -> MetashapeCameras | None:
 
 
 def oriented_files(path: Path) -> list[Path]:
-    """The files of what `read_oriented` reads: COLMAP's model, whose folder may hold others, or `path` alone."""
+    """The files of what `read_oriented` reads: COLMAP's model, whose folder may hold others, a project's, or `path` alone."""
     if path.is_dir() or path.name in _COLMAP_FILES:
         folder = path if path.is_dir() else path.parent
         return [folder / name for name in sorted(_COLMAP_FILES) if (folder / name).exists()]
-    return [path]
+    return project_files(path) if is_project(path) else [path]
 
 
 def read_lens(path: Path) -> Camera:

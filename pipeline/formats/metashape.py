@@ -3,7 +3,8 @@
 Camera XML (File > Export > Export Cameras): a sensor may hold two calibrations, the one of class "adjusted" counts; missing tags
 are 0. A camera without a transform is not aligned. A transform is row-major, camera to chunk; the similarity (s, R, t) of the
 camera's component, or where that has none of the chunk, leads on: x_world = s R x_chunk + t. In a chunk with a projected
-coordinate system (the tag `reference`) that leads to geocentric coordinates, which are taken to the projected ones.
+coordinate system (the tag `reference`) that leads to geocentric coordinates, which are taken to the projected ones. A project
+(.psx) holds the same of its active chunk.
 Calibration XML (Tools > Camera Calibration > Save): one interior orientation.
 """
 
@@ -18,9 +19,10 @@ import numpy as np
 
 from pipeline.formats.atomic import write_bytes
 from pipeline.formats.geocentric import Projection, is_geocentric
+from pipeline.formats.metashape_project import active_chunk, is_project
+from pipeline.formats.xml_file import read_root
 from scene.errors import InputError
 from scene.mesh import FloatArray
-from scene.regular_file import MOST_TEXT_BYTES, check_file
 from sensors.camera import Camera, checked_camera
 
 _TAGS = {"f": "f_px", "cx": "cx_px", "cy": "cy_px"} | {name: name for name in ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")}
@@ -37,7 +39,7 @@ class MetashapeCameras:
 
 
 def read_metashape(path: Path) -> MetashapeCameras:
-    """Read all frame cameras of a Metashape camera XML.
+    """Read all frame cameras of a Metashape camera XML, or of a project's active chunk.
 
     Raises InputError where the file is no such XML, a sensor of an aligned camera is not a frame camera with a calibration, and
     where two cameras have one label.
@@ -114,22 +116,9 @@ def write_calibration(path: Path, camera: Camera) -> None:
     _write(path, root)
 
 
-def read_root(path: Path) -> ElementTree.Element:
-    """The root of an XML file; raises InputError for a file that is none, or that declares entities."""
-    check_file(path, most_bytes=MOST_TEXT_BYTES)
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
-        raise InputError("declares entities, which Metashape never does", where=str(path))
-    try:
-        return ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(f"is not valid XML ({error})", where=str(path), remedy="export it again") from None
-
-
 def _chunk(path: Path) -> ElementTree.Element:
+    if is_project(path):
+        return active_chunk(path)
     root = read_root(path)
     chunk = root.find("chunk") if root.tag == "document" else None
     if chunk is None:

@@ -20,7 +20,7 @@ def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
     Raises InputError where the file does not tell a pair.
     """
     if not path.exists():
-        raise InputError("there is no such file", where=str(path), allowed="cameras.yaml, a Metashape XML, a COLMAP folder")
+        raise InputError("there is no such file", where=str(path), allowed="cameras.yaml, Metashape XML or .psx, a COLMAP folder")
     found = read_oriented(path)
     if found is None:
         return read_cameras_yaml(path)

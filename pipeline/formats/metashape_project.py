@@ -1,0 +1,70 @@
+"""A Metashape project (.psx): a small XML that names an archive, that names the archives of its chunks.
+
+    wall.psx                      <document path="{projectname}.files/project.zip"/>
+    wall.files/project.zip        doc.xml: <chunks active_id="0"><chunk id="0" path="0/chunk.zip"/>
+    wall.files/0/chunk.zip        doc.xml: <chunk> with sensors, components, cameras and transform, as in an exported camera XML
+
+The tags are those of projects of Metashape 1.2 to 2.3, as programs of others read and write them.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+import zipfile
+import zlib
+from pathlib import Path
+
+from pipeline.formats.inside import inside
+from pipeline.formats.xml_file import parsed, read_root
+from scene.errors import InputError
+from scene.regular_file import MOST_TEXT_BYTES, check_file
+
+_DOCUMENT = "doc.xml"
+_EXPORT = "save the project in Metashape again, or export the cameras with File > Export > Export Cameras"
+
+
+def is_project(path: Path) -> bool:
+    """Whether a file is a project, by its name."""
+    return path.suffix.lower() == ".psx"
+
+
+def active_chunk(path: Path) -> ElementTree.Element:
+    """The chunk that was open when the project was saved, or its only one.
+
+    Raises InputError where files of the project are missing or damaged, and where it has several chunks of which none is active.
+    """
+    return _document(project_files(path)[-1], "chunk")
+
+
+def project_files(path: Path) -> list[Path]:
+    """The project, its archive, and that of its active chunk."""
+    root = read_root(path)
+    if root.tag != "document" or root.get("path") is None:
+        raise InputError("is no Metashape project", where=str(path), remedy=_EXPORT)
+    project = inside(path.parent, str(root.get("path")).replace("{projectname}", path.stem), path)
+    document = _document(project, "document")
+    chunks, listed = document.findall("chunks/chunk"), document.find("chunks")
+    number = None if listed is None else listed.get("active_id")
+    chosen = [chunk for chunk in chunks if chunk.get("id") == number] or chunks
+    if len(chosen) != 1:
+        remedy = "open the chunk in Metashape and save the project"
+        raise InputError(f"holds {len(chunks)} chunks, of which none is active", where=str(project), remedy=remedy)
+    return [path, project, inside(project.parent, chosen[0].get("path"), project)]
+
+
+def _document(archive: Path, tag: str) -> ElementTree.Element:
+    """The root of an archive's doc.xml."""
+    check_file(archive)
+    try:
+        with zipfile.ZipFile(archive) as file:
+            if file.getinfo(_DOCUMENT).file_size > MOST_TEXT_BYTES:
+                problem = f"its {_DOCUMENT} has {file.getinfo(_DOCUMENT).file_size / 1e6:,.0f} MB"
+                raise InputError(problem, where=str(archive), allowed=f"{MOST_TEXT_BYTES / 1e6:,.0f} MB", remedy=_EXPORT)
+            text = file.read(_DOCUMENT)
+    except (OSError, zipfile.BadZipFile, zlib.error, KeyError, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        problem = f"is no archive of a Metashape project ({' '.join(str(error).split())[:200]})"
+        raise InputError(problem, where=str(archive), remedy=_EXPORT) from None
+    root = parsed(text, f"{archive}: {_DOCUMENT}")
+    if root.tag != tag:
+        raise InputError(f"begins with <{root.tag}>", where=f"{archive}: {_DOCUMENT}", allowed=f"<{tag}>", remedy=_EXPORT)
+    return root
