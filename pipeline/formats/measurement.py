@@ -212,8 +212,8 @@ class TlsMeasurement(MeasurementBase):
 
     station: scanner to wall frame, of the first scan where there are several; face: in which it was scanned; scans: of several,
     whose numbers are the points' channel `scan`, empty where there is one; pattern: the nominal directions, None where not known;
-    order: each point's scan line and share of the scan's duration (n,), None where not known, once they were counted (see
-    `with_order`).
+    pulses: (m,) those of the pattern that the points are a part of, None for all of them; order: each point's scan line and share
+    of the scan's duration (n,), None where not known, once they were counted (see `with_order`).
     """
 
     sensor = "tls"
@@ -222,6 +222,7 @@ class TlsMeasurement(MeasurementBase):
     face: Face = 1
     scans: tuple[Scanned, ...] = ()
     pattern: ScanPattern | None = None
+    pulses: NDArray[np.bool_] | None = None
     order: tuple[FloatArray | None, FloatArray | None] | None = None
 
     @property

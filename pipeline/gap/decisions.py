@@ -32,6 +32,12 @@ class PointsDecisions(_Group):
     """Which points have a say, and how many there must be."""
 
     fewest: PositiveInt = _by(800, "points", "On smooth, stable rock below which the answer is insufficient_data.", _JUDGEMENT)
+    most: PositiveInt = _by(
+        2_000_000,
+        "points of a laser scan",
+        "Beyond which so many, drawn at random, are looked at.",
+        "memory: 1.5 kB a point; naming rests on 60,000 of them in any case",
+    )
     fewest_epochs: PositiveInt = _by(3, "epochs", "From which on the last is held out as a whole.", _JUDGEMENT)
     outlier: PositiveFloat = _by(
         5.0, "predicted sigmas, times what the residuals spread of them", "Beyond which a point has no say.", _JUDGEMENT

@@ -42,6 +42,7 @@ from pipeline.gap.residuals.registration import registered, residuals_of, settle
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.thinning import thinned
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -110,13 +111,17 @@ def diagnose(
 
     progress: called with the name of each step of `STEPS` that is done; decisions: the thresholds to decide by.
     """
+    clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # the same sums on any number of threads, and none that wait for each other
     with deciding(decisions), threadpool_limits(1, "blas"):
-        return _diagnose(measurement, _Clock(progress), KeyedRandom(seed, ("gap",)))
+        whole = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
+        part, rows = thinned(whole, random.child("thinned"))
+        del whole
+        found = _diagnose(part, clock, random)
+    return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
-    measurement = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
     check_near(measurement.fit)
     first = residuals_of(measurement)
     check_noise(first.sensor, first.sigma)

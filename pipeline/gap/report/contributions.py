@@ -23,13 +23,13 @@ def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
     if len(found.effects) < 2:
         return np.array([found.before - found.after for _ in found.effects]).reshape(-1, len(found.before))
     there = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-    trusted = found.residuals.index[found.residuals.smooth & ~found.held_out]
+    there, trusted = there.part(found.residuals.index), np.flatnonzero(found.residuals.smooth & ~found.held_out)
     return np.stack([found.before - _alone(found, there, number, trusted) for number in range(len(found.effects))])
 
 
 def _alone(found: GapDiagnosis, measurement: Measurement, number: int, trusted: NDArray[np.int64]) -> FloatArray:
-    """(n,) residuals with one effect in the model, those before where there are none."""
+    """(n,) residuals with one effect in the model, those before where there are none. measurement: of these points alone."""
     _, residuals, _ = settled_with(measurement, [found.effects[number]], trusted)
     rest = pose_of(residuals, residuals.smooth & np.isin(residuals.index, trusted))
-    value = residuals.of_points(residuals.value - residuals.pose @ rest, found.residuals.index)
+    value = residuals.of_points(residuals.value - residuals.pose @ rest, np.arange(len(found.before)))
     return np.where(np.isfinite(value), value, found.before)

@@ -63,7 +63,7 @@ class TlsResiduals(Residuals):
 def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     """Range residuals with their predicted spread and covariates; points whose ray misses the surface are left out."""
     (position, rotation), model = measurement.station, measurement.model
-    azimuth, zenith, measured = _recorded(measurement)
+    azimuth, zenith, measured = recorded(measurement)
     line, share = measurement.order or _order(measurement, azimuth)
     intensity = measurement.cloud.intensity
     real = azimuth, zenith
@@ -110,7 +110,7 @@ def with_order(measurement: TlsMeasurement) -> TlsMeasurement:
         found = [(rows, with_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
         line, share = (_scattered([(rows, order[which]) for rows, order in found], len(measurement.scan_of)) for which in (0, 1))
         return measurement.changed(order=(line, share))
-    return measurement.changed(order=_order(measurement, _recorded(measurement)[0]))
+    return measurement.changed(order=_order(measurement, recorded(measurement)[0]))
 
 
 def _scattered(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: int) -> FloatArray | None:
@@ -129,7 +129,7 @@ def log_over_median(power: FloatArray) -> FloatArray:
     return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
 
 
-def _recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
+def recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(n,) azimuth, without jumps, and zenith (rad), as the face counts them, and range (m)."""
     position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
@@ -229,8 +229,9 @@ def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Mis
     if pattern is None:
         return None
     position, rotation = measurement.station
-    sweeps = [_sweep(values) for values in (pattern.azimuth_rad, pattern.zenith_rad)]
-    azimuth, zenith = (grid.ravel() for grid in np.meshgrid(*sweeps, indexing="ij"))
+    sweeps = _sweeps(pattern)
+    sent = np.arange(pulses_of(pattern)) if measurement.pulses is None else np.flatnonzero(measurement.pulses)
+    azimuth, zenith = (sweep[place] for sweep, place in zip(sweeps, np.divmod(sent, len(sweeps[1])), strict=True))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
     distance, normal, curvature = _surface(measurement.scene, position, axes)
     cosine = np.abs(np.einsum("ni,ni->n", axes[0], normal))
@@ -244,20 +245,38 @@ def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Mis
     }
     at = (position + distance[:, None] * axes[0])[:, :2]
     epochs = measurement.epochs[residuals.index]
-    seen = [_seen(pattern, sweeps, residuals.geometry.part(epochs == number))[usable] for number in np.unique(epochs)]
+    seen = [_seen(pattern, residuals.geometry.part(epochs == number))[sent[usable]] for number in np.unique(epochs)]
     chosen = {name: np.tile(values[usable], len(seen)) for name, values in covariates.items()}
     return Missing(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
 
 
-def _seen(pattern: ScanPattern, sweeps: list[FloatArray], geometry: RayGeometry) -> BoolArray:
+def pulses_of(pattern: ScanPattern) -> int:
+    """How many pulses a pattern has."""
+    return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
+
+
+def pulse_of(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
+    """(n,) number of the pulse that has about a recorded direction, line after line."""
+    sweeps = _sweeps(pattern)
+    turn = 2 * np.pi * np.round((azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
+    columns = (
+        np.rint((azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2]),
+        np.rint((zenith - sweeps[1][0]) / pattern.zenith_rad[2]),
+    )
+    line, pulse = (np.clip(column, 0, len(sweep) - 1).astype(np.int64) for column, sweep in zip(columns, sweeps, strict=True))
+    return np.asarray(line * len(sweeps[1]) + pulse)
+
+
+def _seen(pattern: ScanPattern, geometry: RayGeometry) -> BoolArray:
     """(m,) pulses of a pattern in whose direction a point stands."""
-    turn = 2 * np.pi * np.round((geometry.azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
-    columns = [np.rint((geometry.azimuth - turn - sweeps[0][0]) / pattern.azimuth_rad[2])]
-    columns.append(np.rint((geometry.zenith - sweeps[1][0]) / pattern.zenith_rad[2]))
-    line, pulse = (np.clip(column, 0, len(sweep) - 1).astype(int) for column, sweep in zip(columns, sweeps, strict=True))
-    seen = np.zeros((len(sweeps[0]), len(sweeps[1])), dtype=bool)
-    seen[line, pulse] = True
-    return seen.ravel()
+    seen = np.zeros(pulses_of(pattern), dtype=bool)
+    seen[pulse_of(pattern, geometry.azimuth, geometry.zenith)] = True
+    return seen
+
+
+def _sweeps(pattern: ScanPattern) -> list[FloatArray]:
+    """Azimuths of the lines and zenith angles of their pulses, rad."""
+    return [_sweep(values) for values in (pattern.azimuth_rad, pattern.zenith_rad)]
 
 
 def _sweep(values: tuple[float, float, float]) -> FloatArray:
