@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from gap_cases import write_scan
 
-from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, free_forms, repeated
+from pipeline.formats.measurement import read_measurement
+from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated
 from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.naming.entries import Estimate, from_mean
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
+from pipeline.gap.residuals.registration import residuals_of
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.curve import surface_on_host
@@ -77,3 +85,17 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
     effect = DisparityEmpirical.model_validate(entry)
     curve = surface_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
     assert np.std(curve - curve.mean() - (error - error.mean())) < 0.25 * np.std(error)
+
+
+@pytest.mark.parametrize(("lines", "cycles"), [(300, 0.3), (2000, 0.3), (8000, 1.0)])
+def test_periods_are_tried_as_finely_as_the_lines_tell_them_apart(tmp_path: Path, lines: int, cycles: float) -> None:
+    """Neighbouring periods differ by less than so many cycles over all lines: whichever a wobble has, one is near it."""
+    write_scan(tmp_path, 3, step_rad=0.01)
+    measurement = read_measurement(tmp_path)
+    found = residuals_of(measurement)
+    assert isinstance(found, TlsResiduals)
+    line = np.linspace(0, lines, len(found.value)).round()
+    grids = mean_families(replace(found, geometry=replace(found.geometry, line=line)), measurement)
+    [wobble] = [each for each in grids if isinstance(each, SineGrid) and each.name == "wobble"]
+    assert float(np.diff(wobble.frequencies).max()) * lines < 1.05 * cycles
+    assert wobble.frequencies[-1] == pytest.approx(1 / 4)

@@ -26,6 +26,8 @@ _SIDES = ("left", "right", "both")
 _STEP = 0.1
 """Of a parameter's typical size, in finite differences."""
 _PHASE = "phase_rad"
+_MOST_PERIODS = 2000
+"""Of one effect; for a wobble over 8,000 scan lines, one of them is then at most half a cycle off over all lines."""
 _SCALE_UNKNOWN = 0.03
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 
@@ -88,7 +90,7 @@ def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: d
     angle = 2 * np.pi * x / search.shortest
     columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
     factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
-    tried = frequencies(low, 1 / search.shortest, 0.3 / reach)
+    tried = frequencies(low, 1 / search.shortest, 0.3 / reach, _MOST_PERIODS)
     yield SineGrid(effect.tag(), amplitude, Wave(search.period, factor, x, low), tried, fixed)
 
 
