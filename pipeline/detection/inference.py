@@ -26,15 +26,20 @@ def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0
     noise = nmad(difference)
     parts: list[BlockPart] = []
     tiles = [MapTile(row, column, size, difference.shape) for row, column in tile_places(difference.shape, size)]
-    for first in range(0, len(tiles), _BATCH):
-        group = tiles[first : first + _BATCH]
+    for group in _batches(tiles):
         images = [normalised(_pixels(difference, tile), model.config.normalisation, noise) for tile in group]
-        images += [images[0]] * (_BATCH - len(images))  # one shape, one compiled function
         answers = model.predict_on_batch({"image": np.stack(images)})
         for number, tile in enumerate(group):
             answer = {name: values[number] for name, values in answers.items()}
             parts += [part(item, tile) for item in _in_tile(answer, minimum_score, tile)]
     return without_seams(parts)
+
+
+def _batches(tiles: list[MapTile]) -> Iterator[list[MapTile]]:
+    """Whole batches, and what is left over tile by tile: two shapes, so that two functions are compiled, and nothing in vain."""
+    whole = len(tiles) // _BATCH * _BATCH
+    yield from (tiles[first : first + _BATCH] for first in range(0, whole, _BATCH))
+    yield from ([tile] for tile in tiles[whole:])
 
 
 def tile_places(shape: tuple[int, ...], size: int) -> Iterator[tuple[int, int]]:
