@@ -32,6 +32,8 @@ _HIGHEST = 4.0
 _LOW_IN = 4.5
 """Below this height of the figure the label of a colour bar has no room beside the map."""
 _MOST_NUMBERED = 200
+_MOST_LINES, _LONGEST_NAME = 12, 40
+"""Groups in one diagram, and letters of their names in its legend."""
 _MOST_MARKED = 30
 """Up to this many epochs each has a marker, as one alone makes no line."""
 
@@ -89,14 +91,16 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
 
 def write_reliability(groups: Sequence[Reliability], path: Path) -> None:
     """The share of blocks among the detections of about a score against that score, with standard errors; the diagonal is that of
-    scores that are probabilities."""
+    scores that are probabilities. Of many groups the first, which include all images together."""
     figure = Figure(figsize=(6.4, 5.6), dpi=110, layout="constrained")
     axes = figure.subplots()
     axes.plot((0, 1), (0, 1), color="#808080", linestyle="--", linewidth=1, label="a probability")
-    for each in groups:
+    for each in groups[:_MOST_LINES]:
         x, y, error = ([getattr(one, name) for one in each.classes] for name in ("score", "precision", "error"))
         count = sum(one.detections for one in each.classes)
-        axes.errorbar(x, y, error, marker="o", markersize=4, linewidth=1, capsize=2, label=f"{each.group} ({count:,})")
+        axes.errorbar(
+            x, y, error, marker="o", markersize=4, linewidth=1, capsize=2, label=f"{each.group:.{_LONGEST_NAME}} ({count:,})"
+        )
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="score", ylabel="share that are blocks")
     axes.set_title(f"What a score means (in brackets: detections; overlap by {groups[0].iou:g})", fontsize=10)
     axes.grid(alpha=0.3)

@@ -61,3 +61,11 @@ def test_no_detection_has_no_class_and_a_picture_all_the_same(tmp_path):
     assert found[0].to_dict() == {"group": "all", "kind": "bbox", "iou": 0.25, "calibration_error": None, "classes": []}
     write_reliability(found, tmp_path / "reliability.png")
     assert cv2.imread(str(tmp_path / "reliability.png")).std() > 5
+
+
+def test_names_of_groups_are_cut_in_the_picture(tmp_path):
+    """A word of a megabyte takes minutes to draw."""
+    truth, found = _set(np.array([0.8]), np.array([1]))
+    groups = reliability(truth, found, {f"noise {number} {'x' * 1_000_000}": [0] for number in range(30)})
+    write_reliability(groups, tmp_path / "reliability.png")
+    assert cv2.imread(str(tmp_path / "reliability.png")).shape[:2] == (616, 704)
