@@ -74,11 +74,13 @@ RESOLVED = (
     "--set cameras.base_m=28",
     "scarpsim gap --identifiability configs/sites/glendale.yaml --sensor tls --out plan",
     "scarpsim dataset configs/datasets/small.yaml --out sets/small --workers 2",
-    "scarpsim dataset configs/datasets/detector.yaml --out sets/detector --workers 2",
-    "scarpsim dataset configs/datasets/detector_test.yaml --out sets/detector_test --workers 2",
+    "scarpsim dataset configs/datasets/detector.yaml --out sets/one",
+    "scarpsim dataset configs/datasets/detector.yaml --seed 13 --set parts.0.val=0 --set name=detector2 --out sets/two",
+    "scarpsim dataset merge sets/one sets/two --out sets/detector",
+    "scarpsim dataset configs/datasets/detector_test.yaml --out sets/detector_test",
     "scarpsim train sets/small --out detector",
     "scarpsim train sets/small --config configs/detectors/fine.yaml --out detector",
-    "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.epochs=110 --out detector",
+    "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.epochs=24 --out detector",
 )
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
