@@ -9,6 +9,7 @@ The tags are those of projects of Metashape 1.2 to 2.3, as programs of others re
 
 from __future__ import annotations
 
+import lzma
 import xml.etree.ElementTree as ElementTree
 import zipfile
 import zlib
@@ -20,6 +21,9 @@ from scene.errors import InputError
 from scene.regular_file import MOST_TEXT_BYTES, check_file
 
 _DOCUMENT = "doc.xml"
+_DAMAGED = (OSError, zipfile.BadZipFile, KeyError, EOFError, zlib.error, lzma.LZMAError, RuntimeError, UnicodeDecodeError)
+"""Of `zipfile`: unreadable; no archive; without doc.xml; cut off; a damaged stream, of either kind; encrypted, or packed in a way
+that it does not know (NotImplementedError); names in no encoding."""
 _EXPORT = "save the project in Metashape again, or export the cameras with File > Export > Export Cameras"
 
 
@@ -54,17 +58,24 @@ def project_files(path: Path) -> list[Path]:
 
 def _document(archive: Path, tag: str) -> ElementTree.Element:
     """The root of an archive's doc.xml."""
+    where = f"{archive}: {_DOCUMENT}"
+    root = parsed(_unpacked(archive), where)
+    if root.tag != tag:
+        raise InputError(f"begins with <{root.tag}>", where=where, allowed=f"<{tag}>", remedy=_EXPORT)
+    return root
+
+
+def _unpacked(archive: Path) -> bytes:
+    """What stands in an archive's doc.xml."""
     check_file(archive)
     try:
         with zipfile.ZipFile(archive) as file:
-            if file.getinfo(_DOCUMENT).file_size > MOST_TEXT_BYTES:
-                problem = f"its {_DOCUMENT} has {file.getinfo(_DOCUMENT).file_size / 1e6:,.0f} MB"
-                raise InputError(problem, where=str(archive), allowed=f"{MOST_TEXT_BYTES / 1e6:,.0f} MB", remedy=_EXPORT)
-            text = file.read(_DOCUMENT)
-    except (OSError, zipfile.BadZipFile, zlib.error, KeyError, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+            size = file.getinfo(_DOCUMENT).file_size
+            text = file.read(_DOCUMENT) if size <= MOST_TEXT_BYTES else b""
+    except _DAMAGED as error:
         problem = f"is no archive of a Metashape project ({' '.join(str(error).split())[:200]})"
         raise InputError(problem, where=str(archive), remedy=_EXPORT) from None
-    root = parsed(text, f"{archive}: {_DOCUMENT}")
-    if root.tag != tag:
-        raise InputError(f"begins with <{root.tag}>", where=f"{archive}: {_DOCUMENT}", allowed=f"<{tag}>", remedy=_EXPORT)
-    return root
+    if size > MOST_TEXT_BYTES:
+        allowed = f"{MOST_TEXT_BYTES / 1e6:,.0f} MB"
+        raise InputError(f"its {_DOCUMENT} has {size / 1e6:,.0f} MB", where=str(archive), allowed=allowed, remedy=_EXPORT)
+    return text

@@ -34,6 +34,23 @@ def _archive(path: Path, text: str, name: str = "doc.xml") -> None:
         file.writestr(name, text)
 
 
+def _damage(path: Path, packing: int) -> None:
+    """An archive whose document is packed, with bytes of it changed."""
+    with zipfile.ZipFile(path, "w", packing) as file:
+        file.writestr("doc.xml", "<chunk/>" * 200)
+    content = bytearray(path.read_bytes())
+    content[45:60] = bytes(15 * [255])
+    path.write_bytes(content)
+
+
+def _unknown_packing(path: Path) -> None:
+    """An archive that names a method of packing which there is not."""
+    _archive(path, "<chunk/>")
+    content = bytearray(path.read_bytes())
+    content[8] = content[content.index(b"PK\x01\x02") + 10] = 97
+    path.write_bytes(content)
+
+
 def _chunk(folder: Path, cameras: dict[str, Camera]) -> str:
     """The chunk of an exported camera XML, which stands in a project's archive by itself."""
     write_metashape(folder / "export.xml", cameras)
@@ -81,6 +98,9 @@ def test_an_only_chunk_needs_not_be_active(project: Path) -> None:
             "no archive of a Metashape project",
         ),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<chunk/>", "other.xml"), "no archive of a Metashape project"),
+        (lambda psx, files: _damage(files / "2" / "chunk.zip", zipfile.ZIP_DEFLATED), "no archive of a Metashape project"),
+        (lambda psx, files: _damage(files / "2" / "chunk.zip", zipfile.ZIP_LZMA), "no archive of a Metashape project"),
+        (lambda psx, files: _unknown_packing(files / "2" / "chunk.zip"), r"no archive of a Metashape project \(.*not supported"),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<frame/>"), "begins with <frame>"),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<chunk>"), "not valid XML"),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<!DOCTYPE x><chunk/>"), "entities"),
@@ -99,5 +119,6 @@ def test_what_is_missing_or_damaged_is_named(project: Path, spoil: Callable[[Pat
 
 def test_a_document_beyond_the_limit_is_not_unpacked(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.formats.metashape_project.MOST_TEXT_BYTES", 100)
-    with pytest.raises(InputError, match=r"doc\.xml has 0 MB"):
+    with pytest.raises(InputError, match=r"project\.zip: its doc\.xml has 0 MB") as found:
         read_metashape(project)
+    assert "no archive" not in str(found.value)

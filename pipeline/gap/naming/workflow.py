@@ -114,9 +114,8 @@ def diagnose(
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # the same sums on any number of threads, and none that wait for each other
     with deciding(decisions), threadpool_limits(1, "blas"):
-        whole = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-        part, rows = thinned(whole, random.child("thinned"))
-        del whole
+        ordered = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
+        part, rows = thinned(ordered, random.child("thinned"))
         found = _diagnose(part, clock, random)
     return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
 
