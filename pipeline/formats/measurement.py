@@ -39,6 +39,7 @@ from scene.errors import InputError
 from scene.frame import WallFrame
 from scene.imported import read_reference
 from scene.mesh import FloatArray, TriangleMesh
+from scene.plane_normals import plane_normals
 from scene.raycast import RayCaster
 from scene.winding import check_near, facing
 from sensors.camera import Camera, CameraPair
@@ -110,6 +111,11 @@ class MeasurementConfig(Config):
         (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]"
     )
     model: Path = Field(description="what the simulation believes about the sensor today")
+    incidence: Literal["triangles", "planes"] = Field(
+        "triangles",
+        description="what rays are inclined to: the triangle that they hit, or, where triangles lean by noise and relief "
+        "between points, the plane through the 24 nearest vertices (tls)",
+    )
     notes: tuple[str, ...] = Field(
         (), description="what the report should say of the measurement, such as what a reference cannot show"
     )
@@ -213,7 +219,8 @@ class TlsMeasurement(MeasurementBase):
     station: scanner to wall frame, of the first scan where there are several; face: in which it was scanned; scans: of several,
     whose numbers are the points' channel `scan`, empty where there is one; pattern: the nominal directions, None where not known;
     pulses: (m,) those of the pattern that the points are a part of, None for all of them; order: each point's scan line and share
-    of the scan's duration (n,), None where not known, once they were counted (see `with_order`).
+    of the scan's duration (n,), None where not known, once they were counted (see `with_order`); normals: (v, 3) at the
+    reference's vertices, to which rays are inclined, None where it is to its triangles.
     """
 
     sensor = "tls"
@@ -224,6 +231,7 @@ class TlsMeasurement(MeasurementBase):
     pattern: ScanPattern | None = None
     pulses: NDArray[np.bool_] | None = None
     order: tuple[FloatArray | None, FloatArray | None] | None = None
+    normals: FloatArray | None = None
 
     @property
     def viewpoint(self) -> FloatArray:
@@ -387,7 +395,10 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
         Scanned(_to_wall(each, frame), each.face, number)
         for each, number in zip(config.scanners, set_ups(config.scanners), strict=True)
     )
-    return TlsMeasurement(model=material.model, station=_to_wall(pose, frame), scans=scans, pattern=config.pattern, **shared)
+    normals = plane_normals(shared["reference"].vertices) if config.incidence == "planes" else None
+    return TlsMeasurement(
+        model=material.model, station=_to_wall(pose, frame), scans=scans, pattern=config.pattern, normals=normals, **shared
+    )
 
 
 def _to_wall(pose: ScannerPose, frame: WallFrame) -> Pose:

@@ -69,6 +69,8 @@ def build(request: Request, out: Path) -> Understood:
     keys = _where_from(stations)
     if "scanner" in keys and station.pattern is not None and request.reference != HALF and not echo_words:
         keys["pattern"] = station.pattern
+    if reference.of_points:
+        keys["incidence"] = "planes"
     clouds = [_for_file(scan, each) for scan, each in zip(scans, stations, strict=True)]
     content = Content("tls", clouds, reference.mesh, model, _eye(station), ", ".join(scan.name for scan in scans), keys=keys)
     found = Understood(out, about)

@@ -30,7 +30,8 @@ _MUCH_FINER = 0.6
 class Reference:
     """The surface as known, points' frame, m, with its standard error (0: taken as exact) and what is to be said of it.
 
-    rows: (k,) the points of the scan that are compared with it, None for all.
+    rows: (k,) the points of the scan that are compared with it, None for all; of_points: made of a cloud, so that its triangles
+    lean by noise and relief between points.
     """
 
     mesh: TriangleMesh
@@ -38,6 +39,7 @@ class Reference:
     words: tuple[str, ...]
     limits: tuple[str, ...]
     rows: NDArray[Any] | None = None
+    of_points: bool = False
 
 
 def is_cloud(path: Path) -> bool:
@@ -67,7 +69,7 @@ def from_file(path: Path, unit: str, position: FloatArray, rotation: FloatArray)
         "the reference is a measurement itself: errors that both share (same scanner, same place) cannot be seen, and rock that "
         "moved between the two is told from errors only where it has edges",
     )
-    return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits)
+    return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, of_points=True)
 
 
 def _from_dem(path: Path, metres: float) -> Reference:
@@ -105,9 +107,9 @@ def half_of(scan: RawScan, station: Station) -> Reference:
     )
     noise = None if station.geometry is None else _noise_along_lines(station.geometry, even)
     if noise is None or surface.smoothed:
-        return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, np.flatnonzero(~even))
+        return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, np.flatnonzero(~even), of_points=True)
     told = f"along its lines points scatter by {1e3 * noise:.2g} mm: {1e3 * noise * BETWEEN:.2g} mm are carried as its error"
-    return Reference(surface.mesh, float(noise * BETWEEN), (said, told), limits, np.flatnonzero(~even))
+    return Reference(surface.mesh, float(noise * BETWEEN), (said, told), limits, np.flatnonzero(~even), of_points=True)
 
 
 def _noise_along_lines(geometry: ScanGeometry, rows: NDArray[np.bool_]) -> float | None:

@@ -25,10 +25,12 @@ _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
 class DirectedScanner(LaserScanner):
     """A scanner whose pulses leave in the directions of `geometry`, one after another.
 
-    Recorded powers, where there are any, take the place of those that the albedo of the reference would give.
+    Recorded powers, where there are any, take the place of those that the albedo of the reference would give; inclined: so do
+    the geometry's angles of incidence of those to the triangles.
     """
 
     geometry: PulseGeometry = field(kw_only=True)
+    inclined: bool = False
 
     def emit(self) -> Pulses:
         angles, count = self.geometry, len(self.geometry.azimuth)
@@ -56,16 +58,17 @@ class DirectedScanner(LaserScanner):
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
-        power = self.geometry.power
-        recorded = echo if power is None else replace(echo, power=on_device(mi.Float32, np.maximum(power, 1e-9)))
-        return super().measured(pulses, recorded, random)
+        known = {"power": self.geometry.power, "cos_incidence": self.geometry.cos_incidence if self.inclined else None}
+        known = {name: on_device(mi.Float32, np.maximum(each, 1e-9)) for name, each in known.items() if each is not None}
+        return super().measured(pulses, replace(echo, **known), random)
 
 
 def _scanner(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry) -> DirectedScanner:
     position, rotation = measurement.station
     pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
     config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
-    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry)
+    inclined = measurement.normals is not None
+    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry, inclined=inclined)
 
 
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, random: KeyedRandom) -> FloatArray:

@@ -11,7 +11,6 @@ from pipeline.formats.measurement import ScanPattern, TlsMeasurement
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, Rows, part_of, plane_slopes
 from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
 from scene.mesh import FloatArray
-from scene.raycast import RayCaster
 from sensors.effects.base import Stage
 from sensors.polar import polar, polar_axes
 from sensors.pulses import PulseGeometry
@@ -70,7 +69,8 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     if any(effect.stage == Stage.AIM for effect in model.effects):
         real = aimed(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
-    distance, normal, curvature = _surface(measurement.scene, position, axes)
+    met = _met(measurement, axes)
+    distance, normal = met.distance, met.normal
     geometry = RayGeometry(
         azimuth=azimuth,
         zenith=zenith,
@@ -78,7 +78,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         measured_m=measured,
         by_azimuth=plane_slopes(normal, axes[0], axes[1], distance) * np.sin(zenith),
         by_zenith=plane_slopes(normal, axes[0], axes[2], distance),
-        cos_incidence=np.abs(np.einsum("ni,ni->n", axes[0], normal)),
+        cos_incidence=met.cos_incidence,
         line=line,
         share=share,
         power=None if intensity is None else np.maximum(intensity, _LEAST_POWER),
@@ -87,7 +87,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     sigma = np.sqrt(model.variance(geometry))
     slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
     hit = np.isfinite(predicted) & np.isfinite(distance)
-    flat = (curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
+    flat = (met.curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
     whole = TlsResiduals(
         value=measured - predicted,
         sigma=sigma,
@@ -96,7 +96,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         even=hit & flat,
         pose=_pose(axes[0], normal, distance),
         at=(position + distance[:, None] * axes[0])[:, :2],
-        covariates=_covariates(geometry, curvature),
+        covariates=_covariates(geometry, met.curvature),
         index=np.arange(len(measured)),
         geometry=geometry,
         notes=_notes(measurement),
@@ -139,18 +139,38 @@ def recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, Float
     return (around, zenith, measured) if measurement.face == 1 else (around + np.pi, 2 * np.pi - zenith, measured)
 
 
-def _surface(scene: RayCaster, position: FloatArray, axes: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Range (n,), unit normal (n, 3), and the largest departure from the plane that was hit within a beam's width (n,), m."""
-    ray = axes[0]
+@dataclass(frozen=True)
+class _Met:
+    """What rays meet. distance: (n,), m; normal: (n, 3) of the triangle, unit; cos_incidence: (n,); curvature: (n,) the largest
+    departure from the triangle's plane within a beam's width, m."""
+
+    distance: FloatArray
+    normal: FloatArray
+    cos_incidence: FloatArray
+    curvature: FloatArray
+
+
+def _met(measurement: TlsMeasurement, axes: list[FloatArray]) -> _Met:
+    """axes: the rays' directions (n, 3), unit, wall frame, and how they turn with azimuth and zenith."""
+    ray, scene, position = axes[0], measurement.scene, measurement.station[0]
     distance, face = scene.cast(position, ray)
-    normal = scene.mesh.face_normals(np.maximum(face, 0))
+    face = np.maximum(face, 0)
+    normal = scene.mesh.face_normals(face)
     curvature = np.zeros(len(ray))
     for axis in axes[1:]:
         flat = plane_slopes(normal, ray, axis, distance)
         for step in (_PROBE_RAD, -_PROBE_RAD):
             beside = scene.cast(position, ray + step * axis)[0]
             curvature = np.maximum(curvature, np.nan_to_num(np.abs(beside - distance - step * flat), nan=np.inf))
-    return distance, normal, curvature
+    inclined_to = normal if measurement.normals is None else _over_corners(measurement.normals[scene.mesh.faces[face]], normal)
+    return _Met(distance, normal, np.abs(np.einsum("ni,ni->n", ray, inclined_to)), curvature)
+
+
+def _over_corners(normals: FloatArray, outwards: FloatArray) -> FloatArray:
+    """(n, 3) mean directions of normals (n, 3 corners, 3), either way round, turned to the side of `outwards` (n, 3)."""
+    side = np.where(np.einsum("nci,ni->nc", normals, outwards) < 0, -1.0, 1.0)
+    mean = np.einsum("nci,nc->ni", normals, side)
+    return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
 
 
 def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArray:
@@ -233,13 +253,13 @@ def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Mis
     sent = np.arange(pulses_of(pattern)) if measurement.pulses is None else np.flatnonzero(measurement.pulses)
     azimuth, zenith = (sweep[place] for sweep, place in zip(sweeps, np.divmod(sent, len(sweeps[1])), strict=True))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
-    distance, normal, curvature = _surface(measurement.scene, position, axes)
-    cosine = np.abs(np.einsum("ni,ni->n", axes[0], normal))
-    usable = np.isfinite(distance) & (curvature < 0.3)
+    met = _met(measurement, axes)
+    distance = met.distance
+    usable = np.isfinite(distance) & (met.curvature < 0.3)
     covariates = {
         "range": distance,
-        "incidence": np.arccos(np.clip(cosine, 0, 1)),
-        "log_power": np.log(np.maximum(cosine, 1e-6) * (100.0 / distance) ** 2),
+        "incidence": np.arccos(np.clip(met.cos_incidence, 0, 1)),
+        "log_power": np.log(np.maximum(met.cos_incidence, 1e-6) * (100.0 / distance) ** 2),
         "azimuth": azimuth,
         "zenith": zenith,
     }

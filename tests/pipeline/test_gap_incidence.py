@@ -1,0 +1,105 @@
+"""Angles of incidence on a reference made of points, against closed forms: its triangles lean by noise, planes do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.gap.naming.workflow import diagnose
+from pipeline.gap.residuals.scan_simulation import simulated_ranges
+from pipeline.gap.residuals.tls_residuals import RayGeometry, tls_residuals
+from pipeline.measurement.build import Request, build
+from scene.plane_normals import plane_normals
+from sensors.effects.range_incidence_bias import RangeIncidenceBias
+
+HEIGHT_M = 1.7
+NOISE_M = 0.0025
+
+
+def scan(path: Path, bias_m: float = 0.0, swell_m: float = 0.0) -> Path:
+    """Ground 1.7 m under the scanner, noise of 2.5 mm in range, as text, line after line; swell_m: amplitude of waves of 0.9 m.
+
+    bias_m: added to ranges as bias (1 / cos i - 1), i by the surface's own gradient.
+    """
+    rng = np.random.default_rng(8)
+    azimuth, zenith = (
+        each.ravel() for each in np.meshgrid(np.arange(-0.5, 0.5, 0.008), np.arange(1.9, 2.4, 0.004), indexing="ij")
+    )
+    ray = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
+    distance, wave = -HEIGHT_M / ray[:, 2], 2 * np.pi / 0.9
+    for _ in range(60):
+        x, y = (distance * ray[:, axis] for axis in (0, 1))
+        distance = (-HEIGHT_M + swell_m * np.sin(wave * x) * np.cos(wave * y)) / ray[:, 2]
+    x, y = (distance * ray[:, axis] for axis in (0, 1))
+    gradient = swell_m * wave * np.stack([np.cos(wave * x) * np.cos(wave * y), -np.sin(wave * x) * np.sin(wave * y)], axis=1)
+    normal = np.column_stack([-gradient, np.ones(len(ray))])
+    cosine = -np.einsum("ni,ni->n", ray, normal) / np.linalg.norm(normal, axis=1)
+    measured = distance + NOISE_M * rng.standard_normal(len(ray)) + bias_m * (1 / cosine - 1)
+    np.savetxt(path, measured[:, None] * ray, fmt="%.6f")
+    return path
+
+
+@pytest.fixture(scope="module")
+def level(tmp_path_factory: pytest.TempPathFactory) -> TlsMeasurement:
+    """Level ground, one half against the other."""
+    folder = tmp_path_factory.mktemp("level")
+    build(Request([scan(folder / "ground.xyz")], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), folder / "out")
+    measurement = read_measurement(folder / "out")
+    assert isinstance(measurement, TlsMeasurement)
+    return measurement
+
+
+def slant_error(geometry: RayGeometry) -> np.ndarray:
+    """(n,) of 1 / cos i; on level ground it is R / h."""
+    return np.asarray(1 / geometry.cos_incidence - geometry.range_m / HEIGHT_M)
+
+
+def test_planes_tell_the_incidence_where_triangles_lean(level: TlsMeasurement) -> None:
+    planes, triangles = (np.std(slant_error(tls_residuals(each).geometry)) for each in (level, level.changed(normals=None)))
+    assert triangles > 0.15, "corners 15 mm apart, with noise of 2.5 mm"
+    assert planes < triangles / 5
+
+
+def test_the_simulation_takes_the_same_incidence(level: TlsMeasurement) -> None:
+    effect = RangeIncidenceBias(coefficient_m=0.01)
+    biased = level.changed(model=level.model.model_copy(update={"effects": (effect,)}))
+    geometry = tls_residuals(biased).geometry
+    expected = 0.01 * (1 / geometry.cos_incidence - 1)
+    np.testing.assert_allclose(simulated_ranges(biased, geometry) - geometry.range_m, expected, atol=2e-7)
+
+
+def test_a_bias_of_the_incidence_is_named_on_half_of_a_scan(tmp_path: Path) -> None:
+    """Of 6 mm, put into the half that is compared alone."""
+    quiet, biased = (scan(tmp_path / f"{name}.xyz", bias, swell_m=0.06) for name, bias in (("quiet", 0.0), ("biased", 0.006)))
+    build(Request([quiet], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "out")
+    build(Request([biased], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "other")
+    (tmp_path / "other/scan_0.laz").replace(tmp_path / "out/scan_0.laz")
+    found = diagnose(read_measurement(tmp_path / "out"))
+    (effect,) = found.effects
+    assert (effect.name, effect.kind) == ("tls.range_incidence_bias", "physical")
+    assert abs(effect.entry["coefficient_m"] - 0.006) < 0.0009, "15 %"
+
+
+def test_references_of_points_ask_for_planes_others_do_not(tmp_path: Path) -> None:
+    path = scan(tmp_path / "ground.xyz")
+    request = Request([path], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0))
+    build(request, tmp_path / "out")
+    assert yaml.safe_load((tmp_path / "out/measurement.yaml").read_text())["incidence"] == "planes"
+    mesh = tmp_path / "out/reference.ply"
+    build(Request([path], str(mesh), "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "meshed")
+    measurement = read_measurement(tmp_path / "meshed")
+    assert isinstance(measurement, TlsMeasurement)
+    assert measurement.normals is None
+
+
+def test_normals_of_a_sphere_point_to_its_middle() -> None:
+    """24 neighbours of 20,000 points on a sphere span 0.06 rad; the plane through them leans by a part of that."""
+    vectors = np.random.default_rng(3).standard_normal((20_000, 3))
+    radial = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    cosine = np.abs(np.einsum("ni,ni->n", plane_normals(5 * radial), radial))
+    assert np.degrees(np.arccos(np.clip(cosine, 0, 1))).max() < 3
+    np.testing.assert_allclose(np.linalg.norm(plane_normals(radial[:10]), axis=1), 1, rtol=1e-12)
