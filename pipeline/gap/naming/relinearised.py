@@ -157,12 +157,17 @@ def fitted_together(points: SearchedPoints, candidates: list[Candidate]) -> tupl
             return None
         there, found, _ = _with(points, estimates)
         at = noisier(at_points(found, points.part), points.noise[1])
-        if len(at) < decided().points.kept * len(points.part):
+        if _has_lost(points, at):
             return None
         renewed = effects_of(there, at)
         candidates = [_renewed(each, renewed) for each in candidates]
     explained: FloatArray = _all_columns(candidates) @ values
     return there, at, explained
+
+
+def _has_lost(points: SearchedPoints, at: Residuals) -> bool:
+    """Whether too few of the points are left to search among."""
+    return len(at) < decided().points.kept * len(points.part)
 
 
 def _all_columns(candidates: list[Candidate]) -> FloatArray:
@@ -230,7 +235,10 @@ def _beside(points: SearchedPoints, chosen: Explained) -> Explained:
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or beyond(points.measurement, chosen.estimates, chosen.at):
         return chosen
-    search, at, estimates, beside, tried = _again(points, physical, chosen.search.gains_alone)
+    again = _again(points, physical, chosen.search.gains_alone)
+    if again is None:
+        return chosen
+    search, at, estimates, beside, tried = again
     return replace(chosen, estimates=estimates, search=search, at=at, beside=beside, tried=tried)
 
 
@@ -273,15 +281,17 @@ def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
 
 def _again(
     points: SearchedPoints, had: list[Estimate], alone: Mapping[Explanation, float]
-) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]]:
+) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]] | None:
     """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
 
     alone: what each explanation gains by itself. Returns the search, its residuals, the effects with what was found beside them,
-    that only, and what was tried last.
+    that only, and what was tried last; None where the rays of many points would miss the reference with them.
     """
     part = points.part
     there, found, _ = _with(points, had)
     at = noisier(at_points(found, part), points.noise[1])
+    if _has_lost(points, at):
+        return None
     renewed = families_of(there, at)
     allowed = {(family.name, family.empirical) for family in points.families}
     names = {each.candidate.name for each in had}
@@ -335,7 +345,7 @@ def at_points(found: Residuals, part: Residuals) -> Residuals:
     """What was found at the points of a part, where the surface is smooth there too and they are no outliers."""
     rough, _, scale = registered(found)
     good = found.smooth & (np.abs(rough) < decided().points.outlier * scale * found.sigma)
-    place = np.full(int(max(found.index.max(), part.index.max())) + 1, -1)
+    place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
     place[found.index[good]] = np.flatnonzero(good)
     rows = place[part.index]
     return found.part(rows[rows >= 0])

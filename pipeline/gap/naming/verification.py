@@ -83,8 +83,8 @@ class Showing:
         """The gap on points that no step has used, and words for effects that are taken out.
 
         As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
-        one goes that does most. What is described, not named, goes only where it clearly does harm. A lower noise is proposed
-        only if it predicts better.
+        one goes that does most; where the gap is larger by more than its uncertainty one goes in any case. What is described, not
+        named, goes only where it clearly does harm. A lower noise is proposed only if it predicts better.
         """
         shown, words = self._of(named, self.tested), []
         if self.lower and shown.is_worse:
@@ -92,7 +92,7 @@ class Showing:
         while shown.is_worse:
             doubtful = [item for item in shown.named if shown.is_clearly_worse or _may_be_harmful(item)]
             harms = [self._harm(shown, item) for item in doubtful]
-            if max(harms, default=0.0) <= 0:
+            if max(harms, default=0.0) <= 0 and not shown.is_clearly_worse:
                 break
             out = doubtful[int(np.argmax(harms))]
             words.append(f"{out.name} dropped: with it the model predicts worse")

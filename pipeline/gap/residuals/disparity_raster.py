@@ -53,6 +53,8 @@ class DisparityRaster:
         point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
         seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
         matched = seen & ~hidden
+        if not matched.any():  # the cameras look past the reference
+            return None
         disparity = np.full(len(u), np.nan)
         disparity[matched] = nominal.disparity((u[matched], v[matched]), project(right, point[matched]))
         return cls(step, disparity.reshape(shape), (seen & hidden).reshape(shape), row, column)

@@ -81,7 +81,7 @@ def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None, 
     """
     found = residuals_of(measurement) if found is None else found
     total = np.zeros(found.pose.shape[1])
-    for _ in range(_MOST_MOVES):
+    for _ in range(_MOST_MOVES if len(found) else 0):
         pose = registered(_only(found, trusted))[1]
         if not _is_far(pose, found):
             break
