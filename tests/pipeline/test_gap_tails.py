@@ -80,6 +80,16 @@ def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it
         Named(f"stereo.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0)
         for name in ("smoothing", "tangential_distortion")
     ]
-    found = with_doubtful(named, [chosen], frozenset({("camera_omega", False)}))
+    left_out = frozenset({("camera_omega", False)})
+    found = with_doubtful(named, [chosen], frozenset({"camera_omega"}), left_out)
     assert [item.alike for item in found] == [(), ("stereo.camera_omega",)]
-    assert [item.alike for item in with_doubtful(named, [chosen], frozenset())] == [(), ()]
+    assert [item.alike for item in with_doubtful(named, [chosen], frozenset({"camera_omega"}), frozenset())] == [(), ()]
+
+
+def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its_class() -> None:
+    """A drift of the tilt that was not there beside a vertical index is what that leaves; an offset that was there is not."""
+    index: Any = SimpleNamespace(name="vertical_index", empirical=False)
+    chosen = Chosen(index, (), 0.002, 70.0, 67.0, ())
+    named = [Named(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0) for name in ("tilt_drift", "range_offset")]
+    found = with_doubtful(named, [chosen], frozenset({"vertical_index", "range_offset"}), frozenset({("vertical_index", False)}))
+    assert [item.alike for item in found] == [("tls.vertical_index",), ()]

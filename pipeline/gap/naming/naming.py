@@ -35,11 +35,14 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.angle_empirical import AngleEmpirical
+from sensors.effects.base import ShowsIn
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.regularization_noise import RegularizationNoise
 
 _NODES = RegularizationNoise.tag()
+FREE_FORMS = ("", True)
+"""Stands for all families of empirical terms."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ def name_effects(
 
     What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
     slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread; left_out:
-    families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word;
+    families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word; or
+    `FREE_FORMS`;
     nodes: noise that neighbours share, found in what a search had left: it feigns free forms, and an error of the reference that
     is larger than the true one, so that all is searched again beside it.
     """
@@ -101,8 +105,9 @@ def name_effects(
         added = locking.amplitude_px**2 / 2
         found_apart.add((PixelLocking.tag(), False))
     part = noisier(part, added)
-    allowed = (each for each in families_of(measurement, part) if (each.name, each.empirical) not in left_out | found_apart)
-    families = list(allowed)
+    out = left_out | found_apart
+    possible = (each for each in families_of(measurement, part) if (each.name, each.empirical) not in out)
+    families = [each for each in possible if not (each.empirical and FREE_FORMS in out)]
     spread, spread_tried, words = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
     if wrong := _too_wide(measurement, spread):
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
@@ -125,12 +130,13 @@ def name_effects(
                 described = any(each.candidate.empirical for each in found.estimates)
                 if nodes_left is not None and nodes is None:
                     nodes_in_all = find_nodes(part, registered(part)[0], model, random) if described else None
-                    return name_effects(measurement, whole, whole_scale, random, left_out, nodes_in_all or nodes_left)
+                    found_nodes = nodes_in_all or nodes_left.everywhere(len(part))
+                    return name_effects(measurement, whole, whole_scale, random, left_out, found_nodes)
                 kept = nodes_left or (None if described else nodes)
                 spread = [] if kept is None else [kept]
     if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
         again, naming = name_effects(measurement, whole, whole_scale, random, left_out | wrong)
-        return with_doubtful(again, found.chosen, wrong), naming
+        return with_doubtful(again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong), naming
     moving = [from_mean(each, found.at) for each in found.estimates]
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
@@ -151,14 +157,18 @@ def name_effects(
     return named, naming
 
 
-def with_doubtful(named: list[Named], chosen: list[Chosen], left_out: frozenset[tuple[str, bool]]) -> list[Named]:
-    """An effect that was chosen first and is too large to be committed to stays in the class of those that would do as well."""
+def with_doubtful(
+    named: list[Named], chosen: list[Chosen], before: frozenset[str], left_out: frozenset[tuple[str, bool]]
+) -> list[Named]:
+    """An effect that was chosen first and is too large to be committed to stays in the class of those that would do as well: by
+    slopes, or since they were not among those named with it (`before`) and stand in its place."""
     doubtful = [each for each in chosen if (each.candidate.name, False) in left_out]
     found = []
     for item in named:
         sensor, name = item.name.split(".", 1)
-        alike = {f"{sensor}.{each.candidate.name}" for each in doubtful if name in each.alike} - {item.name, *item.alike}
-        found.append(replace(item, alike=(*item.alike, *sorted(alike))))
+        instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
+        alike = {f"{sensor}.{each.candidate.name}" for each in doubtful if instead or name in each.alike}
+        found.append(replace(item, alike=(*item.alike, *sorted(alike - {item.name, *item.alike}))))
     return found
 
 
@@ -214,7 +224,7 @@ def _too_wide(measurement: Measurement, spread: list[SpreadFound]) -> frozenset[
 
 
 def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
-    said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out))
+    said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out - {FREE_FORMS}))
     why = (
         "the best value is beyond what a config may hold, or many times the usual where the registration undoes nearly all of it"
     )

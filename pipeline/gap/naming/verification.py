@@ -82,9 +82,10 @@ class Showing:
     def show(self, named: list[Named]) -> tuple[Shown, list[str]]:
         """The gap on points that no step has used, and words for effects that are taken out.
 
-        As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, the
-        one goes that does most; where the gap is larger by more than its uncertainty one goes in any case. What is described, not
-        named, goes only where it clearly does harm. A lower noise is proposed only if it predicts better.
+        As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, by
+        more than the uncertainty of that, the one goes that does most; where the gap itself is larger by more than its
+        uncertainty one goes in any case. What is described, not named, goes only then. A lower noise is proposed only if it
+        predicts better.
         """
         shown, words = self._of(named, self.tested), []
         if self.lower and shown.is_worse:
@@ -92,7 +93,7 @@ class Showing:
         while shown.is_worse:
             doubtful = [item for item in shown.named if shown.is_clearly_worse or _may_be_harmful(item)]
             harms = [self._harm(shown, item) for item in doubtful]
-            if max(harms, default=0.0) <= 0 and not shown.is_clearly_worse:
+            if max(harms, default=0.0) <= 0:
                 break
             out = doubtful[int(np.argmax(harms))]
             words.append(f"{out.name} dropped: with it the model predicts worse")
@@ -100,12 +101,12 @@ class Showing:
         return shown, words
 
     def _harm(self, shown: Shown, item: Named) -> float:
-        """By how much the model predicts the points that may be looked at worse with an effect than without; the same points,
-        since an effect that moves some far may bring others near."""
+        """By how much more than its uncertainty the model predicts the points that may be looked at worse with an effect than
+        without; the same points, since an effect that moves some far may bring others near."""
         others = [each for each in shown.named if each is not item]
         without = Version(self._model(others), self._registered(others)[1])
         gap = self._gap(shown.named, (without, Version(shown.model, shown.pose)), self.learned)
-        return 0.0 if gap is None else gap.after - gap.before
+        return 0.0 if gap is None else gap.after - gap.before - decided().verdict.gap_sigmas * gap.error
 
     def _model(self, named: list[Named]) -> TlsModel | StereoModel:
         return with_effects(self.measurement.model, [item.entry for item in named], self.lower)

@@ -26,7 +26,7 @@ from pipeline.gap.naming.entries import (
 )
 from pipeline.gap.naming.families import believes
 from pipeline.gap.naming.held_out import score_effects
-from pipeline.gap.naming.naming import Naming, name_effects
+from pipeline.gap.naming.naming import FREE_FORMS, Naming, name_effects
 from pipeline.gap.naming.splitting import with_splits
 from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, verdict_of
 from pipeline.gap.naming.verification import Showing, Shown
@@ -133,29 +133,24 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     clock.lap("residuals")
     if plain.smooth.sum() < decided().points.fewest:
         return _insufficient(measurement, plain, clock)
-    explained = _named(there, plain, held_points, random)
-    state, named, naming = explained.state, explained.named, explained.naming
-    losses = _missing(there, state)
-    lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
-    named = sorted([*named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
-    named, wide = only_within_bounds(there.model, named)
+    held = _held(there, plain, held_points, random)
+    state, naming = held.state, held.naming
     clock.lap("naming")
-    named, tails, dropped = _confirmed(there, state, named, naming.reference_sigma)
     showing = Showing(
         measurement=there,
         residuals=plain,
         chosen=state.chosen,
         tested=state.shown & state.held_out,
         learned=state.shown & ~state.held_out,
-        losses=losses,
+        losses=held.losses,
         reference_sigma=naming.reference_sigma,
         largest=decided().points.outlier * state.scale,
         random=random,
         lower=lower_noise(there.model, naming.share),
     )
-    shown, harmful = showing.show(named)
-    notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *wide, *dropped, *harmful]
-    far = tails.share if tails is not None and tails.even else 0.0
+    shown, harmful = showing.show(held.named)
+    notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *held.words, *harmful]
+    far = held.tails.share if held.tails is not None and held.tails.even else 0.0
     evidence = _with_moved(Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far), there, state, shown)
     if evidence.much_moved:
         shown, _ = replace(showing, lower={}).show([])
@@ -264,8 +259,8 @@ class _Attempt:
     naming: Naming
 
     @classmethod
-    def of(cls, state: _State, random: KeyedRandom) -> _Attempt:
-        return cls(state, *name_effects(*state.part, state.scale, random))
+    def of(cls, state: _State, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> _Attempt:
+        return cls(state, *name_effects(*state.part, state.scale, random, left_out))
 
     @property
     def shapes(self) -> set[str]:
@@ -279,8 +274,10 @@ class _Attempt:
         return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(state.shapes) + len(state.changes)
 
 
-def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random: KeyedRandom) -> _Attempt:
-    """What the naming started from in the end, and what it named.
+def _named(
+    there: Measurement, plain: Residuals, held_points: BoolArray, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]
+) -> _Attempt:
+    """What the naming started from in the end, and what it named. left_out: as of `name_effects`.
 
     What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
     what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
@@ -295,31 +292,62 @@ def _named(there: Measurement, plain: Residuals, held_points: BoolArray, random:
         names = {each.name for each in again.shapes}
         # rays that are not quite where they are thought to be look like a low-pass
         feigned = Smoothing.tag() in names - found.shapes
-        return found if names == found.shapes or feigned else _Attempt.of(again, random)
+        return found if names == found.shapes or feigned else _Attempt.of(again, random, left_out)
 
     shapes = _shapes(there, plain, held_points)
-    first = _Attempt.of(_State.of(there, plain, held_points, *shapes), random)
+    first = _Attempt.of(_State.of(there, plain, held_points, *shapes), random, left_out)
     found = [beside(first)]
     if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0):
-        found.append(beside(_Attempt.of(_State.of(there, plain, held_points, *shapes, resettled=False), random)))
+        staying = _State.of(there, plain, held_points, *shapes, resettled=False)
+        found.append(beside(_Attempt.of(staying, random, left_out)))
     if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
         untouched = np.zeros(len(held_points), dtype=bool)
-        smooth = _Attempt.of(_State.of(there, plain, held_points, [], untouched), random)
+        smooth = _Attempt.of(_State.of(there, plain, held_points, [], untouched), random, left_out)
         if smooth.named:
             found.append(beside(smooth))
     return min(found, key=lambda each: each.complexity)
 
 
-def _confirmed(
-    there: Measurement, state: _State, named: list[Named], reference_sigma: float
-) -> tuple[list[Named], Tails | None, list[str]]:
-    """The effects that hold on held-out blocks, with what would split each class; heavy tails; and words for the others."""
+@dataclass(frozen=True)
+class _Held:
+    """What naming started from, the effects that hold on held-out blocks, heavy tails, and words for the other effects.
+
+    losses: the effect on the returns, and the pulses that it was not fitted to.
+    """
+
+    state: _State
+    naming: Naming
+    losses: tuple[MissingFound, BoolArray] | None
+    named: list[Named]
+    tails: Tails | None
+    words: list[str]
+
+
+def _held(
+    there: Measurement,
+    plain: Residuals,
+    held_points: BoolArray,
+    random: KeyedRandom,
+    left_out: frozenset[tuple[str, bool]] = frozenset(),
+) -> _Held:
+    """What is named and holds on held-out blocks; where a free form does not, what is named without any. The effects come with
+    what would split each class."""
+    attempt = _named(there, plain, held_points, random, left_out)
+    state, naming = attempt.state, attempt.naming
+    losses = _missing(there, state)
+    lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
+    named = sorted([*attempt.named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
+    named, words = only_within_bounds(there.model, named)
     fit = state.residuals.smooth & ~state.changed
     tested = _thinned(np.flatnonzero(fit & state.held_out))
     rows = np.concatenate([state.chosen, tested])
     trained = np.arange(len(rows)) < len(state.chosen)
-    scored = score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
-    words = [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
+    scored = score_effects(*few(there, state.residuals, rows), named, trained, naming.reference_sigma)
+    words += [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
+    if FREE_FORMS not in left_out and any(item.kind == "empirical" and not item.spreads for item in scored.failed):
+        again = _held(there, plain, held_points, random, left_out | {FREE_FORMS})
+        if again.named:
+            return replace(again, words=[*words, *(each for each in again.words if each not in words)])
     words += [f"{item.name} only mentioned: beside the others it gains {item.gain:.1f} on new blocks" for item in scored.weak]
     described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
     least = decided().held_out.left_over * max(described, default=0.0)
@@ -328,7 +356,8 @@ def _confirmed(
     steady = _thinned(np.flatnonzero(fit & ~state.held_out))
     kept = [item for item in scored.named if item not in left]
     found, tails = _with_tails(*few(there, state.residuals, steady), kept, state.cells.side_m)
-    return with_splits(there, found), tails, words + ([tails.words] if tails else [])
+    words += [tails.words] if tails else []
+    return _Held(state, naming, losses, with_splits(there, found), tails, words)
 
 
 def _thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:

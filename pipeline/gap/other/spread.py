@@ -73,6 +73,10 @@ class SpreadFound:
     empirical: bool
     variance: FloatArray
 
+    def everywhere(self, count: int) -> SpreadFound:
+        """The same of `count` points: what is no function of the place adds alike to all."""
+        return replace(self, variance=np.full(count, float(self.variance.mean())))
+
 
 @dataclass(frozen=True)
 class SpreadTried:

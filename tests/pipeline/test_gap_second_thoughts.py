@@ -1,0 +1,81 @@
+"""What a diagnosis does where its first answer does not hold: rays that are turned off the wall, free forms that fail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gap_cases import write_scan
+
+from benchmarks.gap_challenge.cases import Case, make
+from pipeline.formats.measurement import StereoMeasurement, read_measurement
+from pipeline.gap.naming import workflow
+from pipeline.gap.naming.entries import Named, with_effects
+from pipeline.gap.naming.held_out import Scored
+from pipeline.gap.naming.naming import FREE_FORMS
+from pipeline.gap.naming.relinearised import at_points
+from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.residuals.registration import residuals_of, settled
+from scene.keyed_random import KeyedRandom
+
+
+def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path: Path) -> None:
+    """A principal point 10,000 px off, with an effect that looks at the raster of what is seen."""
+    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    measurement = read_measurement(tmp_path / "case")
+    assert isinstance(measurement, StereoMeasurement)
+    away = [{"name": "principal_point_x", "camera": "left", "delta_px": 1e4}, {"name": "smoothing", "sigma_px": 2.0}]
+    found = settled(measurement.changed(model=with_effects(measurement.model, away)))
+    assert len(found.residuals) == 0
+    assert not found.pose.any()
+    assert len(at_points(found.residuals, residuals_of(measurement))) == 0
+
+
+def test_noise_found_on_some_points_adds_alike_to_all() -> None:
+    found = SpreadFound("a", "a", (), 0.1, 3.0, {}, {}, False, np.full(5, 0.04))
+    np.testing.assert_array_equal(found.everywhere(8).variance, np.full(8, 0.04))
+
+
+def _named(name: str, kind: str) -> Named:
+    return Named(f"tls.{name}", kind, {"name": name}, {}, (), 0.002, 50.0)
+
+
+@pytest.mark.parametrize(
+    ("without", "kept", "asked"),
+    [
+        ([_named("range_offset", "physical")], ["tls.range_offset"], [False, True]),
+        ([], [], [False, True]),  # nothing else either: what is left stays as it was found the first time
+    ],
+)
+def test_where_a_free_form_fails_all_is_named_again_without_any(
+    without: list[Named], kept: list[str], asked: list[bool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_scan(tmp_path, 10, step_rad=0.007)
+    there, plain, _ = settled(read_measurement(tmp_path))
+    nowhere = np.zeros(len(there.cloud.points), dtype=bool)
+    state = workflow._State.of(there, plain, nowhere, [], nowhere)
+    seen: list[bool] = []
+
+    def named(*given: Any) -> Any:
+        seen.append(FREE_FORMS in given[-1])
+        items = without if seen[-1] else [_named("range_empirical", "empirical")]
+        naming = SimpleNamespace(reference_sigma=0.0, asked=seen[-1])
+        return SimpleNamespace(state=state, naming=naming, named=items)
+
+    def scored(_there: Any, _residuals: Any, items: list[Named], *_: Any) -> Scored:
+        failed = [item for item in items if item.kind == "empirical"]
+        return Scored([item for item in items if item not in failed], failed, [])
+
+    monkeypatch.setattr(workflow, "_named", named)
+    monkeypatch.setattr(workflow, "score_effects", scored)
+    monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
+    monkeypatch.setattr(workflow, "_with_tails", lambda *given: (given[2], None))
+    monkeypatch.setattr(workflow, "with_splits", lambda _, items: items)
+    found = workflow._held(there, plain, nowhere, KeyedRandom(1))
+    assert [item.name for item in found.named] == kept
+    assert found.words == ["tls.range_empirical dropped: it does not hold on blocks that were held out"]
+    assert seen == asked
+    assert found.naming.asked is bool(kept)  # type: ignore[attr-defined]
