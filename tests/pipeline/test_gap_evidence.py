@@ -15,9 +15,10 @@ from gap_cases import Array, Scan, smooth_noise, write_scan
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.selection import Choice, Members, Tried
+from pipeline.gap.naming.attempts import few
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.held_out import score_effects
-from pipeline.gap.naming.workflow import diagnose, few
+from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
 from pipeline.gap.residuals.registration import registered, settled

@@ -13,6 +13,7 @@ from gap_cases import write_scan
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.naming import workflow
+from pipeline.gap.naming.attempts import State
 from pipeline.gap.naming.entries import Named, with_effects
 from pipeline.gap.naming.held_out import Scored
 from pipeline.gap.naming.naming import FREE_FORMS
@@ -56,7 +57,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     write_scan(tmp_path, 10, step_rad=0.007)
     there, plain, _ = settled(read_measurement(tmp_path))
     nowhere = np.zeros(len(there.cloud.points), dtype=bool)
-    state = workflow._State.of(there, plain, nowhere, [], nowhere)
+    state = State.of(there, plain, nowhere, [], nowhere)
     seen: list[bool] = []
 
     def named(*given: Any) -> Any:
@@ -69,7 +70,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
         failed = [item for item in items if item.kind == "empirical"]
         return Scored([item for item in items if item not in failed], failed, [])
 
-    monkeypatch.setattr(workflow, "_named", named)
+    monkeypatch.setattr(workflow, "attempt", named)
     monkeypatch.setattr(workflow, "score_effects", scored)
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
     monkeypatch.setattr(workflow, "_with_tails", lambda *given: (given[2], None))

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.formats.measurement import Measurement, TlsMeasurement
 from pipeline.formats.measurement_checks import check_near, check_noise
 from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import Tried
+from pipeline.gap.naming.attempts import State, attempt, few, thinned_rows
 from pipeline.gap.naming.entries import (
     Named,
     from_missing,
@@ -22,43 +23,30 @@ from pipeline.gap.naming.entries import (
     from_tails,
     only_within_bounds,
     settled_with,
-    with_effects,
 )
 from pipeline.gap.naming.families import believes
-from pipeline.gap.naming.held_out import score_effects
-from pipeline.gap.naming.naming import FREE_FORMS, Naming, name_effects
+from pipeline.gap.naming.held_out import Scored, score_effects
+from pipeline.gap.naming.naming import FREE_FORMS, Naming
 from pipeline.gap.naming.splitting import with_splits
 from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, verdict_of
 from pipeline.gap.naming.verification import Showing, Shown
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
-from pipeline.gap.other.mixed_pixels import find_footprint
-from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadTried, Tails, find_tails
-from pipeline.gap.other.stereo_shapes import find_shapes
 from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
-from pipeline.gap.residuals.changes import SceneChange, find_changes, moved_share, once_each
+from pipeline.gap.residuals.changes import SceneChange, moved_share
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.thinning import thinned
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.occlusion_fill import OcclusionFill
-from sensors.effects.smoothing import Smoothing
 from sensors.model import StereoModel, TlsModel
 
 STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
 """The steps of `diagnose` and about what each takes, s."""
-_MOST_POINTS = 60_000
-"""Points that take part in the selection; more add little to 1,100 cells."""
-_NOT_FREE = {"tls": ("edge_step", "line"), "stereo": ("edge_step", "incidence")}
-"""Covariates by sensor that an empirical term cannot be a function of."""
-
-
 _USUAL = Decisions()
 
 
@@ -178,7 +166,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     )
 
 
-def _with_moved(evidence: Evidence, there: Measurement, state: _State, shown: Shown) -> Evidence:
+def _with_moved(evidence: Evidence, there: Measurement, state: State, shown: Shown) -> Evidence:
     """With the share of the wall that moved, where that may be why nothing was named that closes the gap."""
     if verdict_of(shown.named, evidence) != "unknown" or (shown.named and not evidence.stays_open):
         return evidence
@@ -193,129 +181,13 @@ def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
 
 
 @dataclass(frozen=True)
-class _State:
-    """What naming starts from, once effects where the surface is not smooth are known.
-
-    shaped: the measurement with them in its model; residuals: against that; touched, changed, held_out: (n,) points that they
-    touch, that lie in changes of the scene, and that no step before the last may look at; rough: (n,) registered residuals, which
-    spread `scale` predicted sigmas; chosen: rows that selection may look at.
-    """
-
-    shapes: list[ShapeFound]
-    shaped: Measurement
-    residuals: Residuals
-    touched: BoolArray
-    changes: list[SceneChange]
-    changed: BoolArray
-    rough: FloatArray
-    scale: float
-    cells: Cells
-    held_out: BoolArray
-    chosen: NDArray[np.int64]
-
-    @classmethod
-    def of(
-        cls,
-        there: Measurement,
-        plain: Residuals,
-        held_points: BoolArray,
-        shapes: list[ShapeFound],
-        touched_points: BoolArray,
-        resettled: bool = True,
-    ) -> _State:
-        """held_points, touched_points: of the measurement; resettled: the sensor goes where it stood with the shapes."""
-        touched = touched_points[plain.index]
-        trusted = plain.index[~(touched | held_points[plain.index])] if resettled else None
-        shaped, residuals = _shaped(there, plain, shapes, touched, trusted)
-        rough, _, scale = registered(residuals)
-        sight = Sight.of(there, residuals)
-        changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
-        if isinstance(there, TlsMeasurement) and there.scans:
-            changes = once_each(changes)
-        rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
-        cells = Cells.over(residuals.at)
-        held_out = held_points[residuals.index]
-        usable = residuals.smooth & ~changed & (np.abs(rough) < decided().points.outlier * scale * residuals.sigma)
-        chosen = _thinned(np.flatnonzero(usable & ~held_out))
-        return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
-
-    @property
-    def shown(self) -> BoolArray:
-        """(n,) points on which a gap may be measured: on smooth surface, or where an effect was found that shows elsewhere."""
-        return np.asarray((self.residuals.smooth | self.touched) & ~self.changed)
-
-    @property
-    def part(self) -> tuple[Measurement, Residuals]:
-        """What selection may look at."""
-        return few(self.shaped, self.residuals, self.chosen)
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """What naming started from and what it named."""
-
-    state: _State
-    named: list[Named]
-    naming: Naming
-
-    @classmethod
-    def of(cls, state: _State, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> _Attempt:
-        return cls(state, *name_effects(*state.part, state.scale, random, left_out))
-
-    @property
-    def shapes(self) -> set[str]:
-        """Effects where the surface is not smooth."""
-        return {each.name for each in self.state.shapes}
-
-    @property
-    def complexity(self) -> tuple[int, int]:
-        """Empirical terms, and all effects and changes of the scene."""
-        state = self.state
-        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(state.shapes) + len(state.changes)
-
-
-def _named(
-    there: Measurement, plain: Residuals, held_points: BoolArray, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]
-) -> _Attempt:
-    """What the naming started from in the end, and what it named. left_out: as of `name_effects`.
-
-    What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
-    what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
-    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation.
-    """
-
-    def beside(found: _Attempt) -> _Attempt:
-        if not found.named:
-            return found
-        seen = settled_with(there, found.named, plain.index[~held_points[plain.index]])
-        again = _State.of(there, plain, held_points, *_shapes(seen.measurement, seen.residuals, held_points))
-        names = {each.name for each in again.shapes}
-        # rays that are not quite where they are thought to be look like a low-pass
-        feigned = Smoothing.tag() in names - found.shapes
-        return found if names == found.shapes or feigned else _Attempt.of(again, random, left_out)
-
-    shapes = _shapes(there, plain, held_points)
-    first = _Attempt.of(_State.of(there, plain, held_points, *shapes), random, left_out)
-    found = [beside(first)]
-    if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0):
-        staying = _State.of(there, plain, held_points, *shapes, resettled=False)
-        found.append(beside(_Attempt.of(staying, random, left_out)))
-    if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
-        untouched = np.zeros(len(held_points), dtype=bool)
-        smooth = _Attempt.of(_State.of(there, plain, held_points, [], untouched), random, left_out)
-        if smooth.named:
-            found.append(beside(smooth))
-    return min(found, key=lambda each: each.complexity)
-
-
-@dataclass(frozen=True)
 class _Held:
     """What naming started from, the effects that hold on held-out blocks, heavy tails, and words for the other effects.
 
     losses: the effect on the returns, and the pulses that it was not fitted to.
     """
 
-    state: _State
+    state: State
     naming: Naming
     losses: tuple[MissingFound, BoolArray] | None
     named: list[Named]
@@ -332,17 +204,13 @@ def _held(
 ) -> _Held:
     """What is named and holds on held-out blocks; where a free form does not, what is named without any. The effects come with
     what would split each class."""
-    attempt = _named(there, plain, held_points, random, left_out)
-    state, naming = attempt.state, attempt.naming
+    first = attempt(there, plain, held_points, random, left_out)
+    state, naming = first.state, first.naming
     losses = _missing(there, state)
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
-    named = sorted([*attempt.named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
+    named = sorted([*first.named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
     named, words = only_within_bounds(there.model, named)
-    fit = state.residuals.smooth & ~state.changed
-    tested = _thinned(np.flatnonzero(fit & state.held_out))
-    rows = np.concatenate([state.chosen, tested])
-    trained = np.arange(len(rows)) < len(state.chosen)
-    scored = score_effects(*few(there, state.residuals, rows), named, trained, naming.reference_sigma)
+    scored = _scored(there, state, named, naming.reference_sigma)
     words += [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
     if FREE_FORMS not in left_out and any(item.kind == "empirical" and not item.spreads for item in scored.failed):
         again = _held(there, plain, held_points, random, left_out | {FREE_FORMS})
@@ -353,66 +221,19 @@ def _held(
     least = decided().held_out.left_over * max(described, default=0.0)
     left = [item for item in scored.named if item.spreads and item.gain < least]
     words += [f"{item.name} dropped: so much is left over by the empirical term" for item in left]
-    steady = _thinned(np.flatnonzero(fit & ~state.held_out))
+    steady = thinned_rows(np.flatnonzero(state.fit & ~state.held_out))
     kept = [item for item in scored.named if item not in left]
     found, tails = _with_tails(*few(there, state.residuals, steady), kept, state.cells.side_m)
     words += [tails.words] if tails else []
     return _Held(state, naming, losses, with_splits(there, found), tails, words)
 
 
-def _thinned(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    return rows[:: max(len(rows) // _MOST_POINTS, 1)]
-
-
-def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> tuple[list[ShapeFound], BoolArray]:
-    """Effects where the surface is not smooth that the model does not hold, and which of the measurement's points they touch.
-
-    held_points: of the measurement's points those that have no say.
-    """
-    rough, _, scale = registered(residuals)
-    found: list[ShapeFound] = []
-    held_out = held_points[residuals.index]
-    match measurement, residuals:
-        case StereoMeasurement(), StereoResiduals():
-            found = find_shapes(measurement, residuals, rough, held_out)
-        case TlsMeasurement(), TlsResiduals() if not believes(measurement, BeamDivergence.tag()):
-            found = find_footprint(measurement, residuals, rough, scale, held_out)
-    touched = np.zeros(len(measurement.cloud.points), dtype=bool)
-    for each in found:
-        touched[residuals.index] |= each.touched
-    return found, touched
-
-
-def _shaped(
-    measurement: Measurement,
-    residuals: Residuals,
-    shapes: list[ShapeFound],
-    touched: BoolArray,
-    trusted: NDArray[np.int64] | None,
-) -> tuple[Measurement, Residuals]:
-    """The measurement with these effects in its model, its sensor where its points say that it stood with them, and the residuals
-    of the same points there. touched: (n,) points that the effects move; trusted: rows of the measurement's points that say where
-    the sensor stood, None where it stays."""
-    if not shapes:
-        return measurement, residuals
-    entries = [from_shape(shape).entry for shape in shapes]
-    shaped = measurement.changed(model=with_effects(measurement.model, entries))
-    if trusted is None:
-        found = residuals_of(shaped)
-    else:
-        shaped, found, _ = settled(shaped, trusted)
-    place = np.full(len(measurement.cloud.points), -1)
-    place[found.index] = np.arange(len(found))
-    rows = place[residuals.index]
-    known = rows >= 0
-    there = residuals.with_rows(known, found.part(rows[known]))
-    return shaped, replace(there, smooth=residuals.smooth & ~touched & known)
-
-
-def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
-    """The measurement with the points of some rows of its residuals alone, and their residuals."""
-    part = residuals.part(rows)
-    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)
+def _scored(there: Measurement, state: State, named: list[Named], reference_sigma: float) -> Scored:
+    """The effects on held-out blocks."""
+    tested = thinned_rows(np.flatnonzero(state.fit & state.held_out))
+    rows = np.concatenate([state.chosen, tested])
+    trained = np.arange(len(rows)) < len(state.chosen)
+    return score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
 
 
 def _with_tails(
@@ -490,7 +311,7 @@ def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock)
     )  # fmt: skip
 
 
-def _missing(measurement: Measurement, state: _State) -> tuple[MissingFound, BoolArray] | None:
+def _missing(measurement: Measurement, state: State) -> tuple[MissingFound, BoolArray] | None:
     """The effect on the returns, and the pulses that it was not fitted to."""
     residuals = state.residuals
     missing = residuals.missing

@@ -1,0 +1,207 @@
+"""What naming starts from, once effects where the surface is not smooth are known, what it names, and those again beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.gap.decisions import decided
+from pipeline.gap.naming.entries import Named, from_shape, settled_with, with_effects
+from pipeline.gap.naming.families import believes
+from pipeline.gap.naming.naming import Naming, name_effects
+from pipeline.gap.other.mixed_pixels import find_footprint
+from pipeline.gap.other.shapes import ShapeFound
+from pipeline.gap.other.stereo_shapes import find_shapes
+from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.residuals.changes import SceneChange, find_changes, once_each
+from pipeline.gap.residuals.registration import registered, residuals_of, settled
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.beam_divergence import BeamDivergence
+from sensors.effects.smoothing import Smoothing
+
+_MOST_POINTS = 60_000
+"""Points that take part in the selection; more add little to 1,100 cells."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What naming starts from, once effects where the surface is not smooth are known.
+
+    shaped: the measurement with them in its model; residuals: against that; touched, changed, held_out: (n,) points that they
+    touch, that lie in changes of the scene, and that no step before the last may look at; rough: (n,) registered residuals, which
+    spread `scale` predicted sigmas; chosen: rows that selection may look at.
+    """
+
+    shapes: list[ShapeFound]
+    shaped: Measurement
+    residuals: Residuals
+    touched: BoolArray
+    changes: list[SceneChange]
+    changed: BoolArray
+    rough: FloatArray
+    scale: float
+    cells: Cells
+    held_out: BoolArray
+    chosen: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls,
+        there: Measurement,
+        plain: Residuals,
+        held_points: BoolArray,
+        shapes: list[ShapeFound],
+        touched_points: BoolArray,
+        resettled: bool = True,
+    ) -> State:
+        """held_points, touched_points: of the measurement; resettled: the sensor goes where it stood with the shapes."""
+        touched = touched_points[plain.index]
+        trusted = plain.index[~(touched | held_points[plain.index])] if resettled else None
+        shaped, residuals = _shaped(there, plain, shapes, touched, trusted)
+        rough, _, scale = registered(residuals)
+        sight = Sight.of(there, residuals)
+        changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
+        if isinstance(there, TlsMeasurement) and there.scans:
+            changes = once_each(changes)
+        rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
+        cells = Cells.over(residuals.at)
+        held_out = held_points[residuals.index]
+        usable = residuals.smooth & ~changed & (np.abs(rough) < decided().points.outlier * scale * residuals.sigma)
+        chosen = thinned_rows(np.flatnonzero(usable & ~held_out))
+        return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
+
+    @property
+    def fit(self) -> BoolArray:
+        """(n,) points on smooth surface that did not change."""
+        return np.asarray(self.residuals.smooth & ~self.changed)
+
+    @property
+    def shown(self) -> BoolArray:
+        """(n,) points on which a gap may be measured: on smooth surface, or where an effect was found that shows elsewhere."""
+        return np.asarray((self.residuals.smooth | self.touched) & ~self.changed)
+
+    @property
+    def part(self) -> tuple[Measurement, Residuals]:
+        """What selection may look at."""
+        return few(self.shaped, self.residuals, self.chosen)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What naming started from and what it named."""
+
+    state: State
+    named: list[Named]
+    naming: Naming
+
+    @classmethod
+    def of(cls, state: State, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> Attempt:
+        return cls(state, *name_effects(*state.part, state.scale, random, left_out))
+
+    @property
+    def shapes(self) -> set[str]:
+        """Effects where the surface is not smooth."""
+        return {each.name for each in self.state.shapes}
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Empirical terms, and all effects and changes of the scene."""
+        state = self.state
+        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(state.shapes) + len(state.changes)
+
+
+def attempt(
+    there: Measurement, plain: Residuals, held_points: BoolArray, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]
+) -> Attempt:
+    """What the naming started from in the end, and what it named. left_out: as of `name_effects`.
+
+    What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
+    what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
+    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation.
+    """
+
+    def beside(found: Attempt) -> Attempt:
+        if not found.named:
+            return found
+        seen = settled_with(there, found.named, plain.index[~held_points[plain.index]])
+        again = State.of(there, plain, held_points, *_shapes(seen.measurement, seen.residuals, held_points))
+        names = {each.name for each in again.shapes}
+        # rays that are not quite where they are thought to be look like a low-pass
+        feigned = Smoothing.tag() in names - found.shapes
+        return found if names == found.shapes or feigned else Attempt.of(again, random, left_out)
+
+    shapes = _shapes(there, plain, held_points)
+    first = Attempt.of(State.of(there, plain, held_points, *shapes), random, left_out)
+    found = [beside(first)]
+    if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0):
+        staying = State.of(there, plain, held_points, *shapes, resettled=False)
+        found.append(beside(Attempt.of(staying, random, left_out)))
+    if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
+        untouched = np.zeros(len(held_points), dtype=bool)
+        smooth = Attempt.of(State.of(there, plain, held_points, [], untouched), random, left_out)
+        if smooth.named:
+            found.append(beside(smooth))
+    return min(found, key=lambda each: each.complexity)
+
+
+def thinned_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    return rows[:: max(len(rows) // _MOST_POINTS, 1)]
+
+
+def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> tuple[list[ShapeFound], BoolArray]:
+    """Effects where the surface is not smooth that the model does not hold, and which of the measurement's points they touch.
+
+    held_points: of the measurement's points those that have no say.
+    """
+    rough, _, scale = registered(residuals)
+    found: list[ShapeFound] = []
+    held_out = held_points[residuals.index]
+    match measurement, residuals:
+        case StereoMeasurement(), StereoResiduals():
+            found = find_shapes(measurement, residuals, rough, held_out)
+        case TlsMeasurement(), TlsResiduals() if not believes(measurement, BeamDivergence.tag()):
+            found = find_footprint(measurement, residuals, rough, scale, held_out)
+    touched = np.zeros(len(measurement.cloud.points), dtype=bool)
+    for each in found:
+        touched[residuals.index] |= each.touched
+    return found, touched
+
+
+def _shaped(
+    measurement: Measurement,
+    residuals: Residuals,
+    shapes: list[ShapeFound],
+    touched: BoolArray,
+    trusted: NDArray[np.int64] | None,
+) -> tuple[Measurement, Residuals]:
+    """The measurement with these effects in its model, its sensor where its points say that it stood with them, and the residuals
+    of the same points there. touched: (n,) points that the effects move; trusted: rows of the measurement's points that say where
+    the sensor stood, None where it stays."""
+    if not shapes:
+        return measurement, residuals
+    entries = [from_shape(shape).entry for shape in shapes]
+    shaped = measurement.changed(model=with_effects(measurement.model, entries))
+    if trusted is None:
+        found = residuals_of(shaped)
+    else:
+        shaped, found, _ = settled(shaped, trusted)
+    place = np.full(len(measurement.cloud.points), -1)
+    place[found.index] = np.arange(len(found))
+    rows = place[residuals.index]
+    known = rows >= 0
+    there = residuals.with_rows(known, found.part(rows[known]))
+    return shaped, replace(there, smooth=residuals.smooth & ~touched & known)
+
+
+def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
+    """The measurement with the points of some rows of its residuals alone, and their residuals."""
+    part = residuals.part(rows)
+    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)
