@@ -18,9 +18,12 @@ from pipeline.gap.naming.entries import Named, with_effects
 from pipeline.gap.naming.held_out import Scored
 from pipeline.gap.naming.naming import FREE_FORMS
 from pipeline.gap.naming.relinearised import at_points
+from pipeline.gap.naming.verify import simulated
 from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.registration import residuals_of, settled
 from scene.keyed_random import KeyedRandom
+from sensors.model import StereoNoise
 
 
 def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path: Path) -> None:
@@ -80,3 +83,19 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     assert found.words == ["tls.range_empirical dropped: it does not hold on blocks that were held out"]
     assert seen == asked
     assert found.naming.asked is bool(kept)  # type: ignore[attr-defined]
+
+
+def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
+    """Depth maps have cells of two pixels or more, the measurement's pixels are half a pixel off their middles: what the surface
+    does between is none of the sensor's."""
+    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    assert isinstance(there, StereoMeasurement)
+    noise = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
+    seen = simulated(there, there.model.model_copy(update={"noise": noise}), residuals, KeyedRandom(1))
+    nominal, u, v = NominalPair.of(there), there.cloud.extra["pixel_x"], there.cloud.extra["pixel_y"]
+    between = nominal.of_surface(there.scene, u + 0.5, v + 0.5) - nominal.of_surface(there.scene, u, v)
+    assert np.nanstd(between[residuals.index[residuals.smooth]]) > 0.01, "px of disparity on smooth surface"
+    known = residuals.smooth & np.isfinite(seen)
+    assert known.sum() > 5000
+    np.testing.assert_allclose(seen[known], 0, atol=2e-4)

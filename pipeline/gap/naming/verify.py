@@ -121,9 +121,10 @@ def simulated(measurement: Measurement, model: TlsModel | StereoModel, residuals
 def _simulated_disparities(
     measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, random: KeyedRandom
 ) -> FloatArray:
-    """Of the depth map's cell that holds each pixel; the finest depth map of whose grid the pixels are.
+    """Of the depth map's cell that holds each pixel; the finest depth map of whose grid the pixels are, or come nearest to.
 
-    measurement: with its cameras where they stood, against which `residuals` may be those of another place.
+    measurement: with its cameras where they stood, against which `residuals` may be those of another place. Cells are two pixels
+    wide at least; by how much the reference's disparity differs between the middle of a cell and the pixel is taken off.
     """
     nominal, g = NominalPair.of(measurement), residuals.geometry
     quality = min(REDUCTION, key=lambda name: float(np.mean(np.abs(np.mod(g.u, REDUCTION[name]) - REDUCTION[name] / 2))))
@@ -134,7 +135,8 @@ def _simulated_disparities(
     columns = np.clip((g.u / step).astype(int), 0, points.shape[1] - 1)
     seen = points[rows, columns]
     found = nominal.disparity(project(nominal.pair.left, seen), project(nominal.pair.right, seen))
-    return np.asarray(found - g.disparity)
+    middle = nominal.of_surface(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
+    return np.asarray(found - g.disparity - (middle - nominal.of_surface(measurement.scene, g.u, g.v)))
 
 
 def measure_gap(

@@ -74,6 +74,13 @@ class NominalPair:
         first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
         return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
+    def of_surface(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
+        """(n,) disparity of what pixels of the left image see, px; NaN where they see nothing."""
+        left = self.pair.left
+        ray = rays(left, u, v)
+        point = left.position + scene.cast(left.position, ray)[0][:, None] * ray
+        return self.disparity((u, v), project(self.pair.right, point))
+
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
         """(n,) rectified column of pixels of the left image."""
         rect = self.geometry
