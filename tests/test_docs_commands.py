@@ -133,6 +133,7 @@ NAMED = (
     "scarpsim gap --identifiability CONFIG",
     "scarpsim gap MEASUREMENT --identifiability",
     "scarpsim gap MEASUREMENT --out DIR",
+    "scarpsim measurement",
     "scarpsim gap MEASUREMENT --out gap",
     "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
