@@ -65,9 +65,12 @@ class Evidence:
 
     @property
     def stays_open(self) -> bool:
-        """Whether the gap with the named effects is above the floor, and most of what it was, by more than its uncertainty."""
+        """Whether the gap with the named effects is above the floor, and most of what it was, by more than its uncertainty; or no
+        smaller than without them while more remains than chance would leave."""
         gap = self.gap
         by = decided().verdict
+        if gap is not None and gap.after > gap.before and self.rejects:
+            return True
         if gap is None or gap.closed is None or not gap.left_open:
             return False
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
