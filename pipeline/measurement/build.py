@@ -26,6 +26,8 @@ from sensors.model import StereoModel, TlsModel
 _ONE_PLACE_M = 0.05
 """Stations that stand nearer to each other than this are one, set up again: its scans are epochs."""
 
+_PLANES = "angles of incidence are those to planes through 24 points of it: its triangles lean by noise and relief between points"
+
 
 @dataclass(frozen=True)
 class Request:
@@ -62,7 +64,7 @@ def build(request: Request, out: Path) -> Understood:
     about = {
         "scan": tuple(f"{scan.name}: {len(scan.cloud.points):,} points{_said(scan)}" for scan in scans) + echo_words,
         "scanner": station.words + _of_others(scans, stations),
-        "reference": reference.words,
+        "reference": (*reference.words, *((_PLANES,) if reference.of_points else ())),
         "cannot show": reference.limits,
         "model": (*model_words, *noise_words),
     }

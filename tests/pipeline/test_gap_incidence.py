@@ -87,7 +87,8 @@ def test_a_bias_of_the_incidence_is_named_on_half_of_a_scan(tmp_path: Path) -> N
 def test_references_of_points_ask_for_planes_others_do_not(tmp_path: Path) -> None:
     path = scan(tmp_path / "ground.xyz")
     request = Request([path], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0))
-    build(request, tmp_path / "out")
+    found = build(request, tmp_path / "out")
+    assert "planes through 24 points of it" in found.about["reference"][-1]
     assert yaml.safe_load((tmp_path / "out/measurement.yaml").read_text())["incidence"] == "planes"
     mesh = tmp_path / "out/reference.ply"
     build(Request([path], str(mesh), "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "meshed")
