@@ -59,7 +59,8 @@ Not mended:
 - **The structured light is too good** (53, 56, 60 and others of `light`): its noise is 0.009 px with 3 % of the points far out,
   and camera effects of as little are blamed. In answers on the matcher what it has without an injection does not count.
 - **Dropped on held-out blocks** (53): a wave along rows of S/N 120 is found, and dropped since it does not hold there.
-- **Rounding to 6 cm** leaves a floor of 43 mm on the rock face: what is weak beside it is not found (42, 46, 47, 51).
+- **The rock face** spreads 2.4 times what the model predicts, most of it shared by neighbours (relief between points, coordinates
+  rounded to 6 cm): what is weak beside that is not found (42, 46, 47, 51).
 """
 
 
