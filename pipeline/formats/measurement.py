@@ -130,7 +130,9 @@ class MeasurementConfig(Config):
         return points
 
     @model_validator(mode="after")
-    def _one_pose_each(self) -> Self:
+    def _fits(self) -> Self:
+        if self.sensor == "stereo" and self.incidence != "triangles":
+            raise ValueError("'incidence: planes' is of laser scans; leave it out")
         files = [self.points] if isinstance(self.points, Path) else self.points
         if self.scanners and len(self.scanners) != len(files):
             raise ValueError(f"'scanners' has {len(self.scanners)} poses for {len(files)} files of points; give one for each")

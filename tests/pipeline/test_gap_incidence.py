@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.formats.measurement import MeasurementConfig, TlsMeasurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.scan_simulation import simulated_ranges
 from pipeline.gap.residuals.tls_residuals import RayGeometry, tls_residuals
 from pipeline.measurement.build import Request, build
+from scene.config import parse
+from scene.errors import InputError
 from scene.plane_normals import plane_normals
 from sensors.effects.range_incidence_bias import RangeIncidenceBias
 
@@ -95,6 +97,12 @@ def test_references_of_points_ask_for_planes_others_do_not(tmp_path: Path) -> No
     measurement = read_measurement(tmp_path / "meshed")
     assert isinstance(measurement, TlsMeasurement)
     assert measurement.normals is None
+
+
+def test_planes_are_not_asked_for_where_nothing_looks_at_them() -> None:
+    values = {"sensor": "stereo", "reference": "a.ply", "points": "b.ply", "model": "model.yaml", "incidence": "planes"}
+    with pytest.raises(InputError, match="of laser scans; leave it out"):
+        parse(MeasurementConfig, values, "measurement.yaml")
 
 
 def test_normals_of_a_sphere_point_to_its_middle() -> None:

@@ -171,7 +171,7 @@ def _with_moved(evidence: Evidence, there: Measurement, state: State, shown: Sho
     if verdict_of(shown.named, evidence) != "unknown" or (shown.named and not evidence.stays_open):
         return evidence
     after = replace(state.residuals, value=shown.value)
-    return replace(evidence, moved=moved_share(after, Sight.of(there, after), state.residuals.smooth & ~state.changed))
+    return replace(evidence, moved=moved_share(after, Sight.of(there, after), state.fit))
 
 
 def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
