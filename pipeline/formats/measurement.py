@@ -112,9 +112,7 @@ class MeasurementConfig(Config):
     )
     model: Path = Field(description="what the simulation believes about the sensor today")
     incidence: Literal["triangles", "planes"] = Field(
-        "triangles",
-        description="what rays are inclined to: the triangle that they hit, or, where triangles lean by noise and relief "
-        "between points, the plane through the 24 nearest vertices (tls)",
+        "triangles", description="what rays are inclined to: the triangle hit, or a plane through 24 vertices around it (tls)"
     )
     notes: tuple[str, ...] = Field(
         (), description="what the report should say of the measurement, such as what a reference cannot show"
