@@ -23,6 +23,7 @@ from sensors.effects.camera_shift import CameraShift
 from sensors.effects.focal_length import FocalLength
 from sensors.effects.matching_noise import MatchingNoise
 from sensors.effects.parallax_noise import ParallaxNoise
+from sensors.effects.point_noise import PointNoise
 from sensors.effects.principal_point_x import PrincipalPointX
 from sensors.effects.principal_point_y import PrincipalPointY
 from sensors.effects.radial_distortion import RadialDistortion
@@ -152,6 +153,13 @@ class StereoNoise(Config):
     regularization_step_px: float = Field(
         32.0, gt=0, le=100_000, description="distance of the grid's nodes [px of the full-resolution frame]"
     )
+    point_sigma_m: float = Field(
+        0.0, ge=0, le=10, description="white noise of the points along the surface's normal, for a cloud without cameras [m]"
+    )
+    point_shared_sigma_m: float = Field(
+        0.0, ge=0, le=10, description="such noise that neighbours share, at the nodes of a grid over the wall's plane [m]"
+    )
+    point_shared_step_m: float = Field(0.1, gt=0, le=1000, description="distance of that grid's nodes [m]")
     orientation: OrientationNoise = OrientationNoise()
     orientation_drawn: Literal["each_camera", "both_alike"] = Field(
         "each_camera", description="orientation noise of its own for each camera, or one draw for both, most of which cancels"
@@ -161,6 +169,12 @@ class StereoNoise(Config):
         """The orientation noise of one observation, as effects."""
         sides: tuple[Side, ...] = ("both",) if self.orientation_drawn == "both_alike" else ("left", "right")
         return tuple(effect for side in sides for effect in self.orientation.draw(side, random.child(side)))
+
+    @property
+    def of_points(self) -> PointNoise:
+        """The noise of the points in metres."""
+        sigma, shared, step = self.point_sigma_m, self.point_shared_sigma_m, self.point_shared_step_m
+        return PointNoise(sigma_m=sigma, shared_sigma_m=shared, shared_step_m=step)
 
 
 class StereoModel(Config):
@@ -202,5 +216,10 @@ class StereoModel(Config):
             *noise.draw(random.child("orientation")),
             ParallaxNoise(sigma_px=noise.parallax_sigma_px),
             RegularizationNoise(sigma_px=noise.regularization_sigma_px, step_px=noise.regularization_step_px),
+            noise.of_points,
             *self.effects,
         )
+
+    def of_points(self) -> tuple[Effect, ...]:
+        """What it says of points in metres: the base noise, and effects of that stage."""
+        return (self.noise.of_points, *(effect for effect in self.effects if effect.stage == Stage.POINT))

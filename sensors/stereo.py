@@ -6,7 +6,8 @@
    the undisplaced one, and the right pixel is recorded displaced.
 3  Both pixels are undistorted and rectified with the nominal calibration: their disparity, plus the matching's effects, is what
    a matcher would report.
-4  The disparity is reprojected with the nominal calibration: the recorded point.
+4  The disparity is reprojected with the nominal calibration: the recorded point, which errors that are given in metres move
+   along the normal of the surface.
 Limits: the matcher follows the row; a vertical parallax, where real and nominal calibration differ, does not disturb it.
 """
 
@@ -23,12 +24,14 @@ from scene.frame import WallFrame
 from scene.keyed_random import KeyedRandom
 from scene.mesh import WALL, FloatArray
 from scene.raycast import Hits, RayCaster
+from scene.upload import vectors_on_device
 from sensors.camera import Camera, CameraPair
 from sensors.device import opaque, rotated, vector
 from sensors.effects.base import Effect, Stage, apply_stage
 from sensors.matches import ImageRows, Matches
 from sensors.model import StereoModel
 from sensors.observation import Observation, offset_of, packed
+from sensors.raised_points import in_metres, shifts
 from sensors.rectify import Rectification, rectify
 
 Quality = Literal["high", "medium", "low"]
@@ -56,7 +59,11 @@ class StereoPair:
         for stage in (Stage.MATCH, Stage.FILL):
             matches = apply_stage(effects, stage, matches, random)
         nominal = self.cameras.in_wall_frame(self.frame)
-        return self.recorded(matches, reproject(rectify(nominal), left_u, left_v, matches.disparity), nominal.left, point)
+        found = reproject(rectify(nominal), left_u, left_v, matches.disparity)
+        if moving := in_metres(effects):
+            seen = packed(dr.select(matches.matched, point, np.nan)).numpy().reshape(-1, 3)
+            found += rotated(nominal.left.rotation.T, vectors_on_device(shifts(scene.mesh, moving, seen, random)))
+        return self.recorded(matches, found, nominal.left, point)
 
     def traced(
         self, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom

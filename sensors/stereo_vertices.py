@@ -26,6 +26,7 @@ from sensors.device import rotated, vector
 from sensors.effects.base import Effect, Stage, apply_stage
 from sensors.matches import Matches, bridged
 from sensors.observation import packed
+from sensors.raised_points import in_metres, shifts
 from sensors.rectify import rectify
 from sensors.stereo import REDUCTION, StereoPair, exposed, rectified_disparity, reproject
 
@@ -59,7 +60,10 @@ def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) ->
     recorded = packed(rotated(nominal.left.rotation, local) + vector(nominal.left.position))
     kept = matches.matched & (local.z > 0)
     dr.eval(recorded, kept)
-    return _kept(mesh.with_vertices(recorded.numpy().reshape(-1, 3)), kept.numpy().astype(bool))
+    vertices = recorded.numpy().reshape(-1, 3)
+    if moving := in_metres(effects):
+        vertices = vertices + shifts(mesh, moving, mesh.vertices, random)
+    return _kept(mesh.with_vertices(vertices), kept.numpy().astype(bool))
 
 
 def _projected(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64, mi.Float64, mi.Bool]:

@@ -20,7 +20,6 @@ from pipeline.api.tables import boxes, frame, spread_out
 from pipeline.config.presets import model_file
 from pipeline.formats.measurement import (
     Material,
-    MeasurementConfig,
     assembled,
     nominal_pair,
     read_measurement,
@@ -28,6 +27,7 @@ from pipeline.formats.measurement import (
     sensor_model,
 )
 from pipeline.formats.measurement import Measurement as Measured
+from pipeline.formats.measurement_config import MeasurementConfig
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.gap.naming import workflow
@@ -77,8 +77,8 @@ def measure(
     values = {"sensor": sensor, "reference": "reference", "points": "points", "model": "model", **plain(keys)}
     config = parse(MeasurementConfig, values, "measure")
     pair = nominal_pair(Path(cameras)) if isinstance(cameras, str | os.PathLike) else cameras
-    if sensor == "stereo" and not isinstance(pair, CameraPair):
-        raise InputError("a stereo measurement needs `cameras`", where="measure", allowed="a CameraPair or a file")
+    if sensor == "stereo" and not isinstance(pair, CameraPair | None):
+        raise InputError(f"got {type(pair).__name__}", where="cameras", allowed="a CameraPair or a file, none if not known")
     mesh, notes = (reference, ()) if isinstance(reference, TriangleMesh) else read_reference(Path(reference))
     material = Material(mesh, _clouds(points), _model(model, sensor), pair if sensor == "stereo" else None, notes)
     return Measurement(assembled(config, material, "reference", "measure"))

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from pipeline.calibration.windows import Windows, choose_windows, unchanged
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement, read_measurement
+from pipeline.formats.measurement import (
+    FILE,
+    Measurement,
+    StereoMeasurement,
+    SurfaceMeasurement,
+    TlsMeasurement,
+    read_measurement,
+)
 from pipeline.formats.result_records import RUN_FILE, read_run
 from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
 from pipeline.run.site import SensorSite, prepare_site
@@ -131,6 +138,8 @@ def _measured_site(measurement: Measurement, config: SimulationConfig) -> Sensor
     sensor: StereoPair | LaserScanner
     if isinstance(measurement, StereoMeasurement):
         name, sensor = "cameras", StereoPair(measurement.cameras, measurement.frame, measurement.model, config.depth_map)
+    elif isinstance(measurement, SurfaceMeasurement):
+        raise InputError("has no cameras to simulate", where=FILE, remedy="name `cameras`; scarpsim gap needs none")
     else:
         name, sensor = "scanner", _scanner(measurement, config)
     eyes = {name: measurement.viewpoint}

@@ -14,6 +14,7 @@ from scene.errors import InputError
 SUMMARY = "find where a measurement and the model disagree, name the effect, add it, show the gap shrink"
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
   scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis
+  scarpsim gap cloud.ply --reference wall.ply --photographs --out diagnosis
   scarpsim gap --identifiability my_site.yaml --sensor tls --out plans/gap"""
 
 
@@ -67,7 +68,10 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
     if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")) and not arguments.reference:
         return given[0]
     if not arguments.reference:
-        remedy = "add --reference (a mesh, a cloud, or half) and --scanner, or name the folder of a measurement"
+        remedy = (
+            "add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs without "
+            "cameras; or name the folder of a measurement"
+        )
         raise InputError("is a raw file, without what it is to be compared with", where=str(given[0]), remedy=remedy)
     return built(arguments, given, out / "measurement").folder
 

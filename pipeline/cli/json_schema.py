@@ -10,7 +10,7 @@ from pydantic import BaseModel, RootModel
 from pipeline.config.simulation import SensorModel, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
 from pipeline.detection.config import TrainConfig
-from pipeline.formats.measurement import MeasurementConfig
+from pipeline.formats.measurement_config import MeasurementConfig
 from scene.errors import InputError, nearest
 from sensors.presets import ScannerPreset
 

@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least, one_of
+from scene.errors import InputError
 
 if TYPE_CHECKING:
-    from pipeline.measurement.build import Request
     from pipeline.measurement.folder import Understood
+    from pipeline.measurement.request import Request
 
 FARTHEST_M = 1e8
 """No coordinate system of a survey reaches farther."""
 SUMMARY = "build the folder that gap takes out of raw scans and a reference; say what was understood"
 EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner riegl_vz400i --out my_measurement
   scarpsim measurement cloud.laz --cameras cameras.xml --reference scan.laz --out my_measurement
+  scarpsim measurement cloud.ply --reference wall.ply --photographs --out my_measurement
   scarpsim measurement scan.laz --reference half --scanner leica_p50 --position 12.1,40.3,2.5 --out my_measurement"""
 
 
@@ -41,7 +43,10 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scanner", metavar="PRESET", help="what is believed about the scanner, such as riegl_vz400i, or a file")
     parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
     parser.add_argument(
-        "--position", type=numbers(3), metavar="X,Y,Z", help="where the scanner stood, m, in the points' frame, if no header says"
+        "--position",
+        type=numbers(3),
+        metavar="X,Y,Z",
+        help="where the scanner stood, m, in the points' frame, if no header says; with --photographs any place before the wall",
     )
     parser.add_argument(
         "--unit", type=one_of("m", "cm", "mm", "ft"), default="m", metavar="m|cm|mm|ft", help="of the scan (default: m)"
@@ -58,6 +63,11 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="the points are from photographs: cameras.yaml, Metashape XML or .psx, COLMAP",
     )
+    parser.add_argument(
+        "--photographs",
+        action="store_true",
+        help="the points, mesh or DEM are from photographs whose cameras are not at hand: only the surface is compared",
+    )
     parser.add_argument("--pair", type=pair, metavar="LEFT,RIGHT", help="which two cameras of a project")
     parser.add_argument("--scan", type=at_least(1), metavar="N", help="take one scan of a file that holds several")
 
@@ -71,15 +81,19 @@ def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Unders
     """Build the folder that the arguments ask for."""
     from pipeline.formats.atomic import empty_folder
     from pipeline.measurement.build import build, build_stereo
+    from pipeline.measurement.surface import build_surface
 
     empty_folder(out)
     request = _request(arguments, scans)
+    if arguments.cameras and arguments.photographs:
+        raise InputError("is for a cloud whose cameras are not at hand", where="--photographs", remedy="leave it out")
+    if arguments.photographs:
+        return build_surface(request, out)
     return build_stereo(request, arguments.cameras, arguments.pair, out) if arguments.cameras else build(request, out)
 
 
 def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
-    from pipeline.measurement.build import Request
-    from scene.errors import InputError
+    from pipeline.measurement.request import Request
 
     if arguments.reference is None:
         remedy = "name a mesh, a cloud or another epoch, or say half"

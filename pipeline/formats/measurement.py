@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,28 +11,31 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Discriminator, Tag
 
 from pipeline.change.areas import Area, in_areas
 from pipeline.formats.camera_files import read_oriented, stereo_pair
 from pipeline.formats.cameras import read_cameras_yaml
 from pipeline.formats.measurement_checks import (
     PointFit,
-    Sweep,
     check_different,
     check_frame,
     check_inside,
+    check_near_rays,
     check_pixels,
     check_power,
     check_pulses,
     check_seen,
     finite,
 )
+from pipeline.formats.measurement_config import MeasurementConfig, ScanPattern
 from pipeline.formats.point_cloud import SCAN, PointCloud, joined
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
-from pipeline.formats.scanner_poses import Face, Pose, Scanned, ScannerPose, ScannerScan, set_ups
+from pipeline.formats.scanner_poses import Face, Pose, Scanned, ScannerPose, set_ups
+from pipeline.formats.surface_fit import SurfaceFit, air_side, check_in_metres
 from pipeline.registration.rigid import rotation_matrix
+from scene.cleaning import weld
 from scene.config import Config, load_yaml, parse
 from scene.errors import InputError
 from scene.frame import WallFrame
@@ -45,98 +47,9 @@ from scene.winding import check_near, facing
 from sensors.camera import Camera, CameraPair
 from sensors.effects.base import Sensor
 from sensors.model import StereoModel, TlsModel
+from sensors.surface_places import ShapedSurface
 
 FILE = "measurement.yaml"
-MOST_EPOCHS = 1000
-_NAME_CAMERAS = "name cameras.yaml or a Metashape XML"
-
-
-class ScanPattern(Config):
-    """The nominal directions of a scan: start, stop and step of each angle."""
-
-    azimuth_rad: Sweep = Field(description="start, stop, step [rad]; or azimuth_deg")
-    zenith_rad: Sweep = Field(description="start, stop, step [rad]; or zenith_deg")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_degrees(cls, values: Any) -> Any:
-        if not isinstance(values, dict):
-            return values
-        found = dict(values)
-        for name in ("azimuth", "zenith"):
-            sweep = found.get(f"{name}_deg")
-            if isinstance(sweep, list | tuple) and all(isinstance(each, int | float) for each in sweep):
-                if f"{name}_rad" in found:
-                    raise ValueError(f"'{name}_deg' stands beside '{name}_rad'; give one of them")
-                found[f"{name}_rad"] = [math.radians(each) for each in found.pop(f"{name}_deg")]
-        return found
-
-    @field_validator("azimuth_rad", "zenith_rad")
-    @classmethod
-    def _forward(cls, sweep: Sweep) -> Sweep:
-        """A sweep of a scanner that turns the other way (step below 0) is the same directions from its other end."""
-        start, stop, step = sweep
-        if step < 0 and stop < start:
-            sweep = start + step * math.floor((stop - start) / step + 1e-6), start, -step
-        if not (sweep[2] > 0 and sweep[1] > sweep[0]):
-            raise ValueError("needs start < stop and a step above 0, or start > stop and a step below 0")
-        if max(map(abs, sweep)) > 2 * math.pi:
-            raise ValueError(
-                f"is beyond a full turn; angles are in radians: {sweep[1]:g} degrees are {math.radians(sweep[1]):.4g}"
-            )
-        return sweep
-
-    @field_validator("zenith_rad")
-    @classmethod
-    def _above_nadir(cls, sweep: Sweep) -> Sweep:
-        if sweep[0] < -sweep[2] or sweep[1] > math.pi + sweep[2]:
-            raise ValueError("zenith angles run from 0, straight up, to pi, straight down")
-        return sweep
-
-
-class MeasurementConfig(Config):
-    """The file measurement.yaml."""
-
-    sensor: Literal["tls", "stereo"]
-    reference: Path = Field(description="the surface as known, world frame, m")
-    points: Path | Annotated[list[Path], Field(max_length=MOST_EPOCHS)] = Field(description="point cloud; several epochs: a list")
-    frame: Literal["scanner", "world"] = Field("world", description="of the points")
-    scanner: ScannerPose | None = None
-    scanners: tuple[ScannerScan, ...] = Field(
-        (), description="instead of `scanner` where each file of `points` is a scan from a place or in a face of its own"
-    )
-    pattern: ScanPattern | None = None
-    cameras: Path | None = Field(None, description="cameras.yaml or a Metashape XML: the nominal calibration (stereo)")
-    stable_areas: tuple[Area, ...] = Field(
-        (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]"
-    )
-    model: Path = Field(description="what the simulation believes about the sensor today")
-    incidence: Literal["triangles", "planes"] = Field(
-        "triangles", description="what rays are inclined to: the triangle hit, or a plane through 24 vertices around it (tls)"
-    )
-    notes: tuple[str, ...] = Field(
-        (), description="what the report should say of the measurement, such as what a reference cannot show"
-    )
-
-    @field_validator("points")
-    @classmethod
-    def _some(cls, points: Path | list[Path]) -> Path | list[Path]:
-        if points == []:
-            raise ValueError("names no file; give a path, or a list of one path an epoch")
-        if isinstance(points, list) and len(set(points)) < len(points):
-            raise ValueError("names a file twice; give a path of its own for each epoch")
-        return points
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        if self.sensor == "stereo" and self.incidence != "triangles":
-            raise ValueError("'incidence: planes' is of laser scans; leave it out")
-        files = [self.points] if isinstance(self.points, Path) else self.points
-        if self.scanners and len(self.scanners) != len(files):
-            raise ValueError(f"'scanners' has {len(self.scanners)} poses for {len(files)} files of points; give one for each")
-        if self.scanners and (self.scanner is not None or self.pattern is not None):
-            raise ValueError("'scanners' stands instead of 'scanner', and without 'pattern'")
-        return self
 
 
 def _kind(values: Any) -> str:
@@ -187,6 +100,10 @@ class MeasurementBase(ABC):
     def fit(self) -> PointFit:
         """How the points lie against the reference."""
         return PointFit.of(self.cloud.points, self.viewpoint, self.scene, self.sensor)
+
+    def check_near(self, where: str) -> None:
+        """Raise InputError where most points lie far from the reference, so that no pose or effect explains it."""
+        check_near_rays(self.fit, where)
 
     def changed(self, **values: Any) -> Self:
         """The same with other points, cameras or pose, in front of the same ray caster."""
@@ -297,7 +214,56 @@ class StereoMeasurement(MeasurementBase):
         return {"cameras": CameraPair(each(self.cameras.left), each(self.cameras.right))}
 
 
-Measurement = TlsMeasurement | StereoMeasurement
+@dataclass(frozen=True, kw_only=True)
+class SurfaceMeasurement(MeasurementBase):
+    """A surface out of photographs whose cameras are not known: points and nothing else, in a datum of shift, turn and scale.
+
+    Its points are noisy in metres along the normal of the reference.
+    """
+
+    sensor = "stereo"
+    model: StereoModel
+
+    @property
+    def centre(self) -> FloatArray:
+        """(3,) about which the cloud is turned and scaled, wall frame, m."""
+        return np.asarray(self.reference.bounds.mean(axis=0))
+
+    @property
+    def viewpoint(self) -> FloatArray:
+        """(3,) a place before the wall; nothing was seen from there."""
+        away = 2 * float(np.linalg.norm(np.ptp(self.reference.bounds, axis=0)))
+        return np.asarray(self.centre + np.array([0.0, 0.0, away]))
+
+    @cached_property
+    def shape(self) -> ShapedSurface:
+        """The reference with what its vertices' neighbourhoods tell."""
+        return ShapedSurface(self.reference)
+
+    @property
+    def surface_fit(self) -> SurfaceFit:
+        """How the points lie against the reference."""
+        return SurfaceFit.of(self.cloud.points, self.reference)
+
+    def check_near(self, where: str) -> None:
+        self.surface_fit.check(where)
+
+    def changed(self, **values: Any) -> Self:
+        other = super().changed(**values)
+        other.__dict__["shape"] = self.shape
+        return other
+
+    def moved(self, pose: FloatArray) -> Self:
+        """The points shifted (m), turned (rad) and stretched by a pose (7,) about the reference's middle, wall frame."""
+        turn = (1 + pose[6]) * rotation_matrix(pose[3:6])
+        points = (self.cloud.points - self.centre) @ turn.T + self.centre + pose[:3]
+        return self.changed(cloud=replace(self.cloud, points=points))
+
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        return {}
+
+
+Measurement = TlsMeasurement | StereoMeasurement | SurfaceMeasurement
 
 
 def read_model(path: Path) -> TlsModel | StereoModel:
@@ -315,7 +281,7 @@ def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
 @dataclass(frozen=True)
 class Material:
     """What a measurement is made of. reference: world frame; notes: on it; points: clouds by their files' names, an epoch each,
-    in the frame that the config says; cameras: world frame, stereo only."""
+    in the frame that the config says; cameras: world frame, of a pair that is known."""
 
     reference: TriangleMesh
     points: dict[str, PointCloud]
@@ -333,7 +299,7 @@ def read_measurement(folder: Path) -> Measurement:
     config, base = parse(MeasurementConfig, values, str(path)), path.parent
     model = read_model(base / config.model)
     _check_sensor(config, model, str(path))
-    cameras = _cameras(config, base, str(path))
+    cameras = _cameras(config, base)
     mesh, notes = read_reference(base / config.reference)
     points = {str(base / name): read_points(base / name) for name in _files(config)}
     notes = (*notes, *_mended(config, values))
@@ -355,7 +321,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     """
     mesh, model, cameras = material.reference, material.model, material.cameras
     _check_sensor(config, model, where)
-    viewpoints = _viewpoints(config, cameras, where)
+    viewpoints = _viewpoints(config, material, where)
     check_near(mesh.vertices, viewpoints, reference)
     frame = WallFrame.fit(mesh.vertices, np.mean([*viewpoints.values()], axis=0))
     local = mesh.with_vertices(frame.to_wall(mesh.vertices))
@@ -368,7 +334,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
             check_pixels(cameras.left, each, name)
     said = [(reference, (*material.notes, words))]
     for name, each in zip(material.points, clouds, strict=True):
-        said.append((name, _rounding(each.points, config, model, cameras, name)))
+        said.append((name, _rounding(each.points, config, material, name)))
     cloud = joined(clouds, SCAN if config.scanners else "epoch")
     found = _of_sensor(
         config,
@@ -388,7 +354,8 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
     """A laser scan or a pair's surface. shared: the fields that both have."""
     if isinstance(material.model, StereoModel):
         if material.cameras is None:
-            raise InputError("a stereo measurement needs `cameras`", where=where, remedy=_NAME_CAMERAS)
+            check_in_metres(material.model, where)
+            return SurfaceMeasurement(model=material.model, **{**shared, "reference": weld(shared["reference"])[0]})
         return StereoMeasurement(model=material.model, cameras=material.cameras, **shared)
     pose, frame = _scanner_pose(config, where), shared["frame"]
     scans = tuple(
@@ -420,6 +387,9 @@ def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, wher
 
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
     """Raise InputError where the points (`cloud`: as read) fit neither pattern nor reference."""
+    if isinstance(found, SurfaceMeasurement):
+        found.check_near(where)
+        return
     if config.pattern is not None:
         check_pulses(config.pattern.azimuth_rad, config.pattern.zenith_rad, len(cloud.points), len(_files(config)), where)
     here, other = found.fit, None
@@ -437,11 +407,11 @@ def _files(config: MeasurementConfig) -> list[Path]:
     return [config.points] if isinstance(config.points, Path) else config.points
 
 
-def _cameras(config: MeasurementConfig, base: Path, where: str) -> CameraPair | None:
+def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:
     if config.sensor == "tls":
         return None
     if config.cameras is None:
-        raise InputError("a stereo measurement needs `cameras`", where=where, remedy=_NAME_CAMERAS)
+        return None
     return nominal_pair(base / config.cameras)
 
 
@@ -451,21 +421,26 @@ def nominal_pair(file: Path) -> CameraPair:
     return read_cameras_yaml(file) if found is None else stereo_pair(found, None, None, str(file))
 
 
-def _viewpoints(config: MeasurementConfig, cameras: CameraPair | None, where: str) -> dict[str, FloatArray]:
-    """Where the sensors stand, by name, world frame."""
+def _viewpoints(config: MeasurementConfig, material: Material, where: str) -> dict[str, FloatArray]:
+    """Where the sensors stand, by name, world frame; of a cloud without cameras a place before the reference."""
+    cameras = material.cameras
     if cameras is not None:
         return {"left camera": cameras.left.position, "right camera": cameras.right.position}
+    if config.sensor == "stereo":
+        return {"the side that the reference shows": air_side(material.reference)}
     scanners = {f"scanner {number}": np.array(each.position_m) for number, each in enumerate(config.scanners, start=1)}
     return scanners or {"scanner": np.array(_scanner_pose(config, where).position_m)}
 
 
-def _rounding(
-    points: FloatArray, config: MeasurementConfig, model: TlsModel | StereoModel, cameras: CameraPair | None, where: str
-) -> tuple[str, ...]:
+def _rounding(points: FloatArray, config: MeasurementConfig, material: Material, where: str) -> tuple[str, ...]:
     """What to say of the rounding of a file's points (n, 3), against the noise along the lines of sight."""
     points = points[np.isfinite(points).all(axis=1)]
+    model, cameras = material.model, material.cameras
     if not len(points):
         return ()
+    if isinstance(model, StereoModel) and cameras is None:
+        spread = float(np.sqrt(model.noise.of_points.variance([None])[0]))
+        return check_rounded_points(points, air_side(material.reference), spread, where) if spread else ()
     if isinstance(model, TlsModel) or cameras is None:
         viewpoint = np.zeros(3) if config.frame == "scanner" else np.array(_scanner_pose(config, where).position_m)
         noise = model.noise.range_sigma_m if isinstance(model, TlsModel) else np.inf

@@ -42,8 +42,12 @@ _FEWEST_SEEN = 0.05
 _LARGEST_POWER = 1e12
 _MOST_OFF = 0.05
 """Share of the frame's width that given pixels may lie off on the median: a registration moves points by some centimetres."""
-_LEAST_SIGMA = {"tls": (1e-6, "m", "range_sigma_m"), "stereo": (2e-4, "px", "parallax_sigma_px")}
-"""By sensor: a smaller predicted spread is none; its unit; the key that says more."""
+_LEAST_SIGMA = {
+    "tls": (1e-6, "m", "range_sigma_m"),
+    "stereo": (2e-4, "px", "parallax_sigma_px"),
+    "surface": (1e-7, "m", "point_sigma_m"),
+}
+"""By sensor, and of a surface without cameras: a smaller predicted spread is none; its unit; the key that says more."""
 
 
 @dataclass(frozen=True)
@@ -195,8 +199,8 @@ def check_different(clouds: Mapping[str, PointCloud]) -> None:
         known[digest] = name
 
 
-def check_near(here: PointFit) -> None:
-    """Raise InputError where most points lie far from the reference, so that no pose or effect explains it."""
+def check_near_rays(here: PointFit, where: str) -> None:
+    """Raise InputError where most points lie far from the reference along their rays."""
     if here.good:
         return
     problem = (
@@ -204,7 +208,7 @@ def check_near(here: PointFit) -> None:
     )
     allowed = f"a quarter of them within {_NEAR_M:g} m or {100 * here.reach:g} % of the range"
     remedy = "check the sensor's position, the unit (m) and that points and reference are of one wall"
-    raise InputError(problem, where="measurement.yaml", allowed=allowed, remedy=remedy)
+    raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
 
 
 def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where: str) -> None:
@@ -238,9 +242,9 @@ def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) 
         )  # fmt: skip
 
 
-def check_noise(sensor: str, sigma: FloatArray) -> None:
+def check_noise(of: str, sigma: FloatArray) -> None:
     """Raise InputError where the model predicts no spread (n,), against which no residual means anything."""
-    least, unit, key = _LEAST_SIGMA[sensor]
+    least, unit, key = _LEAST_SIGMA[of]
     if sigma.min(initial=np.inf) < least:
         problem = f"the model predicts a spread of {sigma.min():.2g} {unit}"
         raise InputError(problem, where="model.yaml: noise", allowed=f"{least:g} {unit} and more", remedy=f"state `{key}`")

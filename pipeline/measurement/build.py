@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.folder import Content, Understood, write
 from pipeline.measurement.photogrammetry import looking, read_pair, seen_by
 from pipeline.measurement.reference import HALF, Reference, from_file, half_of
+from pipeline.measurement.request import Request
 from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.station import Station, find_station
 from pipeline.measurement.units import check_extent, check_same_unit
@@ -26,24 +26,11 @@ from sensors.model import StereoModel, TlsModel
 _ONE_PLACE_M = 0.05
 """Stations that stand nearer to each other than this are one, set up again: its scans are epochs."""
 
+_NAME_SCANNER = (
+    "name a preset such as riegl_vz400i, or give --model FILE; of a cloud from photographs name --cameras, or say --photographs "
+    "where they are not at hand"
+)
 _PLANES = "angles of incidence are those to planes through 24 points of it: its triangles lean by noise and relief between points"
-
-
-@dataclass(frozen=True)
-class Request:
-    """What is asked for. scans: files, each an epoch; reference: a file, or `half`; scanner: a preset's name or file, or model: a
-    file model.yaml; position: (3,) m; unit, reference_unit: of the files' coordinates; columns: of text files; number: which scan
-    of a file of several, from 1."""
-
-    scans: Sequence[Path]
-    reference: str
-    scanner: str | None = None
-    model: Path | None = None
-    position: tuple[float, float, float] | None = None
-    unit: str = "m"
-    reference_unit: str = "m"
-    columns: Sequence[str] = ()
-    number: int | None = None
 
 
 def build(request: Request, out: Path) -> Understood:
@@ -189,7 +176,7 @@ def _model(request: Request) -> tuple[TlsModel, tuple[str, ...]]:
             raise InputError("is the model of a stereo pair", where=str(request.model), allowed="sensor: tls")
         return model, (f"as in {request.model}",)
     if request.scanner is None:
-        raise InputError("is missing", where="--scanner", remedy="name a preset such as riegl_vz400i, or give --model FILE")
+        raise InputError("is missing", where="--scanner", remedy=_NAME_SCANNER)
     preset = read_preset(request.scanner)
     return preset.model(), (f"of the preset {preset.name}: what its data sheet states, what it does not state by default",)
 

@@ -13,7 +13,6 @@ from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
 from pipeline.formats.cameras import write_cameras_yaml
 from pipeline.formats.laz import EXACT_INTENSITY, write_laz
 from pipeline.formats.measurement import FILE, read_measurement
-from pipeline.formats.measurement_checks import check_near
 from pipeline.formats.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.picture import picture
@@ -104,7 +103,7 @@ def _write_yaml(path: Path, values: Mapping[str, Any], comments: Sequence[str] =
 def _try(folder: Path, out: Path) -> None:
     """Raise InputError, with the folder's later name, where `gap` could not use the folder."""
     try:
-        check_near(read_measurement(folder).fit)
+        read_measurement(folder).check_near(FILE)
     except InputError as error:
         where = error.where.replace(str(folder), str(out))
         raise InputError(error.what, where=where, allowed=error.allowed, remedy=error.remedy) from None

@@ -21,7 +21,7 @@ from scene.mesh import FloatArray, TriangleMesh
 from scene.ply import read_elements
 
 HALF = "half"
-_DEMS = (".tif", ".tiff")
+DEMS = (".tif", ".tiff")
 _MUCH_FINER = 0.6
 """Pulses that lie so much closer along a line than lines do are halved instead of the lines."""
 
@@ -50,12 +50,15 @@ def is_cloud(path: Path) -> bool:
     return faces is None or not faces or not len(next(iter(faces.values())))
 
 
-def from_file(path: Path, unit: str, position: FloatArray, rotation: FloatArray) -> Reference:
-    """A reference out of a file, seen from `position` (3,) m with `rotation` (3, 3); InputError where it cannot be used."""
+def from_file(
+    path: Path, unit: str, position: FloatArray, rotation: FloatArray, seen_from: str = "from the scanner"
+) -> Reference:
+    """A reference out of a file, seen from `position` (3,) m with `rotation` (3, 3), `seen_from` in words; InputError where it
+    cannot be used."""
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, a DEM, or the word {HALF}")
-    if path.suffix.lower() in _DEMS:
-        return _from_dem(path, METRES[unit])
+    if path.suffix.lower() in DEMS:
+        return from_dem(path, METRES[unit])
     if not is_cloud(path):
         mesh, notes = read_mesh(path, unit)
         words = (f"mesh {path.name}: {len(mesh.faces):,} triangles, taken as exact", *notes)
@@ -64,7 +67,7 @@ def from_file(path: Path, unit: str, position: FloatArray, rotation: FloatArray)
     scans = read_scans(path, unit)
     points = np.concatenate([scan.cloud.points for scan in scans])
     surface = triangulated(points, position, rotation, str(path))
-    said = f"cloud {path.name}: {len(points):,} points, meshed as seen from the scanner, {len(surface.mesh.faces):,} triangles"
+    said = f"cloud {path.name}: {len(points):,} points, meshed as seen {seen_from}, {len(surface.mesh.faces):,} triangles"
     limits = (
         "the reference is a measurement itself: errors that both share (same scanner, same place) cannot be seen, and rock that "
         "moved between the two is told from errors only where it has edges",
@@ -72,7 +75,7 @@ def from_file(path: Path, unit: str, position: FloatArray, rotation: FloatArray)
     return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, of_points=True)
 
 
-def _from_dem(path: Path, metres: float) -> Reference:
+def from_dem(path: Path, metres: float) -> Reference:
     """A raster of heights as a surface: a vertex at the centre of each pixel, two triangles between four that have data."""
     heights, grid = read_geotiff(path)
     known = np.isfinite(heights)

@@ -32,6 +32,7 @@ class Stage(IntEnum):
     EXPOSE = 12  # stereo: image rows
     MATCH = 13  # stereo: disparity, in the order that sensors/matches.py gives
     FILL = 14  # stereo: cells without a match
+    POINT = 15  # stereo: the recorded points, m
 
 
 class ShowsIn(StrEnum):
@@ -157,7 +158,7 @@ class Effect(Config, ABC):
         }
 
     def apply(self, state: StateT, random: KeyedRandom) -> StateT:
-        """The state (`Pulses`, `Beam`, `CameraPair` or `Matches`) after this effect; `random` is the effect's own source."""
+        """The state (`Pulses`, `Beam`, `CameraPair`, `Matches`, `RecordedPoints`) after this effect; `random`: its own source."""
         return state if self.is_null else self.evaluate(state, random)
 
     @abstractmethod

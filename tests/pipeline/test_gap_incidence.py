@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.formats.measurement import MeasurementConfig, TlsMeasurement, read_measurement
+from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.formats.measurement_config import MeasurementConfig
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.scan_simulation import simulated_ranges
 from pipeline.gap.residuals.tls_residuals import RayGeometry, tls_residuals

@@ -29,8 +29,9 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points import read_points
 from pipeline.formats.ptx import read_ptx
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
-from pipeline.measurement.build import Request, build
+from pipeline.measurement.build import build
 from pipeline.measurement.origin import from_order
+from pipeline.measurement.request import Request
 from pipeline.measurement.scans import orthonormal, read_scans
 from pipeline.measurement.triangulation import triangulated
 from scene.errors import InputError

@@ -17,7 +17,6 @@ from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real
 from pipeline.gap.residuals.residuals import Geometry, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.mesh import FloatArray
-from sensors.effects import catalogue
 from sensors.effects.base import Effect, Search, ShowsIn
 from sensors.effects.camera_effect import CameraEffect
 from sensors.effects.pixel_locking import PixelLocking
@@ -40,7 +39,7 @@ def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Cand
 def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
     """The same with each searched sine as one grid."""
     geometry = residuals.geometry
-    shown = [effect for effect in catalogue(residuals.sensor) if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
+    shown = [effect for effect in residuals.candidates if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
     cameras: list[type[CameraEffect]] = [effect for effect in shown if issubclass(effect, CameraEffect)]
     found: list[Candidate | SineGrid] = []
     if isinstance(residuals, StereoResiduals) and isinstance(measurement, StereoMeasurement) and cameras:

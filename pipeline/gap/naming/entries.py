@@ -29,16 +29,10 @@ from sensors.effects import effect_of
 from sensors.effects.angle_empirical import AngleEmpirical
 from sensors.effects.base import Effect, ShowsIn
 from sensors.effects.detection_limit import DetectionLimit
-from sensors.effects.disparity_empirical import DisparityEmpirical
-from sensors.effects.parallax_noise import ParallaxNoise
 from sensors.effects.pixel_locking import PixelLocking
-from sensors.effects.range_empirical import RangeEmpirical
-from sensors.effects.range_noise import RangeNoise
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.model import StereoModel, TlsModel
 
-PLANES = {"tls": ("azimuth", "zenith"), "stereo": ("image_x", "image_y")}
-"""The two covariates by sensor that an error may depend on together."""
 _NODES, _GRID, _JOINED, _MOST_POINTS = 65, 17, 257, 20_000
 """Of the curve of an empirical term, of each side of a surface, and of a sum of curves."""
 _FITTED = 1.1
@@ -162,10 +156,10 @@ def from_locking(found: Locking) -> Named:
 def from_spread(found: SpreadFound, sensor: str) -> Named:
     """An effect on the spread of laser ranges or disparities."""
     alike = tuple(f"{sensor}.{name}" for name in found.alike)
-    kind = "empirical" if found.empirical else "physical"
+    empirical = found.empirical or effect_of(found.effect).empirical
     entry = {"name": found.effect, **found.parameters}
-    name = f"{sensor}.{found.effect}"
-    return Named(name, kind, entry, found.std, () if found.empirical else alike, found.p_value, found.gain)
+    name, kind = f"{sensor}.{found.effect}", "empirical" if empirical else "physical"
+    return Named(name, kind, entry, found.std, () if empirical else alike, found.p_value, found.gain)
 
 
 def from_shape(found: ShapeFound) -> Named:
@@ -174,10 +168,10 @@ def from_shape(found: ShapeFound) -> Named:
     return Named(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
-def from_tails(sensor: str, sigma: float, gain: float) -> Named:
+def from_tails(part: Residuals, sigma: float, gain: float) -> Named:
     """Noise with heavy tails, which the catalogue does not have: its standard deviation as white noise, marked empirical."""
-    name, key = (RangeNoise.tag(), "sigma_m") if sensor == "tls" else (ParallaxNoise.tag(), "sigma_px")
-    return Named(f"{sensor}.{name}", "empirical", {"name": name, key: sigma}, {}, (), None, gain)
+    noise, key = part.noise
+    return Named(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
 
 
 def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:
@@ -235,11 +229,11 @@ def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Res
     error = candidate.columns @ values[: candidate.columns.shape[1]]
     if candidate.angle and isinstance(part, TlsResiduals):
         return _of_an_angle(candidate, error, item, part)
-    unit, name = ("m", RangeEmpirical.tag()) if part.sensor == "tls" else ("px", DisparityEmpirical.tag())
+    term, key = part.described_by
     found = _surface(candidate, error, part) if candidate.form == SURFACE else _curve(candidate, error, part)
     rows = _rows(found.pop("values"))
-    entry = {"name": name, **found, f"values_{unit}": rows}
-    return Named(f"{part.sensor}.{name}", "empirical", entry, {}, (), item.p_value, item.gain)
+    entry = {"name": term.tag(), **found, key: rows}
+    return Named(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
 
 
 def _of_an_angle(candidate: Candidate, error: FloatArray, item: Chosen, part: TlsResiduals) -> Named:
@@ -291,7 +285,7 @@ def _curve(candidate: Candidate, error: FloatArray, part: Residuals, rows: Any =
 
 def _surface(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
     """The polynomial again, at the nodes of a grid: it is found back from its values at the points."""
-    first, second = PLANES[part.sensor]
+    first, second = part.planes
     x, y = part.covariates[first], part.covariates[second]
     axes = [np.linspace(values.min(), values.max(), _GRID) for values in (x, y)]
     nodes = np.meshgrid(*axes)

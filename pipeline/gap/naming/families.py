@@ -10,7 +10,6 @@ from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import Candidate, SineGrid, angle_forms, free_forms, places, repeated, surface_form
 from pipeline.gap.mean.signatures import mean_families
-from pipeline.gap.naming.entries import PLANES
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -48,7 +47,7 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
     if isinstance(part, TlsResiduals):
         angles = _of_angles(part)
         named, free = _not_held(named, angles, measurement, part), [*free, *angles]
-    first, second = PLANES[part.sensor]
+    first, second = part.planes
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
     return [*named, *free, both, *_repeated(part), *places(part.at)]
 

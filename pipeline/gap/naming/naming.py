@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import PLACE, REPEATED
 from pipeline.gap.mean.search import MeanSearch
@@ -116,7 +118,8 @@ def name_effects(
     points = SearchedPoints(measurement, part, families, spread, (scale, added), random)
     first = MeanSearch(weighed(part, spread, scale), families, random)
     found = followed_up(points, first)
-    names, cosines, survival = first.design.identifiability()
+    physical = any(not each.empirical for each in families)
+    names, cosines, survival = first.design.identifiability() if physical else ([], np.zeros((0, 0)), np.zeros(0))
     wrong = beyond(measurement, found.estimates, found.at)
     wrong |= undone(found.estimates, found.at, dict(zip(names, survival, strict=True)))
     design = found.search.design

@@ -22,7 +22,8 @@ VERDICTS = {
     "unknown": "The model is rejected, and no effect of the catalogue passes its own test; an empirical term describes it.",
     "insufficient_data": "There are too few points on smooth parts of the reference to say anything.",
 }
-_NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px", "regularization_sigma_px")
+_NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px", "regularization_sigma_px",
+           "point_sigma_m", "point_shared_sigma_m")  # fmt: skip
 STILL_OPEN = (
     "Effects were named, but most of the gap stays open: the model is rejected with them too, and nothing else explains it."
 )

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals
 from pipeline.gap.residuals.several_scans import simulate_departures
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, simulated_distances
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -115,6 +116,8 @@ def simulated(measurement: Measurement, model: TlsModel | StereoModel, residuals
             return simulate_departures(measurement, model, residuals, random)
         case StereoMeasurement(), StereoModel(), StereoResiduals():
             return _simulated_disparities(measurement, model, residuals, random)
+        case SurfaceMeasurement(), StereoModel(), SurfaceResiduals():
+            return simulated_distances(model, residuals, random)
     raise TypeError("measurement, model and residuals are of different sensors")
 
 
@@ -216,7 +219,9 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
 
 def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
     stood = measurement.moved(version.pose)
-    return np.stack([simulated(stood, version.model, residuals, random.child(number)) for number in range(_DRAWS)])
+    draws = np.stack([simulated(stood, version.model, residuals, random.child(number)) for number in range(_DRAWS)])
+    # a cloud without cameras has no place from which to simulate it: its datum counts by its slopes
+    return draws + residuals.pose @ version.pose if isinstance(residuals, SurfaceResiduals) else draws
 
 
 def _summaries(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:

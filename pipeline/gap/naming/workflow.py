@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pipeline.formats.measurement import Measurement, TlsMeasurement
-from pipeline.formats.measurement_checks import check_near, check_noise
+from pipeline.formats.measurement import FILE, Measurement, TlsMeasurement
+from pipeline.formats.measurement_checks import check_noise
 from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.attempts import State, attempt, few, thinned_rows
@@ -38,6 +38,7 @@ from pipeline.gap.residuals.changes import SceneChange, moved_share
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.thinning import thinned
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
 from scene.keyed_random import KeyedRandom
@@ -109,9 +110,9 @@ def diagnose(
 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
-    check_near(measurement.fit)
+    measurement.check_near(FILE)
     first = residuals_of(measurement)
-    check_noise(first.sensor, first.sigma)
+    check_noise("surface" if isinstance(first, SurfaceResiduals) else first.sensor, first.sigma)
     held_points = np.zeros(len(measurement.cloud.points), dtype=bool)
     held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
     held_points |= _held_epoch(measurement.epochs)
@@ -253,7 +254,7 @@ def _with_tails(
         _, _, middle = _smooth_with(measurement, steady)
         if middle**2 - 1 > decided().spread.core_excess:
             return named, tails
-    heavy = from_tails(part.sensor, tails.sigma * float(np.median(part.sigma)), tails.gain)
+    heavy = from_tails(part, tails.sigma * float(np.median(part.sigma)), tails.gain)
     return [*steady, *only_within_bounds(measurement.model, [heavy])[0]], tails
 
 

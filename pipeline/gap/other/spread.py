@@ -16,7 +16,6 @@ from pipeline.gap.residuals.cells import Cells, block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
-from sensors.effects import catalogue
 from sensors.effects.base import Effect, ShowsIn
 
 DRAWS = 1999
@@ -116,7 +115,7 @@ def standardised(residuals: Residuals, cells: Cells, value: FloatArray) -> Float
 def spread_candidates(residuals: Residuals) -> list[SpreadCandidate]:
     """The catalogue's forms of the variance of single points, by what is recorded; without noise that neighbours share."""
     found = []
-    for effect in catalogue(residuals.sensor):
+    for effect in residuals.candidates:
         if effect.shows_in == ShowsIn.SPREAD and not effect.shared and effect.known(residuals.geometry):
             key, tried = effect.trials or ("", ())
             found += [_candidate(effect, residuals.geometry, {key: value}) for value in tried] or [

@@ -17,6 +17,7 @@ from pipeline.gap.naming.verify import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.report.covariate_ranking import bins, standardised, steady
 from pipeline.gap.report.in_words import with_unit
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, sigma_of
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.report.figures import COLOURS, dress_map
 from pipeline.report.pictures import png
@@ -86,6 +87,8 @@ def sigma_after(found: GapDiagnosis) -> FloatArray:
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays):
             return np.asarray(np.sqrt(model.variance(rays)))
+        case StereoModel() as model, SurfaceResiduals() as surface:
+            return sigma_of(model, surface)
         case StereoModel() as model, residuals:
             return np.asarray(np.sqrt(np.broadcast_to(model.variance, len(residuals))))
     raise TypeError("model and residuals are of different sensors")

@@ -7,15 +7,21 @@ from typing import Any
 
 from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verdict import closing, in_a_sentence, left_over
+from pipeline.gap.naming.verdict import VERDICTS, closing, in_a_sentence, left_over
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.other.spread import SpreadTried
 from pipeline.gap.report.quantities import with_std
+from pipeline.gap.report.scale import scale_of
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.report.page import true_minus
 from sensors.effects.base import ShowsIn
 
-_INSTRUMENTS = {"tls": "ranges of a laser scan", "stereo": "disparities of a stereo pair"}
 _STATISTICS = {"mean": "mean", "spread": "spread", "shape": "outliers", "missing": "lost returns"}
+_WITHOUT_NAMES = {
+    VERDICTS["no_gap"]: "The cloud agrees with the reference: what is left is as large as its noise.",
+    VERDICTS["unknown"]: "The cloud departs from the reference by more than its noise; an empirical term describes how.",
+}
+"""Sentences of verdicts where no effect of the catalogue can be tried."""
 _CLEAR = 0.01
 _COVARIATES = {
     "range": ("range", "m"), "depth": ("depth", "m"), "azimuth": ("azimuth", "rad"), "zenith": ("zenith", "rad"),
@@ -23,6 +29,9 @@ _COVARIATES = {
     "radius": ("distance from the image's middle", "px"), "disparity": ("disparity", "px"),
     "disparity_fraction": ("fraction of the disparity", "px"), "intensity": ("intensity", "ln of power over its median"),
     "line": ("scan line", "number"), "time": ("time", "share of the scan"),
+    "along": ("place along the wall", "m"), "up": ("place up the wall", "m"), "out": ("place out of the wall's plane", "m"),
+    "slope": ("slope against the wall's plane", "rad"), "roughness": ("roughness", "m"), "convexity": ("convexity", "m"),
+    "edge_distance": ("distance to the nearest edge", "m"),
     "log_power": ("expected power", "ln of power over that at 100 m"), "edge_step": ("step beside the point", ""),
 }  # fmt: skip
 """A covariate in words, and the unit of its values; "": the observable's."""
@@ -44,6 +53,8 @@ def title(found: GapDiagnosis) -> str:
             return "Measurement and model disagree, and nothing that was tried says why"
         case "unknown" if not any(effect.kind == "empirical" for effect in found.effects):
             return f"{listed(names)} closes little of the gap: something else is missing"
+        case "unknown" if isinstance(found.residuals, SurfaceResiduals):
+            return "The cloud departs from the reference by more than its noise"
         case "unknown":
             return "Missing: something that is not in the catalogue" + (f", and {listed(names)}" if names else "")
         case _:
@@ -61,8 +72,11 @@ def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
 
 
 def _findings(found: GapDiagnosis, rows: list[dict[str, Any]]) -> list[str]:
-    parts = [f"{len(found.residuals):,} {_INSTRUMENTS[found.residuals.sensor]} were compared with what the model predicts."]
-    parts.append(in_a_sentence(found.verdict, found.effects, found.evidence))
+    parts = [f"{len(found.residuals):,} {found.residuals.called} were compared with what the model predicts."]
+    sentence = in_a_sentence(found.verdict, found.effects, found.evidence)
+    parts.append(_WITHOUT_NAMES.get(sentence, sentence) if isinstance(found.residuals, SurfaceResiduals) else sentence)
+    scale = scale_of(found)
+    parts += [] if scale is None else [scale.words]
     parts += [_effect(effect) for effect in found.effects]
     return [*parts, left_over(found.effects, found.evidence), _shown_most(found, rows)]
 

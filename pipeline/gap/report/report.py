@@ -32,6 +32,7 @@ from pipeline.gap.report.in_words import (
     values,
     with_unit,
 )
+from pipeline.gap.report.scale import scale_of
 from pipeline.report.page import p_value_in_words, template
 from scene.mesh import FloatArray
 
@@ -45,7 +46,8 @@ def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
 
 
 def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    poses = [_registration(found.pose[start : start + 6], measurement) for start in range(0, len(found.pose), 6)]
+    poses = [_registration(found.pose[start : start + 6], measurement) for start in range(0, len(found.pose) - 5, 6)]
+    scale = scale_of(found)
     return {
         "schema": 1,
         "verdict": found.verdict,
@@ -53,7 +55,7 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
         "where": where(found),
         "scene_changes": [change.to_dict(measurement.frame) for change in found.changes],
         "sensor": measurement.sensor,
-        "registration": poses[0],
+        "registration": poses[0] | ({} if scale is None else {"scale_ppm": scale.to_dict()}),
         **({"further_registrations": poses[1:]} if len(poses) > 1 else {}),
         "identifiability": found.identifiability,
         "gap": found.gap.to_dict() if found.gap else None,

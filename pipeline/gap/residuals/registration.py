@@ -9,17 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement, TlsMeasurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.several_scans import scans_residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
 from scene.mesh import FloatArray
 
 _ROUNDS = 6
 _FEWEST = 100
 _FAR_M, _MOST_MOVES = 0.002, 3
+_FAR_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
+"""Of a cloud whose nearest places change as it moves: far in predicted sigmas, on average over its points."""
 
 
 def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
@@ -45,8 +48,10 @@ def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatA
 
 
 def raw_residuals(measurement: Measurement) -> Residuals:
-    """The raw residuals of either sensor."""
-    if not isinstance(measurement, TlsMeasurement):
+    """The raw residuals of a laser scan, of a pair, or of a surface without cameras."""
+    if isinstance(measurement, SurfaceMeasurement):
+        return surface_residuals(measurement)
+    if isinstance(measurement, StereoMeasurement):
         return stereo_residuals(measurement)
     return scans_residuals(measurement) if measurement.scans else tls_residuals(measurement)
 
@@ -81,7 +86,8 @@ def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None, 
     """
     found = residuals_of(measurement) if found is None else found
     total = np.zeros(found.pose.shape[1])
-    for _ in range(_MOST_MOVES if len(found) else 0):
+    most = _MOST_MOVES_OF_SURFACES if isinstance(measurement, SurfaceMeasurement) else _MOST_MOVES
+    for _ in range(most if len(found) else 0):
         pose = registered(_only(found, trusted))[1]
         if not _is_far(pose, found):
             break
@@ -98,6 +104,8 @@ def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
 
 
 def _is_far(pose: FloatArray, residuals: Residuals) -> bool:
+    if isinstance(residuals, SurfaceResiduals):
+        return float(np.mean(np.abs(residuals.pose @ pose) / residuals.sigma)) > _FAR_SIGMAS
     for start in range(0, len(pose), 6):
         own, columns = pose[start : start + 6], residuals.pose[:, start : start + 6]
         turn, shift = (float(np.linalg.norm(columns[:, part], axis=1).mean()) for part in (slice(3, 6), slice(3)))

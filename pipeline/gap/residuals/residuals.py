@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
 from scene.mesh import FloatArray
-from sensors.effects.base import Sensor
+from sensors.effects import Effects, catalogue
+from sensors.effects.base import Effect, Sensor
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -58,9 +59,16 @@ class Residuals(ABC):
     measurement's points; away: (n,) what was taken off `value` because epochs were taken from places of their own, None where
     they were not; missing: of the pulses that were sent and should have met the wall, None where the pattern is not known;
     shared_noise: predicted noise that neighbours share.
+
+    What stands on the class: planes, the two covariates that an error may depend on together; described_by, noise: the empirical
+    term and the white noise in the observable's unit, each with the name of its values; called: what they are in words.
     """
 
     sensor: ClassVar[Sensor]
+    planes: ClassVar[tuple[str, str]]
+    described_by: ClassVar[tuple[type[Effect], str]]
+    noise: ClassVar[tuple[type[Effect], str]]
+    called: ClassVar[str]
     value: FloatArray
     sigma: FloatArray
     unit_m: FloatArray
@@ -83,6 +91,11 @@ class Residuals(ABC):
     @abstractmethod
     def depth_m(self) -> FloatArray:
         """(n,) metres by which the surface lies deeper per unit of the observable: positive where rock is missing."""
+
+    @property
+    def candidates(self) -> Effects:
+        """The effects that may be named."""
+        return catalogue(self.sensor)
 
     @property
     def observed(self) -> FloatArray:

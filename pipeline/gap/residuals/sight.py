@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
-from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.residuals import Residuals, Rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.mesh import FloatArray, area_normals
 
@@ -24,6 +25,8 @@ _SAMPLE, _NEAR, _ROUNDS = 2000, 48, 6
 _AROUND = 24
 """Two rings: the neighbours among which the cells of a few points are found."""
 _LARGEST_CELL = 4.0
+_FROM_AFAR, _STEEPEST = 1000.0, 0.2
+"""A surface is looked at along its plane's normal, from so many times as far; cosine of the steepest parts' slope that count."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Sight:
     plane: (n, 2) direction as the sensor counts it, rad (azimuth, zenith) or px (column, row), in any units; epoch: (n,); origin:
     (3,) of the rays, or (n, 3) of several scans, which lie apart in `plane`, m; ray: (n, 3) unit vectors, wall frame;
     reference_m: (n,) range on the reference along them; disparity: (n,) of the reference less that of infinity, px, None where
-    ranges are measured.
+    ranges are measured; slant: (n,) range per metre of a residual, of a surface without cameras, which is seen from far away.
     """
 
     plane: FloatArray
@@ -42,11 +45,12 @@ class Sight:
     ray: FloatArray
     reference_m: FloatArray
     disparity: FloatArray | None = None
+    slant: FloatArray | None = None
 
     @classmethod
     def of(cls, measurement: Measurement, residuals: Residuals) -> Sight:
         """Of the points of the residuals. A pair of cameras looks from the left one."""
-        origin, reference, disparity = measurement.viewpoint, None, None
+        origin, reference, disparity, slant = measurement.viewpoint, None, None, None
         match measurement, residuals:
             case StereoMeasurement(), StereoResiduals(geometry=pixels):
                 towards = pixels.point - origin
@@ -54,6 +58,9 @@ class Sight:
             case TlsMeasurement(), TlsResiduals(geometry=rays):
                 origin = _origins(measurement, residuals.index) if measurement.scans else origin
                 towards, reference = measurement.cloud.points[residuals.index] - origin, rays.range_m
+            case SurfaceMeasurement(), SurfaceResiduals(geometry=places):
+                origin = measurement.centre + _FROM_AFAR * (origin - measurement.centre)
+                towards, slant = places.point - origin, -1 / np.maximum(places.normal[:, 2], _STEEPEST)
             case _:
                 raise TypeError("measurement and residuals are of different sensors")
         length = np.linalg.norm(towards, axis=1)
@@ -61,7 +68,7 @@ class Sight:
         if isinstance(measurement, TlsMeasurement) and measurement.scans:
             plane = _apart_by_scan(plane, measurement.scan_of[residuals.index])
         reference = length if reference is None else reference
-        return cls(plane, epoch, origin, towards / length[:, None], reference, disparity)
+        return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
 
     def part(self, rows: Rows) -> Sight:
         """Of some of the points."""
@@ -73,10 +80,13 @@ class Sight:
             origin=self.origin if self.origin.ndim == 1 else self.origin[rows],
             reference_m=self.reference_m[rows],
             disparity=None if self.disparity is None else self.disparity[rows],
+            slant=None if self.slant is None else self.slant[rows],
         )
 
     def range_with(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
         """(m,) range of some points that depart from the reference by residuals (m,), m of range or px: R d / (d + residual)."""
+        if self.slant is not None:
+            return np.asarray(self.reference_m[rows] + residual * self.slant[rows])
         if self.disparity is None:
             return np.asarray(self.reference_m[rows] + residual)
         return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))

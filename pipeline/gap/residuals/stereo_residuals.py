@@ -27,6 +27,7 @@ from sensors.camera import Camera, CameraPair
 from sensors.curve import surface_on_host
 from sensors.effects.camera_effect import CameraEffect
 from sensors.effects.disparity_empirical import DisparityEmpirical
+from sensors.effects.parallax_noise import ParallaxNoise
 from sensors.effects.raster_effect import RasterEffect
 from sensors.model import StereoModel
 
@@ -45,6 +46,10 @@ class StereoResiduals(Residuals):
     """Residuals of disparities, px."""
 
     sensor = "stereo"
+    planes = ("image_x", "image_y")
+    described_by = DisparityEmpirical, "values_px"
+    noise = ParallaxNoise, "sigma_px"
+    called = "disparities of a stereo pair"
     geometry: PixelGeometry
 
     @property

@@ -9,22 +9,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement, TlsMeasurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.tls_residuals import pulse_of, pulses_of, recorded
 from scene.keyed_random import KeyedRandom
 
 
 def thinned(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:
-    """At most about `points.most` of a scan's points, with a note, and their rows; of a stereo pair all.
+    """At most about `points.most` of a scan's or a surface's points, with a note, and their rows; of a stereo pair all.
 
     Scan lines and times have to be known already (`with_order`): a part of the points does not tell them.
     """
     count, most = len(measurement.cloud.points), decided().points.most
-    if not isinstance(measurement, TlsMeasurement) or count <= most:
+    if isinstance(measurement, StereoMeasurement) or count <= most:
         return measurement, np.arange(count)
     share, generator, pulses = most / count, random.generator(), None
-    if measurement.pattern is None:
+    if isinstance(measurement, SurfaceMeasurement) or measurement.pattern is None:
         drawn = generator.random(count, dtype=np.float32) < share
     else:
         pulses = generator.random(pulses_of(measurement.pattern), dtype=np.float32) < share
@@ -35,4 +35,5 @@ def thinned(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement,
         f"{len(rows):,} of {count:,} points, drawn at random, were looked at: the smallest change of the scene that can be found "
         f"is {1 / share:.1f} times as large; --set points.most=... takes more, with 1.5 kB of memory each"
     )
-    return measurement.part(rows).changed(pulses=pulses, notes=(*measurement.notes, note)), rows
+    part = measurement.part(rows).changed(notes=(*measurement.notes, note))
+    return part if isinstance(part, SurfaceMeasurement) else part.changed(pulses=pulses), rows

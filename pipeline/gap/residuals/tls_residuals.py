@@ -7,11 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import ScanPattern, TlsMeasurement
+from pipeline.formats.measurement import TlsMeasurement
+from pipeline.formats.measurement_config import ScanPattern
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, Rows, part_of, plane_slopes
 from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
 from scene.mesh import FloatArray
 from sensors.effects.base import Stage
+from sensors.effects.range_empirical import RangeEmpirical
+from sensors.effects.range_noise import RangeNoise
 from sensors.polar import polar, polar_axes
 from sensors.pulses import PulseGeometry
 
@@ -51,6 +54,10 @@ class TlsResiduals(Residuals):
     """Residuals of ranges, m."""
 
     sensor = "tls"
+    planes = ("azimuth", "zenith")
+    described_by = RangeEmpirical, "values_m"
+    noise = RangeNoise, "sigma_m"
+    called = "ranges of a laser scan"
     geometry: RayGeometry
 
     @property

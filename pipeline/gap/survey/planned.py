@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.simulation import SensorName, SimulationConfig
-from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
@@ -167,6 +167,10 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
         seen = stereo_residuals(measurement)
         pair = StereoView(seen.part(_thinned(seen, most)), int(seen.smooth.sum()), 0, measurement)
         return StereoSurvey((pair,), centre, _pair_observer("medium"))
+    if isinstance(measurement, SurfaceMeasurement):
+        raise InputError(
+            "has no cameras, so no effect that it could show", where="--identifiability", remedy="name `cameras`"
+        )
     measurement = measurement.changed(order=None)
     several = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
     found, *others = [(number, one, tls_residuals(one)) for number, one in several or [(0, measurement)]]

@@ -1,0 +1,153 @@
+"""A cloud, mesh or elevation model out of photographs whose cameras are not at hand: from the files to the folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.formats.measurement import Material, SurfaceMeasurement, assembled, read_model
+from pipeline.formats.measurement_config import MeasurementConfig
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.surface_fit import air_side, check_in_metres
+from pipeline.gap.residuals.surface_noise import estimated_noise
+from pipeline.gap.residuals.surface_residuals import NO_CAMERAS, spacing_m
+from pipeline.measurement.folder import Content, Understood, write
+from pipeline.measurement.reference import DEMS, HALF, Reference, from_dem, from_file, is_cloud
+from pipeline.measurement.request import Request
+from pipeline.measurement.scans import METRES, RawScan, read_scans
+from pipeline.measurement.units import check_extent, check_same_unit
+from scene.errors import InputError
+from scene.imported import read_mesh
+from scene.mesh import FloatArray, TriangleMesh
+from scene.winding import facing
+from sensors.model import StereoModel, StereoNoise
+
+_LEANING = 0.1
+"""Vertical component of a wall's normal below which the side of the air is a guess."""
+_MESHES = (".obj", ".stl", ".off", ".glb", ".gltf")
+_FIRST_GUESS = 0.1
+"""Noise by which a cloud is registered before its own is known, of its spacing."""
+
+
+def build_surface(request: Request, out: Path) -> Understood:
+    """Write the folder `out` of a measurement without cameras.
+
+    Raises InputError where a file cannot be used, cloud and reference do not meet, or the noise cannot be estimated.
+    """
+    _check(request)
+    clouds = [_read(path, request) for path in request.scans]
+    points = clouds[0].cloud.points
+    reference, side = _reference(request, points)
+    check_same_unit(points, reference.mesh.vertices, clouds[0].name, request.unit, request.reference_unit)
+    model, words = _model(request, clouds[0], reference)
+    about = {
+        "points": tuple(f"{each.name}: {len(each.cloud.points):,} points{_said(each)}" for each in clouds),
+        "cameras": (NO_CAMERAS,),
+        "reference": (*reference.words, *side),
+        "cannot show": reference.limits,
+        "model": words,
+    }
+    found = Understood(out, about)
+    eye = _looking(air_side(reference.mesh), reference.mesh.vertices.mean(axis=0))
+    write(out, Content("stereo", [each.cloud for each in clouds], reference.mesh, model, eye, clouds[0].name), found)
+    return found
+
+
+def _check(request: Request) -> None:
+    if request.reference == HALF:
+        raise InputError("is for scans: neighbours in a matched cloud share their errors", where="--reference half",
+                         remedy="name a mesh, a cloud or a DEM")  # fmt: skip
+    if request.scanner is not None:
+        raise InputError("is for laser scans", where="--scanner", remedy="leave it out, or --photographs")
+    if len(set(request.scans)) < len(request.scans):
+        raise InputError("names a file twice", where="SCAN", remedy="give each epoch a file of its own")
+
+
+def _read(path: Path, request: Request) -> RawScan:
+    """The points of a cloud; the vertices of a mesh; the pixels of an elevation model."""
+    if not path.is_file():
+        raise InputError("there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM")
+    if path.suffix.lower() in DEMS:
+        dem = from_dem(path, METRES[request.unit])
+        return RawScan(path.name, PointCloud(dem.mesh.vertices), words=("the heights of an elevation model",))
+    if path.suffix.lower() in _MESHES or not is_cloud(path):
+        mesh, notes = read_mesh(path, request.unit)
+        found = RawScan(path.name, PointCloud(mesh.vertices), words=("the vertices of a mesh", *notes))
+    else:
+        scans = read_scans(path, request.unit, request.columns)
+        words = tuple(dict.fromkeys(word for scan in scans for word in scan.words if "intensity" not in word))
+        found = RawScan(path.name, PointCloud(np.concatenate([scan.cloud.points for scan in scans])), words=words)
+    check_extent(found.cloud.points, str(path), request.unit)
+    return found
+
+
+def _reference(request: Request, points: FloatArray) -> tuple[Reference, tuple[str, ...]]:
+    """The reference, wound to the side of the air, with words on which that is."""
+    path, centre = Path(request.reference), points.mean(axis=0)
+    normal = _normal(points)
+    given = None if request.position is None else np.array(request.position)
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    eye = centre + 2 * extent * (normal if normal[2] >= 0 else -normal) if given is None else given
+    position, rotation = _looking(eye, centre)
+    reference = from_file(path, request.reference_unit, position, rotation, seen_from="before the wall")
+    if given is not None:
+        mesh = _wound_to(reference.mesh, eye, str(path))
+        return Reference(mesh, reference.error_m, reference.words, reference.limits), ()
+    if not reference.of_points:
+        return reference, ()
+    guessed = " is a guess, as it stands upright" if abs(normal[2]) < _LEANING else " is taken from how it leans back"
+    return reference, (f"on which side of the wall the air is{guessed}; --position X,Y,Z says otherwise (any place before it)",)
+
+
+def _wound_to(mesh: TriangleMesh, eye: FloatArray, where: str) -> TriangleMesh:
+    centre = mesh.vertices.mean(axis=0)
+    turned = facing(mesh.with_vertices(mesh.vertices - centre), [eye - centre], where)[0]
+    return turned.with_vertices(mesh.vertices)
+
+
+def _normal(points: FloatArray) -> FloatArray:
+    """(3,) of the plane of least squares, either way round."""
+    few = points[:: max(len(points) // 20_000, 1)]
+    few = few - few.mean(axis=0)
+    return np.asarray(np.linalg.eigh(np.einsum("ni,nj->ij", few, few))[1][:, 0])
+
+
+def _looking(eye: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A place and a rotation (3, 3) to the world: x towards the wall, z up in what is seen."""
+    forward = (centre - eye) / np.linalg.norm(centre - eye)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    up = up - (up @ forward) * forward
+    up /= np.linalg.norm(up)
+    return eye, np.stack([forward, np.cross(up, forward), up], axis=1)
+
+
+def _model(request: Request, cloud: RawScan, reference: Reference) -> tuple[StereoModel, tuple[str, ...]]:
+    """What is believed of the points' noise: as given, or as the cloud itself shows."""
+    if request.model is not None:
+        model = read_model(request.model)
+        if not isinstance(model, StereoModel):
+            raise InputError("is the model of a laser scanner", where=str(request.model), allowed="sensor: stereo")
+        check_in_metres(model, str(request.model))
+        return model, (f"as in {request.model}",)
+    guess = StereoModel(
+        noise=StereoNoise(
+            parallax_sigma_px=0.0,
+            regularization_sigma_px=0.0,
+            point_sigma_m=max(_FIRST_GUESS * spacing_m(cloud.cloud.points), 1e-6),
+        )
+    )
+    config = MeasurementConfig(sensor="stereo", reference=Path("reference"), points=Path("points"), model=Path("model"))
+    material = Material(reference.mesh, {cloud.name: cloud.cloud}, guess)
+    measurement = assembled(config, material, request.reference, cloud.name)
+    if not isinstance(measurement, SurfaceMeasurement):
+        raise TypeError("a measurement without cameras is one of a surface")
+    noise = estimated_noise(measurement, cloud.name)
+    said = "whether that is too much cannot be told from this cloud; --model FILE states what is believed instead"
+    return noise.model, (noise.words, said)
+
+
+def _said(cloud: RawScan) -> str:
+    words: Sequence[str] = cloud.words
+    return "" if not words else "; " + "; ".join(words)

@@ -1,0 +1,59 @@
+"""Noise of a cloud's points in metres, for a cloud whose cameras are not known."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.effects.base import Effect, ShowsIn, Stage, parameter
+from sensors.node_grid import MEAN_VARIANCE
+from sensors.surface_places import RecordedPoints
+
+
+class PointNoise(Effect):
+    """dn ~ N(0, sigma), and beside it sum_ij w_ij(x, y) g_ij with g_ij ~ N(0, shared) at nodes a step apart on the wall's plane.
+
+    By so much single points, and neighbours in common, lie above the surface along its normal. Empirical, found by `scarpsim gap`
+    and `scarpsim measurement`; not in the shared catalogue.
+    """
+
+    name: Literal["point_noise"] = "point_noise"
+    sensor = "stereo"
+    stage = Stage.POINT
+    shows_in = ShowsIn.SPREAD
+    catalogue = False
+    empirical = True
+    sigma_m: float = parameter("standard deviation of each point", unit="m", source="empirical", typical=0.003, ge=0, le=10)
+    shared_sigma_m: float = parameter("standard deviation at the nodes", unit="m", source="empirical", ge=0, le=10)
+    shared_step_m: float = parameter("distance of the nodes", unit="m", source="empirical", null=None, default=0.1, gt=0, le=1000)
+
+    @property
+    def shared_variance(self) -> float:
+        """Of what neighbours have in common, on average over the surface, m2."""
+        return MEAN_VARIANCE * self.shared_sigma_m**2
+
+    def variance(self, at: Any) -> FloatArray:
+        return np.full(len(at), self.sigma_m**2 + self.shared_variance)
+
+    def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
+        white = self.sigma_m * random.child("point").generator().standard_normal(len(state.above))
+        return state.raised(white + self.shared_sigma_m * self._field(state.places.point[:, :2], random.child("nodes")))
+
+    def _field(self, at: FloatArray, random: KeyedRandom) -> FloatArray:
+        """(n,) of variance 1 at the nodes, at places (n, 2), m; 0 where a place is NaN."""
+        known = np.isfinite(at).all(axis=1)
+        field = np.zeros(len(at))
+        if not self.shared_sigma_m or not known.any():
+            return field
+        place = at[known] / self.shared_step_m
+        low = np.floor(place.min(axis=0))
+        corner = np.floor(place).astype(np.int64) - low.astype(np.int64)
+        share = place - low - corner
+        nodes = random.generator().standard_normal(tuple(corner.max(axis=0) + 2))
+        for right, up in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            weight = np.abs(1 - right - share[:, 0]) * np.abs(1 - up - share[:, 1])
+            field[known] += weight * nodes[corner[:, 0] + right, corner[:, 1] + up]
+        return field
