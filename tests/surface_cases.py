@@ -17,14 +17,14 @@ Array = np.ndarray[Any, np.dtype[np.float64]]
 WIDTH, HEIGHT = 24.0, 16.0
 SIGMA = 0.004
 _RNG = np.random.default_rng(7)
-_WAVES = [(*_RNG.uniform(0.15, 1.3, 1), *_RNG.uniform(0, 2 * np.pi, 2)) for _ in range(24)]
+_WAVES = [(*_RNG.uniform(0.15, 0.8, 1), *_RNG.uniform(0, 2 * np.pi, 2)) for _ in range(14)]
 
 
 def depth(x: Array, z: Array) -> Array:
     """How far the wall lies behind y = 0, m."""
     total = np.zeros(np.broadcast(x, z).shape)
     for k, angle, phase in _WAVES:
-        total += 0.09 / (0.3 + k) * np.sin(k * 2 * (np.cos(angle) * x + np.sin(angle) * z) + phase)
+        total += 0.15 / (0.2 + k) * np.sin(k * (np.cos(angle) * x + np.sin(angle) * z) + phase)
     return total
 
 
@@ -38,14 +38,14 @@ def normals(x: Array, z: Array) -> Array:
 
 @dataclass(frozen=True)
 class CloudCase:
-    """What a cloud is like. above: (x, z) to m above the wall, along the normal; scale: of the cloud about the wall's middle; niche:
-    x, z and depth of a square niche of 1 m along and up; sigma: m; points: how many; moved: shift of the cloud, m."""
+    """What a cloud is like. above: (x, z) to m above the wall, along the normal; scale: of the cloud about the wall's middle;
+    niche: x, z and depth of a square niche of 1 m along and up; sigma: m; points: how many; moved, turn_rad: of the cloud, m."""
 
     above: Callable[[Array, Array], Array] | None = None
     scale: float = 1.0
     niche: tuple[float, float, float] | None = None
     sigma: float = SIGMA
-    points: int = 30_000
+    points: int = 12_000
     moved: tuple[float, float, float] = (0.03, -0.02, 0.025)
     turn_rad: float = 0.002
 
@@ -60,7 +60,7 @@ def cloud(seed: int, **how: Any) -> Array:
         off = off + case.above(x, z)
     if case.niche is not None:
         inside = (np.abs(x - case.niche[0]) < 0.5) & (np.abs(z - case.niche[1]) < 0.5)
-        off = off - case.niche[2] * inside / np.abs(normals(x, z)[:, 1])
+        off = off - case.niche[2] * inside * np.abs(normals(x, z)[:, 1])
     points = np.stack([x, depth(x, z), z], axis=1) + off[:, None] * normals(x, z)
     middle = np.array([WIDTH / 2, 0.0, HEIGHT / 2])
     c, s = np.cos(case.turn_rad), np.sin(case.turn_rad)
@@ -68,7 +68,7 @@ def cloud(seed: int, **how: Any) -> Array:
     return case.scale * (points - middle) @ turn.T + middle + np.array(case.moved)
 
 
-def write_wall(path: Path, step: float = 0.04, beyond: float = 0.5, shift: tuple[float, float, float] = (0, 0, 0)) -> None:
+def write_wall(path: Path, step: float = 0.05, beyond: float = 0.5, shift: tuple[float, float, float] = (0, 0, 0)) -> None:
     """The reference: a PLY mesh of the wall, wider than the cloud by `beyond`."""
     xs, zs = np.arange(-beyond, WIDTH + beyond, step), np.arange(-beyond, HEIGHT + beyond, step)
     x, z = np.meshgrid(xs, zs, indexing="ij")

@@ -84,8 +84,13 @@ def write(out: Path, content: Content, found: Understood) -> None:
         write_text(folder / "understood.txt", found.summary() + "\n")
         write_json(folder / UNDERSTOOD, found.to_dict())
         seen = np.concatenate([cloud.points for cloud in content.clouds])
-        write_bytes(folder / "understood.png", picture(seen, content.reference, *content.eye, content.title))
+        write_bytes(folder / "understood.png", _picture(content, seen))
         _try(folder, out)
+
+
+def _picture(content: Content, points: FloatArray) -> bytes:
+    sensor = content.sensor == "tls" or content.cameras is not None
+    return picture(points, content.reference, *content.eye, content.title, sensor=sensor)
 
 
 def _write_points(path: Path, cloud: PointCloud) -> None:

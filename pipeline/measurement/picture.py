@@ -13,17 +13,29 @@ from sensors.polar import polar
 _DOTS = 15_000
 
 
-def picture(points: FloatArray, mesh: TriangleMesh, position: FloatArray, rotation: FloatArray, title: str) -> bytes:
-    """PNG of points (n, 3) and the reference, both m in one frame, with the scanner (position, rotation to that frame)."""
+def picture(
+    points: FloatArray,
+    mesh: TriangleMesh,
+    position: FloatArray,
+    rotation: FloatArray,
+    title: str,
+    *,
+    sensor: bool = True,
+) -> bytes:
+    """PNG of points (n, 3) and the reference, both m in one frame, with the scanner (position, rotation to that frame).
+
+    sensor: whether there is one at that place; else it is only a place to look from.
+    """
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     above, seen = figure.subplots(1, 2)
     origin = np.floor(position / 1000) * 1000 if np.abs(position).max() > 1e4 else np.zeros(3)
     few, known = (each[:: max(len(each) // _DOTS, 1)] - origin for each in (points, mesh.vertices))
     here = position - origin
     above.scatter(*known[:, :2].T, s=0.5, color="#b5b5b5", linewidths=0, label="reference")
-    above.scatter(*few[:, :2].T, s=0.5, color=FAMILY[0], linewidths=0, label="scan")
-    above.plot(here[0], here[1], marker="*", markersize=13, color=FAMILY[1], linestyle="none", label="sensor")
-    _fan(above, few, here)
+    above.scatter(*few[:, :2].T, s=0.5, color=FAMILY[0], linewidths=0, label="scan" if sensor else "cloud")
+    if sensor:
+        above.plot(here[0], here[1], marker="*", markersize=13, color=FAMILY[1], linestyle="none", label="sensor")
+        _fan(above, few, here)
     above.set_aspect("equal", adjustable="datalim")
     shift = "" if not origin.any() else f" less {origin[0]:,.0f}", f" less {origin[1]:,.0f}" if origin.any() else ""
     dress(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
@@ -37,8 +49,8 @@ def picture(points: FloatArray, mesh: TriangleMesh, position: FloatArray, rotati
     dots = seen.scatter(np.degrees(azimuth), np.degrees(zenith), c=distance, s=0.8, cmap=SEQUENTIAL, linewidths=0)
     seen.invert_yaxis()
     dress(seen, "azimuth, degrees", "zenith angle, degrees")
-    seen.set_title("as the sensor sees it")
-    figure.colorbar(dots, ax=seen, label="range, m")
+    seen.set_title("as the sensor sees it" if sensor else "seen from before the wall")
+    figure.colorbar(dots, ax=seen, label="range, m" if sensor else "distance from there, m")
     figure.suptitle(title)
     return png_bytes(figure)
 

@@ -14,7 +14,8 @@ from sensors.surface_places import RecordedPoints
 
 
 class PointNoise(Effect):
-    """dn ~ N(0, sigma), and beside it sum_ij w_ij(x, y) g_ij with g_ij ~ N(0, shared) at nodes a step apart on the wall's plane.
+    """dn ~ N(0, sqrt(sigma^2 + (steep b)^2)), b the slope against the wall's plane in radians, and beside it
+    sum_ij w_ij(x, y) g_ij with g_ij ~ N(0, shared) at nodes a step apart on the wall's plane.
 
     By so much single points, and neighbours in common, lie above the surface along its normal. Empirical, found by `scarpsim gap`
     and `scarpsim measurement`; not in the shared catalogue.
@@ -27,6 +28,14 @@ class PointNoise(Effect):
     catalogue = False
     empirical = True
     sigma_m: float = parameter("standard deviation of each point", unit="m", source="empirical", typical=0.003, ge=0, le=10)
+    steep_sigma_m: float = parameter(
+        "further standard deviation, in proportion to the slope, at 1 rad",
+        unit="m",
+        source="empirical",
+        typical=0.003,
+        ge=0,
+        le=10,
+    )
     shared_sigma_m: float = parameter("standard deviation at the nodes", unit="m", source="empirical", ge=0, le=10)
     shared_step_m: float = parameter("distance of the nodes", unit="m", source="empirical", null=None, default=0.1, gt=0, le=1000)
 
@@ -36,10 +45,15 @@ class PointNoise(Effect):
         return MEAN_VARIANCE * self.shared_sigma_m**2
 
     def variance(self, at: Any) -> FloatArray:
-        return np.full(len(at), self.sigma_m**2 + self.shared_variance)
+        return self._own_variance(at) + self.shared_variance
+
+    def _own_variance(self, at: Any) -> FloatArray:
+        """(n,) of what single points have by themselves, m2."""
+        own = np.full(len(at), self.sigma_m**2)
+        return own + (self.steep_sigma_m * np.nan_to_num(at.covariates["slope"])) ** 2 if self.steep_sigma_m else own
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
-        white = self.sigma_m * random.child("point").generator().standard_normal(len(state.above))
+        white = np.sqrt(self._own_variance(state.places)) * random.child("point").generator().standard_normal(len(state.above))
         return state.raised(white + self.shared_sigma_m * self._field(state.places.point[:, :2], random.child("nodes")))
 
     def _field(self, at: FloatArray, random: KeyedRandom) -> FloatArray:

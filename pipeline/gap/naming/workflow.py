@@ -213,7 +213,8 @@ def _held(
     named, words = only_within_bounds(there.model, named)
     scored = _scored(there, state, named, naming.reference_sigma)
     words += [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
-    if FREE_FORMS not in left_out and any(item.kind == "empirical" and not item.spreads for item in scored.failed):
+    nameable = any(not each.empirical for each in plain.candidates)
+    if nameable and FREE_FORMS not in left_out and any(item.kind == "empirical" and not item.spreads for item in scored.failed):
         again = _held(there, plain, held_points, random, left_out | {FREE_FORMS})
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])

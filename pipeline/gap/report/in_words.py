@@ -15,6 +15,7 @@ from pipeline.gap.report.scale import scale_of
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.report.page import true_minus
 from sensors.effects.base import ShowsIn
+from sensors.effects.surface_empirical import SurfaceEmpirical
 
 _STATISTICS = {"mean": "mean", "spread": "spread", "shape": "outliers", "missing": "lost returns"}
 _WITHOUT_NAMES = {
@@ -71,10 +72,15 @@ def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     return " ".join(each for each in (*_findings(found, rows), _closed(found), *_asides(found)) if each)
 
 
+def sentence(found: GapDiagnosis) -> str:
+    """The verdict in words; of a surface without cameras, of which no effect of the catalogue can be tried, in its own."""
+    said = in_a_sentence(found.verdict, found.effects, found.evidence)
+    return _WITHOUT_NAMES.get(said, said) if isinstance(found.residuals, SurfaceResiduals) else said
+
+
 def _findings(found: GapDiagnosis, rows: list[dict[str, Any]]) -> list[str]:
     parts = [f"{len(found.residuals):,} {found.residuals.called} were compared with what the model predicts."]
-    sentence = in_a_sentence(found.verdict, found.effects, found.evidence)
-    parts.append(_WITHOUT_NAMES.get(sentence, sentence) if isinstance(found.residuals, SurfaceResiduals) else sentence)
+    parts.append(sentence(found))
     scale = scale_of(found)
     parts += [] if scale is None else [scale.words]
     parts += [_effect(effect) for effect in found.effects]
@@ -210,9 +216,17 @@ def _effect(effect: Named) -> str:
 def _described(effect: Named) -> str:
     covariates = [in_words(effect.entry[key]) for key in ("covariate", "second") if effect.entry.get(key)]
     if covariates:
-        return f"depends on {listed(covariates)}"
+        return f"depends on {listed(covariates)}{_span(effect)}"
     lost = effect.effect.shows_in == ShowsIn.RETURNS
     return "is in the directions from which nothing returns" if lost else "is larger than the model says"
+
+
+def _span(effect: Named) -> str:
+    """How much an empirical term of a surface differs between its places."""
+    if effect.effect is not SurfaceEmpirical:
+        return ""
+    values = [each for row in effect.entry["values_m"] for each in row]
+    return f" (over {number(1e3 * (max(values) - min(values)), 3)} mm from its lowest to its highest value)"
 
 
 def gap_in_words(found: GapDiagnosis) -> str:

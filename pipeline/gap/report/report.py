@@ -13,7 +13,7 @@ from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import Measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.decisions import deciding
-from pipeline.gap.naming.verdict import closing, in_a_sentence
+from pipeline.gap.naming.verdict import closing
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.report.advice import advice, page_of
 from pipeline.gap.report.contributions import contributions
@@ -26,6 +26,7 @@ from pipeline.gap.report.in_words import (
     number,
     outcome,
     rounded,
+    sentence,
     shown,
     spread_outcome,
     title,
@@ -103,7 +104,8 @@ def summary(found: GapDiagnosis) -> str:
 
 
 def _summary(found: GapDiagnosis) -> str:
-    lines = [f"{found.verdict}: {in_a_sentence(found.verdict, found.effects, found.evidence)}"]
+    lines, scale = [f"{found.verdict}: {sentence(found)}"], scale_of(found)
+    lines += [] if scale is None else [f"  {scale.words}"]
     if found.verdict == "insufficient_data":
         lines += [f"  {found.remaining['note']}", f"  to measure: {_request(found)}"]
     for effect in found.effects:

@@ -2,7 +2,7 @@
 
 Each point is compared along the normal of the plane through the 24 vertices around the nearest one, as M3C2 does (Lague et al.
 2013): where that line meets the reference is the point's place. A cloud's datum has a shift, a turn and a scale, so that the
-registration has seven values. With N the normal of the triangle that is met, n the line's direction and p the point less the
+registration has seven values. With N the normal of the triangle that is met, n the line's direction and p that place less the
 reference's middle, a move d + w x p + s p of the cloud changes its distance by N.(d + w x p + s p) / (N.n).
 """
 
@@ -95,7 +95,7 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
         unit_m=np.ones(len(points)),
         smooth=even & measurement.stable,
         even=even,
-        pose=_pose(points - measurement.centre, triangle, across),
+        pose=_pose(geometry.point - measurement.centre, triangle, across),
         at=geometry.point[:, :2],
         covariates=geometry.covariates,
         index=np.arange(len(points)),
@@ -142,7 +142,10 @@ def _met(measurement: SurfaceMeasurement, points: FloatArray) -> tuple[SurfaceGe
 
 
 def _pose(away: FloatArray, triangle: FloatArray, across: FloatArray) -> FloatArray:
-    """(n, 7) change of the distance by a shift (m), a turn (rad) and a stretch that the cloud needs. away: (n, 3), m."""
+    """(n, 7) change of the distance by a shift (m), a turn (rad) and a stretch that the cloud needs.
+
+    away: (n, 3) of the places on the reference, m: the points' own noise would be in the stretch.
+    """
     columns = [triangle, np.cross(away, triangle), np.einsum("ni,ni->n", away, triangle)[:, None]]
     return -np.concatenate(columns, axis=1) / across[:, None]
 
