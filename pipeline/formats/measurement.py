@@ -254,8 +254,8 @@ class SurfaceMeasurement(MeasurementBase):
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """The points shifted (m), turned (rad) and stretched by a pose (7,) about the reference's middle, wall frame."""
-        turn = (1 + pose[6]) * rotation_matrix(pose[3:6])
+        """The points shifted (m), turned (rad) and, of seven values, stretched about the reference's middle, wall frame."""
+        turn = (1 + float(pose[6:].sum())) * rotation_matrix(pose[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + pose[:3]
         return self.changed(cloud=replace(self.cloud, points=points))
 

@@ -34,6 +34,7 @@ from pipeline.gap.report.in_words import (
     with_unit,
 )
 from pipeline.gap.report.scale import scale_of
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.report.page import p_value_in_words, template
 from scene.mesh import FloatArray
 
@@ -48,7 +49,6 @@ def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
 
 def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
     poses = [_registration(found.pose[start : start + 6], measurement) for start in range(0, len(found.pose) - 5, 6)]
-    scale = scale_of(found)
     return {
         "schema": 1,
         "verdict": found.verdict,
@@ -56,7 +56,7 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
         "where": where(found),
         "scene_changes": [change.to_dict(measurement.frame) for change in found.changes],
         "sensor": measurement.sensor,
-        "registration": poses[0] | ({} if scale is None else {"scale_ppm": scale.to_dict()}),
+        "registration": poses[0] | _scale(found),
         **({"further_registrations": poses[1:]} if len(poses) > 1 else {}),
         "identifiability": found.identifiability,
         "gap": found.gap.to_dict() if found.gap else None,
@@ -64,6 +64,14 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
         "decisions": found.decisions.model_dump(),
         "seconds": round(found.seconds, 2),
     }
+
+
+def _scale(found: GapDiagnosis) -> dict[str, Any]:
+    """Of a surface without cameras; null where its relief does not tell."""
+    if not isinstance(found.residuals, SurfaceResiduals):
+        return {}
+    scale = scale_of(found)
+    return {"scale_ppm": {"value": None, "std": None} if scale is None else scale.to_dict()}
 
 
 def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:

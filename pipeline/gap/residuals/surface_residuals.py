@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.formats.measurement import SurfaceMeasurement
 from pipeline.formats.surface_fit import near_m
+from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
 from pipeline.gap.residuals.shared_noise import SharedNoise
@@ -31,6 +32,7 @@ NO_CAMERAS = (
     "no cameras: every effect of the catalogue of stereo pairs needs them, and none was tried; what is left is described over "
     "the surface, without a name for its cause"
 )
+NO_SCALE = "the reference has too little relief to tell the cloud's scale, which is taken as right"
 _START = 1e-5
 """Share of the reference's extent by which rays start on the other side of a point, so that none starts on the surface."""
 _EDGE_SIGMAS, _EDGE_SLOPE = 3.0, 0.5
@@ -38,6 +40,9 @@ _EDGE_SIGMAS, _EDGE_SLOPE = 3.0, 0.5
 _FROM_RIM = 2.0
 """Spacings of the points from the reference's rim within which it is not smooth."""
 _JACKKNIFE_CELLS = 30.0
+_SAMPLE = 5000
+_ROUNDING = 1e-6
+"""Share of the reference's extent by which a covariate must differ."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,7 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     sigma = np.sqrt(sum((effect.variance(geometry) for effect in model.of_points()), np.zeros(len(points))))
     mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(points)))
     hit = np.isfinite(geometry.departure)
+    scaled = tells_scale(measurement)
     bend = _bend(measurement, geometry.point, triangle, geometry.normal, spacing)
     even = hit & (bend < np.maximum(_EDGE_SIGMAS * sigma, _EDGE_SLOPE * spacing))
     even &= _rim_distance(measurement, geometry.point) > _FROM_RIM * spacing
@@ -95,15 +101,36 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
         unit_m=np.ones(len(points)),
         smooth=even & measurement.stable,
         even=even,
-        pose=_pose(geometry.point - measurement.centre, triangle, across),
+        pose=_pose(geometry.point - measurement.centre, triangle, across)[:, : 7 if scaled else 6],
         at=geometry.point[:, :2],
-        covariates=geometry.covariates,
+        covariates=_varying(geometry, hit, measurement),
         index=np.arange(len(points)),
         geometry=geometry,
         shared_noise=_shared(model, geometry.point[:, :2], spacing),
-        notes=(*measurement.notes, NO_CAMERAS),
+        notes=(*measurement.notes, NO_CAMERAS, *(() if scaled else (NO_SCALE,))),
     )
     return whole.part(hit)
+
+
+def tells_scale(measurement: SurfaceMeasurement) -> bool:
+    """Whether stretching the reference moves it off itself, beyond what a shift and a turn do."""
+    vertices = np.arange(0, len(measurement.reference.vertices), max(len(measurement.reference.vertices) // _SAMPLE, 1))
+    normal = measurement.shape.normals(vertices)
+    columns = _pose(measurement.reference.vertices[vertices] - measurement.centre, normal, np.ones(len(vertices)))
+    rigid, stretch = columns[:, :6], columns[:, 6]
+    left = stretch - rigid @ np.linalg.lstsq(rigid, stretch, rcond=None)[0]
+    extent = float(np.linalg.norm(np.ptp(measurement.reference.bounds, axis=0)))
+    return bool(np.sqrt(np.mean(left**2)) > decided().points.least_relief * extent)
+
+
+def _varying(geometry: SurfaceGeometry, hit: BoolArray, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
+    """The covariates that differ by more than rounding does."""
+    extent = float(np.linalg.norm(np.ptp(measurement.reference.bounds, axis=0)))
+    return {
+        name: values
+        for name, values in geometry.covariates.items()
+        if name in SurfaceResiduals.planes or (hit.any() and float(np.ptp(values[hit])) > _ROUNDING * extent)
+    }
 
 
 def spacing_m(points: FloatArray) -> float:
@@ -201,7 +228,7 @@ def sigma_of(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
 
 
 def datum_std(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
-    """(7,) standard deviations of the registration: the jackknife over blocks of the wall, which share their errors.
+    """(6,) or (7,) standard deviations of the registration: the jackknife over blocks of the wall, which share their errors.
 
     value: (n,) residuals with the registration taken off; rows: (n,) those by which it was made. Without a block b the values
     change by -(A - A_b)^-1 r_b, A and r being the normal equations' matrix and right side.
