@@ -99,6 +99,7 @@ PARSED = (
     "scarpsim gap scan.e57 --reference wall.ply --scanner leica_p50",
     "scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis",
     "scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis",
+    "scarpsim gap cloud.ply --reference wall.ply --photographs --out diagnosis",
     "scarpsim view diagnosis",
     "scarpsim view runs/stereo runs/tls",
     "scarpsim view sets/small/test",

@@ -33,6 +33,7 @@ from pipeline.formats.point_cloud import SCAN, PointCloud, joined
 from pipeline.formats.points import read_points
 from pipeline.formats.rounded_points import check_rounded_points
 from pipeline.formats.scanner_poses import Face, Pose, Scanned, ScannerPose, set_ups
+from pipeline.formats.surface_datum import told_datum
 from pipeline.formats.surface_fit import SurfaceFit, air_side, check_in_metres
 from pipeline.registration.rigid import rotation_matrix
 from scene.cleaning import weld
@@ -240,6 +241,12 @@ class SurfaceMeasurement(MeasurementBase):
         """The reference with what its vertices' neighbourhoods tell."""
         return ShapedSurface(self.reference)
 
+    @cached_property
+    def datum(self) -> FloatArray:
+        """(7, k) the parts of the cloud's datum that the reference tells, of shift, turn and stretch."""
+        vertices = np.arange(len(self.reference.vertices))
+        return told_datum(self.reference.vertices - self.centre, self.shape.normals(vertices))
+
     @property
     def surface_fit(self) -> SurfaceFit:
         """How the points lie against the reference."""
@@ -250,13 +257,14 @@ class SurfaceMeasurement(MeasurementBase):
 
     def changed(self, **values: Any) -> Self:
         other = super().changed(**values)
-        other.__dict__["shape"] = self.shape
+        other.__dict__["shape"], other.__dict__["datum"] = self.shape, self.datum
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """The points shifted (m), turned (rad) and, of seven values, stretched about the reference's middle, wall frame."""
-        turn = (1 + float(pose[6:].sum())) * rotation_matrix(pose[3:6])
-        points = (self.cloud.points - self.centre) @ turn.T + self.centre + pose[:3]
+        """The points shifted (m), turned (rad) and stretched about the reference's middle by parts of the datum (k,)."""
+        whole = self.datum @ pose
+        turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
+        points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
         return self.changed(cloud=replace(self.cloud, points=points))
 
     def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:

@@ -43,13 +43,6 @@ class PointsDecisions(_Group):
         5.0, "predicted sigmas, times what the residuals spread of them", "Beyond which a point has no say.", _JUDGEMENT
     )
     unregistered: PositiveFloat = _by(3.5, "sigmas", "Beyond which a point has no say in the registration.", _JUDGEMENT)
-    least_relief: PositiveFloat = _by(
-        0.001,
-        "share of the extent",
-        "Root mean square of how far a stretch moves a surface without cameras off itself, below which its scale is not fitted.",
-        "geometry: 3 cm on a wall 30 m wide, where noise of 4 mm in 500 places that count leaves the scale known to 6,000 ppm",
-        lt=1,
-    )
     kept: PositiveFloat = _by(
         0.9, "share", "Of the points whose rays must still meet the reference with an effect in the model.", _JUDGEMENT, le=1
     )

@@ -306,8 +306,9 @@ def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock)
     count, least = int(residuals.smooth.sum()), decided().points.fewest
     note = f"{count} points on smooth parts of the reference and stable ground, {least} are needed"
     empty = np.zeros(len(residuals))
+    pose = np.zeros(residuals.pose.shape[1] if isinstance(residuals, SurfaceResiduals) else 6)
     return GapDiagnosis(
-        "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, np.zeros(6), measurement.model,
+        "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, pose, measurement.model,
         None, (), (), _remaining(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
         clock.total, clock.laps, decided(),
     )  # fmt: skip

@@ -48,7 +48,8 @@ def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
 
 
 def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    poses = [_registration(found.pose[start : start + 6], measurement) for start in range(0, len(found.pose) - 5, 6)]
+    pose = found.residuals.datum[:6] @ found.pose if isinstance(found.residuals, SurfaceResiduals) else found.pose
+    poses = [_registration(pose[start : start + 6], measurement) for start in range(0, len(pose), 6)]
     return {
         "schema": 1,
         "verdict": found.verdict,

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, datum_std
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, datum_covariance
 
 _FEWEST = 100
 _CLEAR = 3.0
@@ -40,9 +42,10 @@ class Scale:
 def scale_of(found: GapDiagnosis) -> Scale | None:
     """Of a surface without cameras; None of what has no scale of its own, or too few points."""
     residuals = found.residuals
-    if not isinstance(residuals, SurfaceResiduals) or len(found.pose) < 7:
+    if not isinstance(residuals, SurfaceResiduals) or not residuals.datum[6].any():
         return None
     rows = residuals.smooth & ~found.held_out & (abs(found.after) < found.decisions.points.outlier * residuals.sigma)
     if rows.sum() < _FEWEST:
         return None
-    return Scale(1e6 * (1 / (1 + float(found.pose[6])) - 1), 1e6 * float(datum_std(residuals, found.after, rows)[6]))
+    stretch, variance = residuals.datum[6] @ found.pose, datum_covariance(residuals, found.after, rows)[6, 6]
+    return Scale(1e6 * (1 / (1 + float(stretch)) - 1), 1e6 * float(np.sqrt(variance)))

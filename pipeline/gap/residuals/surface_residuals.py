@@ -8,13 +8,13 @@ reference's middle, a move d + w x p + s p of the cloud changes its distance by 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pipeline.formats.measurement import SurfaceMeasurement
+from pipeline.formats.surface_datum import datum_columns
 from pipeline.formats.surface_fit import near_m
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
 from pipeline.gap.residuals.shared_noise import SharedNoise
@@ -40,7 +40,6 @@ _EDGE_SIGMAS, _EDGE_SLOPE = 3.0, 0.5
 _FROM_RIM = 2.0
 """Spacings of the points from the reference's rim within which it is not smooth."""
 _JACKKNIFE_CELLS = 30.0
-_SAMPLE = 5000
 _ROUNDING = 1e-6
 """Share of the reference's extent by which a covariate must differ."""
 
@@ -63,7 +62,11 @@ class SurfaceGeometry(SurfacePlaces):
 
 @dataclass(frozen=True)
 class SurfaceResiduals(Residuals):
-    """Distances along the normal, m, positive out of the rock."""
+    """Distances along the normal, m, positive out of the rock.
+
+    pose: (n, k) by the parts of the datum that the reference tells; datum: (7, k) these in shift (m), turn (rad) and stretch. The
+    places of the reference make the slopes, not the points, whose noise would be in the stretch.
+    """
 
     sensor = "stereo"
     planes = ("along", "up")
@@ -71,6 +74,7 @@ class SurfaceResiduals(Residuals):
     noise = PointNoise, "sigma_m"
     called = "points of a surface from photographs"
     geometry: SurfaceGeometry
+    datum: FloatArray = field(default_factory=lambda: np.eye(7))
 
     @property
     def depth_m(self) -> FloatArray:
@@ -91,7 +95,6 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     sigma = np.sqrt(sum((effect.variance(geometry) for effect in model.of_points()), np.zeros(len(points))))
     mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(points)))
     hit = np.isfinite(geometry.departure)
-    scaled = tells_scale(measurement)
     bend = _bend(measurement, geometry.point, triangle, geometry.normal, spacing)
     even = hit & (bend < np.maximum(_EDGE_SIGMAS * sigma, _EDGE_SLOPE * spacing))
     even &= _rim_distance(measurement, geometry.point) > _FROM_RIM * spacing
@@ -101,26 +104,16 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
         unit_m=np.ones(len(points)),
         smooth=even & measurement.stable,
         even=even,
-        pose=_pose(geometry.point - measurement.centre, triangle, across)[:, : 7 if scaled else 6],
+        pose=-datum_columns(geometry.point - measurement.centre, triangle) @ measurement.datum / across[:, None],
         at=geometry.point[:, :2],
         covariates=_varying(geometry, hit, measurement),
         index=np.arange(len(points)),
         geometry=geometry,
+        datum=measurement.datum,
         shared_noise=_shared(model, geometry.point[:, :2], spacing),
-        notes=(*measurement.notes, NO_CAMERAS, *(() if scaled else (NO_SCALE,))),
+        notes=(*measurement.notes, NO_CAMERAS, *(() if measurement.datum[6].any() else (NO_SCALE,))),
     )
     return whole.part(hit)
-
-
-def tells_scale(measurement: SurfaceMeasurement) -> bool:
-    """Whether stretching the reference moves it off itself, beyond what a shift and a turn do."""
-    vertices = np.arange(0, len(measurement.reference.vertices), max(len(measurement.reference.vertices) // _SAMPLE, 1))
-    normal = measurement.shape.normals(vertices)
-    columns = _pose(measurement.reference.vertices[vertices] - measurement.centre, normal, np.ones(len(vertices)))
-    rigid, stretch = columns[:, :6], columns[:, 6]
-    left = stretch - rigid @ np.linalg.lstsq(rigid, stretch, rcond=None)[0]
-    extent = float(np.linalg.norm(np.ptp(measurement.reference.bounds, axis=0)))
-    return bool(np.sqrt(np.mean(left**2)) > decided().points.least_relief * extent)
 
 
 def _varying(geometry: SurfaceGeometry, hit: BoolArray, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
@@ -166,15 +159,6 @@ def _met(measurement: SurfaceMeasurement, points: FloatArray) -> tuple[SurfaceGe
     places = shape.at(points - distance[:, None] * normal, corners)
     known = {name: getattr(places, name) for name in ("point", "normal", "roughness", "convexity", "edge_distance")}
     return SurfaceGeometry(**known, departure=distance), triangle, np.where(met, across, 1.0)
-
-
-def _pose(away: FloatArray, triangle: FloatArray, across: FloatArray) -> FloatArray:
-    """(n, 7) change of the distance by a shift (m), a turn (rad) and a stretch that the cloud needs.
-
-    away: (n, 3) of the places on the reference, m: the points' own noise would be in the stretch.
-    """
-    columns = [triangle, np.cross(away, triangle), np.einsum("ni,ni->n", away, triangle)[:, None]]
-    return -np.concatenate(columns, axis=1) / across[:, None]
 
 
 def _bend(
@@ -227,8 +211,8 @@ def sigma_of(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
     return np.sqrt(sum((effect.variance(residuals.geometry) for effect in model.of_points()), np.zeros(len(residuals))))
 
 
-def datum_std(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
-    """(6,) or (7,) standard deviations of the registration: the jackknife over blocks of the wall, which share their errors.
+def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
+    """(7, 7) covariance of shift, turn and stretch: the jackknife over blocks of the wall, which share their errors.
 
     value: (n,) residuals with the registration taken off; rows: (n,) those by which it was made. Without a block b the values
     change by -(A - A_b)^-1 r_b, A and r being the normal equations' matrix and right side.
@@ -246,5 +230,5 @@ def datum_std(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -
         matrix = whole - columns[own].T @ columns[own]
         changes.append(-np.linalg.lstsq(matrix, columns[own].T @ (left[own] / part.sigma[own]), rcond=None)[0] / scale)
     count = len(changes)
-    spread = np.array(changes) - np.mean(changes, axis=0)
-    return np.sqrt((count - 1) / count * np.sum(spread**2, axis=0))
+    spread = (np.array(changes) - np.mean(changes, axis=0)) @ residuals.datum.T
+    return np.asarray((count - 1) / count * spread.T @ spread)
