@@ -53,7 +53,7 @@ DECISIONS = Decisions()
 
 
 class _Residuals(list[int]):
-    sensor = "tls"
+    sensor, called = "tls", "ranges of a laser scan"
 
 
 @dataclass
