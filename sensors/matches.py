@@ -36,7 +36,8 @@ class Matches:
     index: the cell's number, row by row (keys its random numbers); u, v: the cell's centre in the left image; disparity: of the
     rectified pair; matched: whether the cell has a match; block, true_depth (m, along the real left camera's axis), albedo: of
     the surface that the left camera sees there, albedo None for a wall that has none. width, height: of the frame; reduction:
-    frame px per cell, so that one cell is one px of the image that is matched.
+    frame px per cell, so that one cell is one px of the image that is matched. tangent: of the angle between a rectified row and
+    the rectified axis; infinity: disparity of a point at infinity.
     """
 
     index: mi.UInt32
@@ -50,6 +51,8 @@ class Matches:
     width: int
     height: int
     reduction: int
+    tangent: mi.Float64
+    infinity: float
 
     @property
     def shape(self) -> tuple[int, int]:

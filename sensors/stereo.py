@@ -75,10 +75,12 @@ class StereoPair:
         hits, point = view(scene, real.left, u - exposed(effects, "left", v, random), v)
         matched, right_u, right_v = _visible(scene, real.right, hits, point)
         right_u += exposed(effects, "right", right_v, random)
-        left_u, left_v, disparity = rectified_disparity(nominal, rectify(nominal), (u, v), (right_u, right_v))
+        geometry = rectify(nominal)
+        left_u, left_v, disparity = rectified_disparity(nominal, geometry, (u, v), (right_u, right_v))
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
         size = nominal.left.width, nominal.left.height, REDUCTION[self.quality]
-        return Matches(index, u, v, disparity, matched, *seen, *size), left_u, left_v, point
+        rows = row_tangent(geometry, left_v), geometry.offset
+        return Matches(index, u, v, disparity, matched, *seen, *size, *rows), left_u, left_v, point
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -175,6 +177,12 @@ def rectified_disparity(
     left_u, left_v = rectified_pixel(nominal.left, geometry.left, *left, geometry.f, geometry.u_left, geometry.v)
     right_u, _ = rectified_pixel(nominal.right, geometry.right, *right, geometry.f, geometry.u_right, geometry.v)
     return left_u, left_v, left_u - right_u
+
+
+def row_tangent(geometry: Rectification, v: mi.Float64) -> mi.Float64:
+    """(n,) tangent of the angle between rectified rows, px, and the rectified axis."""
+    scale, centre = opaque(geometry.f, geometry.v)
+    return (v - centre) / scale
 
 
 def rectified_pixel(

@@ -28,7 +28,7 @@ from sensors.matches import Matches, bridged
 from sensors.observation import packed
 from sensors.raised_points import in_metres, shifts
 from sensors.rectify import rectify
-from sensors.stereo import REDUCTION, StereoPair, exposed, rectified_disparity, reproject
+from sensors.stereo import REDUCTION, StereoPair, exposed, rectified_disparity, reproject, row_tangent
 
 
 def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) -> TriangleMesh:
@@ -51,8 +51,10 @@ def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) ->
     albedo = None if mesh.vertex_albedo is None else on_device(mi.Float32, mesh.vertex_albedo)
     block = mi.Int32(WALL) if mesh.vertex_block is None else on_device(mi.Int32, mesh.vertex_block)
     index, size = dr.arange(mi.UInt32, len(mesh.vertices)), (nominal.left.width, nominal.left.height, REDUCTION[pair.quality])
+    rows = row_tangent(geometry, left_v), geometry.offset
     matches: Matches = VertexMatches(
-        index, u, v, disparity, in_left & in_right, block, depth, albedo, *size, _TracedCells(pair, scene, effects, random)
+        index, u, v, disparity, in_left & in_right, block, depth, albedo, *size, *rows,
+        _TracedCells(pair, scene, effects, random),
     )
     for stage in (Stage.MATCH, Stage.FILL):
         matches = apply_stage(effects, stage, matches, random)

@@ -39,13 +39,24 @@ class PixelLocking(Effect):
         None, gt=0, description="n, where another rectification's pixels are not those of this one [px]; null: the reduction"
     )
     phase_rad: float = Field(0.0, description="where another rectification's columns count from elsewhere [rad]")
+    tilt_rad: float = Field(
+        0.0, gt=-1, lt=1, description="by which another rectification is turned about the base against this one [rad]"
+    )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         amplitude, period, phase = opaque(self.amplitude_px, self.period_px or state.reduction, self.phase_rad)
-        return replace(state, disparity=state.disparity + amplitude * _wave(state.disparity / period, phase, DEVICE))
+        matched = self._matched(state.disparity, state)
+        return replace(state, disparity=state.disparity + amplitude * _wave(matched / period, phase, DEVICE))
 
     def mean(self, at: Any) -> FloatArray:
-        return np.asarray(self.amplitude_px * _wave(at.found / (self.period_px or 1.0), self.phase_rad, HOST))
+        matched = self._matched(at.found, at)
+        return np.asarray(self.amplitude_px * _wave(matched / (self.period_px or 1.0), self.phase_rad, HOST))
+
+    def _matched(self, disparity: Any, at: Any) -> Any:
+        """Disparities of this rectification in the one that is turned: f B / Z' with Z' = Z (1 + tan w y), its scale in n."""
+        if not self.tilt_rad:
+            return disparity
+        return at.infinity + (disparity - at.infinity) / (1 + math.tan(self.tilt_rad) * at.tangent)
 
 
 def _wave(pixels: Any, phase: Any, m: Functions) -> Any:

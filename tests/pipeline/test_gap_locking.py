@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from pipeline.gap.other.locking import find_locking
+from sensors.effects.pixel_locking import PixelLocking
 
 
 @pytest.mark.parametrize(
@@ -45,3 +48,24 @@ def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one()
     found = find_locking(measured, plain)
     assert found is not None
     assert found.amplitude_px == pytest.approx(0.12, abs=0.02)
+
+
+@pytest.mark.parametrize(("tilt", "amplitude"), [(0.06, 0.3), (-0.04, 0.08)])
+def test_a_matcher_whose_rectification_is_turned_about_the_base_is_seen_through(tilt: float, amplitude: float) -> None:
+    """Disparities f B / Z' of another rectification, Z' = Z cos w + Y sin w, counted in pixels of its own principal distance."""
+    rng = np.random.default_rng(5)
+    tangent, beyond, infinity = rng.uniform(-0.35, 0.3, 20_000), rng.uniform(400, 700, 20_000), -350.0
+    theirs = 1.01 * beyond / (np.cos(tilt) + tangent * np.sin(tilt)) + 0.3 * rng.standard_normal(20_000)
+    locked = theirs + amplitude * np.sin(2 * np.pi * theirs)
+    ours = infinity + locked * (np.cos(tilt) + tangent * np.sin(tilt)) / 1.01
+    found = find_locking(ours, infinity + beyond, tangent, infinity)
+    assert found is not None
+    assert found.tilt_rad == pytest.approx(tilt, abs=2e-4)
+    assert found.amplitude_px == pytest.approx(amplitude / 1.01, abs=max(4 * found.std_px, 0.01))
+    turned = find_locking(ours, infinity + beyond)
+    assert turned is None or turned.gain < 0.1 * found.gain
+    effect = PixelLocking(
+        amplitude_px=found.amplitude_px, period_px=found.period_px, phase_rad=found.phase_rad, tilt_rad=found.tilt_rad
+    )
+    mean = effect.mean(SimpleNamespace(found=ours, tangent=tangent, infinity=infinity))
+    assert np.corrcoef(mean, np.sin(2 * np.pi * locked))[0, 1] > 0.98

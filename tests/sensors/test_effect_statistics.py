@@ -142,6 +142,8 @@ def matches(disparity: Any = 60.0) -> Matches:
         width=CELLS * REDUCTION,
         height=CELLS * REDUCTION,
         reduction=REDUCTION,
+        tangent=dr.zeros(mi.Float64, CELLS * CELLS),
+        infinity=0.0,
     )
 
 

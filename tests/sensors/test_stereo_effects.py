@@ -451,7 +451,7 @@ def textured_matches(albedo: FloatArray) -> Matches:
     index = dr.arange(mi.UInt32, rows * columns)
     zero, block = dr.zeros(mi.Float64, rows * columns), dr.zeros(mi.Int32, rows * columns)
     seen = block, zero, mi.Float32(albedo.astype(np.float32).ravel())
-    return Matches(index, zero, zero, zero, dr.full(mi.Bool, True, rows * columns), *seen, columns * 4, rows * 4, 4)
+    return Matches(index, zero, zero, zero, dr.full(mi.Bool, True, rows * columns), *seen, columns * 4, rows * 4, 4, zero, 0.0)
 
 
 def test_texture_noise_has_the_cramer_rao_bounds_variance_and_an_end_where_there_is_no_texture() -> None:

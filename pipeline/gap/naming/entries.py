@@ -149,6 +149,7 @@ def from_locking(found: Locking) -> Named:
         "amplitude_px": found.amplitude_px,
         "period_px": found.period_px,
         "phase_rad": found.phase_rad,
+        "tilt_rad": found.tilt_rad,
     }
     return Named(f"stereo.{PixelLocking.tag()}", "physical", entry, {"amplitude_px": found.std_px}, (), None, found.gain)
 

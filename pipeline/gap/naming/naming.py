@@ -97,7 +97,8 @@ def name_effects(
     if isinstance(part, TlsResiduals) and not believes(measurement, RangeQuantization.tag()):
         comb = find_comb(part.geometry.measured_m)
     if isinstance(part, StereoResiduals) and not believes(measurement, PixelLocking.tag()):
-        locking = find_locking(part.geometry.found, part.geometry.disparity)
+        at = part.geometry
+        locking = find_locking(at.found, at.disparity, at.tangent, at.infinity)
     if comb is not None:
         named.append(from_comb(comb, part))
         added, scale = comb.step_m**2 / 12, 1.0

@@ -3,6 +3,10 @@
 If d' = x + A sin(2 pi x / n + phase) and x is spread over many pixels, the mean of exp(2 pi i d' / n) is -J1(2 pi A / n)
 exp(-i phase) (Jacobi-Anger), also where x holds noise that would average the sine away in the residuals. The k-th multiple of the
 angle gives |Jk(2 pi k A / n)|; what blurs the disparities by s after the locking takes exp(-2 (pi k s / n)^2) of it.
+
+The rectification in which the disparities were found is not part of a measurement. Another one has another principal distance and
+may be turned about the base by an angle w, so that d' = s d / (1 + y tan w), d counted from that of a point at
+infinity, y the tangent of a row's angle to the axis.
 """
 
 from __future__ import annotations
@@ -10,16 +14,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.special import j1, jv
 
 from pipeline.gap.decisions import decided
 from scene.mesh import FloatArray
 
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
-_SCALE_UNKNOWN = 0.03
-"""The rectification in which the disparities were found is not part of a measurement: its principal distance may be another."""
-_BESIDE = np.concatenate([np.linspace(0.72, 0.9, 10), np.linspace(1.1, 1.28, 10)])
+_SCALE_UNKNOWN, _TILT_UNKNOWN = 0.03, 0.1
+"""By how much the principal distance of the matcher's rectification may be another, and its turn about the base, rad."""
+_BESIDE = 0.18
+"""Frequencies about that of whole pixels, as a share of it, at which what crowds is the wall's shape."""
+_BINS_A_CYCLE, _STEPS_A_CYCLE = 8, 4
+_MOST_BINS = 4096
 _LARGEST = 0.6
 """Amplitude in matched pixels."""
 _MULTIPLES = np.arange(1, 5)
@@ -29,43 +36,95 @@ _MOST_POINTS = 60_000
 
 @dataclass(frozen=True)
 class Locking:
-    """amplitude_px, std_px; period_px: n; phase_rad in the nominal rectification; gain in log-likelihood."""
+    """amplitude_px, std_px; period_px: n; phase_rad of the disparities that were given; tilt_rad: turn about the base of
+    the rectification in which they were found; gain in log-likelihood."""
 
     amplitude_px: float
     std_px: float
     period_px: float
     phase_rad: float
+    tilt_rad: float
     gain: float
 
 
-def find_locking(disparity: FloatArray, reference: FloatArray) -> Locking | None:
+def find_locking(
+    disparity: FloatArray, reference: FloatArray, tangent: FloatArray | float = 0.0, infinity: FloatArray | float = 0.0
+) -> Locking | None:
     """The locking that measured disparities (n,), px, show, if any: n |R|^2 is exponential where there is none (Rayleigh).
 
-    reference: (n,) disparities of the surface as known; what crowds there too is its shape.
+    reference: (n,) disparities of the surface as known; what crowds there too, by more than chance, is its shape; tangent: (n,) of
+    the angle between a point's rectified row and the axis; infinity: disparity of a point at infinity.
     """
     thin = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
-    some, known = disparity[thin], reference[thin]
-    reach = float(np.ptp(np.quantile(some, [0.02, 0.98])))
-    best: tuple[float, float, complex, int] | None = None
+    far = np.broadcast_to(infinity, disparity.shape)[thin]
+    some, known, rows = disparity[thin] - far, reference[thin] - far, np.broadcast_to(tangent, disparity.shape)[thin]
+    count, reach = len(some), float(np.ptp(np.quantile(some, [0.02, 0.98])))
+    best: tuple[float, float, float, float] | None = None
     for reduction in _REDUCTIONS:
         if reach < decided().locking.fewest_cycles * reduction:
             continue
-        tried = np.arange((1 - _SCALE_UNKNOWN) / reduction, (1 + _SCALE_UNKNOWN) / reduction, 0.2 / reach)
-        means, shape = np.abs(_means(some, tried)), np.abs(_means(known, np.concatenate([tried, _BESIDE / reduction])))
-        frequency = _refined(some, float(tried[int(np.argmax(means))]), 0.2 / reach)
-        mean = complex(_means(some, np.array([frequency]))[0])
-        gain = len(some) * max(abs(mean) - decided().locking.crowding * float(shape.max()), 0.0) ** 2
+        whole = 1 / reduction
+        frequency, tilt, _, tries = _strongest(some, rows, whole, _SCALE_UNKNOWN)
+        _, _, crowded, tries_beside = _strongest(known, rows, whole, _BESIDE)
+        shape = np.sqrt(max(crowded**2 - np.log(tries_beside) / count, 0.0))
+        frequency, tilt = _refined(some, rows, frequency, tilt)
+        crowds = _crowding(some, rows, frequency, tilt)
+        gain = count * max(crowds - decided().locking.crowding * shape, 0.0) ** 2
         if best is None or gain > best[0]:
-            best = gain, frequency, mean, len(tried)
+            best = gain, frequency, tilt, tries
     if best is None:
         return None
-    gain, frequency, mean, count = best
-    by_chance = min(1.0, len(_REDUCTIONS) * count * float(np.exp(-gain)))
+    gain, frequency, tilt, tries = best
+    by_chance = min(1.0, len(_REDUCTIONS) * tries * float(np.exp(-gain)))
     if by_chance > decided().locking.significance:
         return None
-    share, error = _amplitude(np.array([abs(np.exp(2j * np.pi * k * frequency * some).mean()) for k in _MULTIPLES]), len(some))
-    phase = float(np.angle(-np.conj(mean) * np.sign(j1(2 * np.pi * share))))
-    return Locking(share / frequency, error / frequency, 1 / frequency, phase, float(gain))
+    pixels = frequency * (some / (1 + np.tan(tilt) * rows) + far)
+    share, error = _amplitude(np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES]), count)
+    first = complex(np.exp(2j * np.pi * pixels).mean())
+    phase = float(np.angle(-np.conj(first) * np.sign(j1(2 * np.pi * share))))
+    return Locking(share / frequency, error / frequency, 1 / frequency, phase, tilt, float(gain))
+
+
+def _strongest(disparity: FloatArray, tangent: FloatArray, whole: float, share: float) -> tuple[float, float, float, float]:
+    """Frequency (1/px) within a share of `whole`, and tilt, at which disparities crowd most; how much; how many were tried.
+
+    The mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phases of whole pixels, in
+    frequencies that are low beside those: the phases are gathered in bins of an eighth of their shortest cycle.
+    """
+    phasor = np.exp(2j * np.pi * whole * disparity)
+    axes = [disparity - disparity.mean(), disparity * tangent]
+    axes[1] = axes[1] - axes[1].mean()
+    highest = [share * whole, (1 + share) * _TILT_UNKNOWN * whole]
+    bins = [int(np.clip(np.ceil(np.ptp(x) * f * _BINS_A_CYCLE), 4, _MOST_BINS)) for x, f in zip(axes, highest, strict=True)]
+    edges = [np.linspace(x.min(), x.max() + 1e-9, n + 1) for x, n in zip(axes, bins, strict=True)]
+    table = np.histogram2d(*axes, bins=edges, weights=phasor.real)[0] + 1j * np.histogram2d(*axes, bins=edges, weights=phasor.imag)[0]
+    middles, steps = [(edge[1:] + edge[:-1]) / 2 for edge in edges], []
+    found = table
+    for axis in (1, 0):
+        reach = max(float(np.ptp(axes[axis])), 1e-9)
+        tried = np.arange(-highest[axis], highest[axis], 1 / (_STEPS_A_CYCLE * reach))
+        steps.append(tried)
+        turned = np.exp(2j * np.pi * tried[:, None] * middles[axis])
+        found = found @ turned.T if axis else turned @ found
+    strength = np.abs(found) / len(disparity)
+    row, column = np.unravel_index(int(np.argmax(strength)), strength.shape)
+    frequency = whole + float(steps[1][row])
+    return frequency, -float(steps[0][column]) / frequency, float(strength[row, column]), float(strength.size)
+
+
+def _crowding(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> float:
+    return float(abs(np.exp(2j * np.pi * frequency * disparity / (1 + np.tan(tilt) * tangent)).mean()))
+
+
+def _refined(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> tuple[float, float]:
+    """Frequency and tilt at the top of the crowding."""
+    unit = 1 / float(np.ptp(disparity)), 1 / (frequency * max(float(np.ptp(disparity * tangent)), 1e-9))
+
+    def less(at: FloatArray) -> float:
+        return -_crowding(disparity, tangent, frequency + at[0] * unit[0], tilt + at[1] * unit[1])
+
+    top = minimize(less, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": [[0, 0], [0.1, 0], [0, 0.1]]}).x
+    return frequency + top[0] * unit[0], tilt + top[1] * unit[1]
 
 
 def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
@@ -109,14 +168,3 @@ def _plausible(shares: FloatArray, square: FloatArray, whole: float) -> int:
         if square.min() > decided().locking.fits or (shares[rows[0]] > _FAR and square[small] < _NO_SINE * whole):
             return small
     return int(rows[0])
-
-
-def _means(disparity: FloatArray, frequencies: FloatArray) -> NDArray[np.complex128]:
-    return np.array([np.exp(2j * np.pi * frequency * disparity).mean() for frequency in frequencies])
-
-
-def _refined(disparity: FloatArray, frequency: float, step: float) -> float:
-    for width in (step, step / 5, step / 25):
-        tried = frequency + np.linspace(-width, width, 11)
-        frequency = float(tried[int(np.argmax([abs(np.exp(2j * np.pi * each * disparity).mean()) for each in tried]))])
-    return frequency

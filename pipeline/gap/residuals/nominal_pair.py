@@ -18,7 +18,7 @@ from sensors.camera import Camera, CameraPair
 from sensors.device import rotated, vector
 from sensors.effects.base import Effect, Stage
 from sensors.rectify import Rectification, rectify
-from sensors.stereo import rectified_pixel
+from sensors.stereo import rectified_pixel, row_tangent
 
 _HIDDEN_SHARE = 2e-4
 """A point is hidden where another surface stands before it by this share of its distance."""
@@ -27,7 +27,8 @@ _HIDDEN_SHARE = 2e-4
 @dataclass(frozen=True)
 class PixelGeometry:
     """Per point: left pixel (u, v) and row in the right image (px), disparity of the reference and as found (px), point and unit
-    normal of the reference (n, 3), wall frame, m, and distances to the middles of both images (px)."""
+    normal of the reference (n, 3), wall frame, m, distances to the middles of both images (px), tangent of the angle between the
+    rectified row and axis, and the disparity of a point at infinity (px)."""
 
     u: FloatArray
     v: FloatArray
@@ -38,6 +39,8 @@ class PixelGeometry:
     normal: FloatArray
     radius: FloatArray
     radius_right: FloatArray
+    tangent: FloatArray
+    infinity: FloatArray
 
     def __len__(self) -> int:
         return len(self.u)
@@ -85,6 +88,13 @@ class NominalPair:
         """(n,) rectified column of pixels of the left image."""
         rect = self.geometry
         return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
+
+    def tangent(self, u: FloatArray, v: FloatArray) -> FloatArray:
+        """(n,) tangent of the angle between the rectified rows of pixels of the left image and the rectified axis."""
+        rect = self.geometry
+        pixel = on_device(mi.Float64, u), on_device(mi.Float64, v)
+        row = rectified_pixel(self.pair.left, rect.left, *pixel, rect.f, rect.u_left, rect.v)[1]
+        return _on_host(row_tangent(rect, row))[0]
 
     def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
         """(n,) rectified column of pixels of the right image."""

@@ -160,6 +160,8 @@ def _reference(
         normal=normal,
         radius=np.hypot(u - left.width / 2, v - left.height / 2),
         radius_right=np.hypot(right[0] - camera.width / 2, right[1] - camera.height / 2),
+        tangent=nominal.tangent(u, v),
+        infinity=np.full(len(u), nominal.geometry.offset),
     )
     return geometry, curvature, distance
 
