@@ -79,7 +79,7 @@ class StereoPair:
         left_u, left_v, disparity = rectified_disparity(nominal, geometry, (u, v), (right_u, right_v))
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
         size = nominal.left.width, nominal.left.height, REDUCTION[self.quality]
-        rows = row_tangent(geometry, left_v), geometry.offset
+        rows = row_tangent(geometry, left_v), float(geometry.offset)
         return Matches(index, u, v, disparity, matched, *seen, *size, *rows), left_u, left_v, point
 
     @property

@@ -35,7 +35,7 @@ from sensors.observation import Observation
 from sensors.rectified import Disparity, RectifiedGrid
 from sensors.rectify import Rectification, rectify
 from sensors.refinement import refine
-from sensors.stereo import REDUCTION, StereoPair, exposed, rectified_pixel, row_tangent, reproject, view
+from sensors.stereo import REDUCTION, StereoPair, exposed, rectified_pixel, reproject, row_tangent, view
 
 STEP_PX = 1.0
 """Difference of neighbouring disparities beyond which a cell between them takes the nearest one instead of a mean."""
@@ -81,7 +81,7 @@ class MatchedStereoPair:
         found = _sampled(disparity, *grid.cells(left_u, left_v))
         full_px = (mi.Float64(found) + grid.disparity_offset) * step
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
-        rows = row_tangent(geometry, left_v), geometry.offset
+        rows = row_tangent(geometry, left_v), float(geometry.offset)
         matches = Matches(index, u, v, full_px, ~dr.isnan(found), *seen, nominal.left.width, nominal.left.height, step, *rows)
         matches = apply_stage(effects, Stage.FILL, matches, random)
         camera_point = reproject(geometry, left_u, left_v, matches.disparity)

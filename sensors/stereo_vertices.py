@@ -51,9 +51,18 @@ def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) ->
     albedo = None if mesh.vertex_albedo is None else on_device(mi.Float32, mesh.vertex_albedo)
     block = mi.Int32(WALL) if mesh.vertex_block is None else on_device(mi.Int32, mesh.vertex_block)
     index, size = dr.arange(mi.UInt32, len(mesh.vertices)), (nominal.left.width, nominal.left.height, REDUCTION[pair.quality])
-    rows = row_tangent(geometry, left_v), geometry.offset
+    rows = row_tangent(geometry, left_v), float(geometry.offset)
     matches: Matches = VertexMatches(
-        index, u, v, disparity, in_left & in_right, block, depth, albedo, *size, *rows,
+        index,
+        u,
+        v,
+        disparity,
+        in_left & in_right,
+        block,
+        depth,
+        albedo,
+        *size,
+        *rows,
         _TracedCells(pair, scene, effects, random),
     )
     for stage in (Stage.MATCH, Stage.FILL):

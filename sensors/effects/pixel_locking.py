@@ -45,18 +45,19 @@ class PixelLocking(Effect):
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         amplitude, period, phase = opaque(self.amplitude_px, self.period_px or state.reduction, self.phase_rad)
-        matched = self._matched(state.disparity, state)
+        matched = state.disparity
+        if self.tilt_rad:
+            matched = _turned(matched, state.tangent, *opaque(state.infinity, math.tan(self.tilt_rad)))
         return replace(state, disparity=state.disparity + amplitude * _wave(matched / period, phase, DEVICE))
 
     def mean(self, at: Any) -> FloatArray:
-        matched = self._matched(at.found, at)
+        matched = _turned(at.found, at.tangent, at.infinity, math.tan(self.tilt_rad))
         return np.asarray(self.amplitude_px * _wave(matched / (self.period_px or 1.0), self.phase_rad, HOST))
 
-    def _matched(self, disparity: Any, at: Any) -> Any:
-        """Disparities of this rectification in the one that is turned: f B / Z' with Z' = Z (1 + tan w y), its scale in n."""
-        if not self.tilt_rad:
-            return disparity
-        return at.infinity + (disparity - at.infinity) / (1 + math.tan(self.tilt_rad) * at.tangent)
+
+def _turned(disparity: Any, tangent: Any, infinity: Any, turn: Any) -> Any:
+    """Disparities in a rectification that is turned about the base: f B / Z' with Z' = Z (1 + y tan w), its scale left to n."""
+    return infinity + (disparity - infinity) / (1 + turn * tangent)
 
 
 def _wave(pixels: Any, phase: Any, m: Functions) -> Any:

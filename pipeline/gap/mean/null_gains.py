@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +46,7 @@ class NullGains:
         """Twice what a family gains on average where there is nothing."""
         return 2 * float(self.gains[family].mean())
 
-    def p_value(self, score: float) -> float:
-        """Of the largest score over all families where there is nothing: (1 + b) / (1 + N)."""
-        scores = np.stack([gains - 2 * gains.mean() for gains in self.gains.values()])
+    def p_value(self, score: float, families: Iterable[str] | None = None) -> float:
+        """Of the largest score over all families, or some of them, where there is nothing: (1 + b) / (1 + N)."""
+        scores = np.stack([self.gains[name] - self.penalty(name) for name in families or self.gains])
         return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + DRAWS))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, Explanation, SineGrid, harmonics
+from pipeline.gap.mean.candidates import FOLDED, PLACE, REPEATED, Candidate, Explanation, SineGrid, harmonics
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
@@ -75,6 +75,16 @@ class MeanSearch:
     def p_value(self, score: float) -> float:
         """Of the largest score over all families where there is nothing."""
         return self._null.p_value(score)
+
+    def p_of_rest(self, tried: Sequence[Tried], of_places: bool = False) -> float | None:
+        """p-value of what is left beside some effects, by all that was tried there; None where nothing was.
+
+        Mere places count only by themselves (`of_places`): null draws are Gaussian processes, and a reference that is wrong by a
+        few waves only has single ones that are larger than any of those, slanting across the wall where no sensor has an axis.
+        """
+        scores = [item.score for item in tried if item.name.startswith(PLACE) == of_places]
+        families = [name for name in self.design.families.members if name.startswith(f"free {PLACE}") == of_places]
+        return self._null.p_value(max(scores), families) if scores else None
 
     def score(self, members: Members) -> float:
         """Of effects together, their periods at the top of the likelihood: the steps of the search cost a strong sine some."""

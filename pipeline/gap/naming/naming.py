@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
+from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import PLACE, REPEATED
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Chosen, Tried
@@ -24,7 +25,7 @@ from pipeline.gap.naming.entries import (
     within_bounds,
 )
 from pipeline.gap.naming.families import believes, families_of
-from pipeline.gap.naming.relinearised import SearchedPoints, at_points, beyond, followed_up, noisier, undone, weighed
+from pipeline.gap.naming.relinearised import Explained, SearchedPoints, at_points, beyond, followed_up, noisier, undone, weighed
 from pipeline.gap.other.locking import find_locking
 from pipeline.gap.other.quantization import find_comb
 from pipeline.gap.other.spread import SpreadFound, SpreadTried, find_spread, share_of_spread
@@ -145,10 +146,10 @@ def name_effects(
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
     share = 1.0 if spread else share_of_spread(found.at, design.cells, left, random)
-    notes = (*part.notes, *_words(left_out), *filter(None, [words]), *_repeats(found.estimates))
-    p_value = found.search.p_value(found.tried[0].score) if found.tried else None
+    notes = (*part.notes, *_words(left_out), *filter(None, [words]), *_repeats(found.estimates), *_slanting(found))
+    p_value = found.search.p_of_rest(found.tried)
     alone = first.tried(()) if moving else ()
-    p_alone = first.p_value(alone[0].score) if alone else p_value
+    p_alone = first.p_of_rest(alone) if alone else p_value
     names_moving = frozenset(each.name for each in moving)
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     tried = found.chosen[0].tried if found.chosen else found.tried
@@ -202,6 +203,17 @@ def _repeats(estimates: list[Estimate]) -> list[str]:
     """Words for forms that repeat after a few lines."""
     lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(REPEATED)]
     return [f"what is described repeats every {each} lines exactly: facets of a mirror or a read-out in blocks" for each in lines]
+
+
+def _slanting(found: Explained) -> list[str]:
+    """Words for waves across the wall that are larger than chance leaves, though no sensor has an axis there."""
+    p_value = found.search.p_of_rest(found.tried, of_places=True)
+    if p_value is None or p_value > decided().verdict.least_p:
+        return []
+    return [
+        f"the residuals vary slantwise across the wall more than a reference wrong by a Gaussian process would let them (p-value "
+        f"{p_value:.2g}): no sensor has an axis there, so this is taken for the reference's error"
+    ]
 
 
 def _spread(

@@ -52,8 +52,8 @@ def find_locking(
 ) -> Locking | None:
     """The locking that measured disparities (n,), px, show, if any: n |R|^2 is exponential where there is none (Rayleigh).
 
-    reference: (n,) disparities of the surface as known; what crowds there too, by more than chance, is its shape; tangent: (n,) of
-    the angle between a point's rectified row and the axis; infinity: disparity of a point at infinity.
+    reference: (n,) disparities of the surface as known; what crowds there too, by more than chance, is its shape; tangent: (n,)
+    of the angle between a point's rectified row and the axis; infinity: disparity of a point at infinity.
     """
     thin = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
     far = np.broadcast_to(infinity, disparity.shape)[thin]
@@ -97,9 +97,9 @@ def _strongest(disparity: FloatArray, tangent: FloatArray, whole: float, share: 
     highest = [share * whole, (1 + share) * _TILT_UNKNOWN * whole]
     bins = [int(np.clip(np.ceil(np.ptp(x) * f * _BINS_A_CYCLE), 4, _MOST_BINS)) for x, f in zip(axes, highest, strict=True)]
     edges = [np.linspace(x.min(), x.max() + 1e-9, n + 1) for x, n in zip(axes, bins, strict=True)]
-    table = np.histogram2d(*axes, bins=edges, weights=phasor.real)[0] + 1j * np.histogram2d(*axes, bins=edges, weights=phasor.imag)[0]
+    real, imaginary = (np.histogram2d(axes[0], axes[1], bins=edges, weights=part)[0] for part in (phasor.real, phasor.imag))
     middles, steps = [(edge[1:] + edge[:-1]) / 2 for edge in edges], []
-    found = table
+    found = real + 1j * imaginary
     for axis in (1, 0):
         reach = max(float(np.ptp(axes[axis])), 1e-9)
         tried = np.arange(-highest[axis], highest[axis], 1 / (_STEPS_A_CYCLE * reach))
