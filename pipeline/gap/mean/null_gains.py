@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +46,11 @@ class NullGains:
         """Twice what a family gains on average where there is nothing."""
         return 2 * float(self.gains[family].mean())
 
-    def p_value(self, score: float, families: Iterable[str] | None = None) -> float:
-        """Of the largest score over all families, or some of them, where there is nothing: (1 + b) / (1 + N)."""
-        scores = np.stack([self.gains[name] - self.penalty(name) for name in families or self.gains])
+    def p_value(self, score: float, larger: Mapping[str, float] | None = None) -> float:
+        """Of the largest score over all families where there is nothing: (1 + b) / (1 + N).
+
+        larger: those families alone, which gain so many times as much.
+        """
+        times = dict.fromkeys(self.gains, 1.0) if larger is None else larger
+        scores = np.stack([each * self.gains[name] - self.penalty(name) for name, each in times.items()])
         return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + DRAWS))

@@ -76,15 +76,28 @@ class MeanSearch:
         """Of the largest score over all families where there is nothing."""
         return self._null.p_value(score)
 
-    def p_of_rest(self, tried: Sequence[Tried], of_places: bool = False) -> float | None:
-        """p-value of what is left beside some effects, by all that was tried there; None where nothing was.
+    def p_of_rest(self, tried: Sequence[Tried]) -> float | None:
+        """p-value of what is left beside some effects, by all that was tried there but mere places; None where nothing was.
 
-        Mere places count only by themselves (`of_places`): null draws are Gaussian processes, and a reference that is wrong by a
-        few waves only has single ones that are larger than any of those, slanting across the wall where no sensor has an axis.
+        Null draws are wrong by a Gaussian process; a reference that is wrong by a few waves has larger single ones. How much larger
+        is seen slantwise across the wall, where no sensor has an axis, and so much more may all sines gain where there is nothing
+        (as in genomic control, Devlin & Roeder 1999).
         """
-        scores = [item.score for item in tried if item.name.startswith(PLACE) == of_places]
-        families = [name for name in self.design.families.members if name.startswith(f"free {PLACE}") == of_places]
-        return self._null.p_value(max(scores), families) if scores else None
+        scores = [item.score for item in tried if not item.name.startswith(PLACE)]
+        if not scores:
+            return None
+        slanting = [item for item in tried if item.name.startswith(PLACE) and item.candidate.wave is not None]
+        usual = sum(float(self._null.gains[item.candidate.family].mean()) for item in slanting)
+        larger = max(sum(item.gain for item in slanting) / usual, 1.0) if usual else 1.0
+        members = self.design.families.members
+        allowed = {name: larger if members[name][1] else 1.0 for name in members if not name.startswith(f"free {PLACE}")}
+        return self._null.p_value(max(scores), allowed)
+
+    def p_of_places(self, tried: Sequence[Tried]) -> float | None:
+        """The same of mere places."""
+        scores = [item.score for item in tried if item.name.startswith(PLACE)]
+        places = [name for name in self.design.families.members if name.startswith(f"free {PLACE}")]
+        return self._null.p_value(max(scores), dict.fromkeys(places, 1.0)) if scores else None
 
     def score(self, members: Members) -> float:
         """Of effects together, their periods at the top of the likelihood: the steps of the search cost a strong sine some."""

@@ -207,7 +207,7 @@ def _repeats(estimates: list[Estimate]) -> list[str]:
 
 def _slanting(found: Explained) -> list[str]:
     """Words for waves across the wall that are larger than chance leaves, though no sensor has an axis there."""
-    p_value = found.search.p_of_rest(found.tried, of_places=True)
+    p_value = found.search.p_of_places(found.tried)
     if p_value is None or p_value > decided().verdict.least_p:
         return []
     return [

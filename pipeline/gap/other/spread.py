@@ -143,13 +143,13 @@ def find_spread(
     candidates = [each for each in spread_candidates(residuals) if each.name not in left_out]
     if not candidates:
         return [], [], ""
-    weighed = residuals
+    weighed, predicted = residuals, residuals.sigma**2 * _expected_square(residuals, cells, random)
     for again in (True, False):
         # noisy points move a cell's plane, and with that what its quiet points show, unless they have the weight they deserve
         z = standardised(weighed, cells, value)
         kept = np.isfinite(z) & (np.abs(z) < decided().spread.clip * max(1.0, nmad(z, 0.0)))
-        squared = (z * weighed.sigma / residuals.sigma)[kept] ** 2
-        forms = [candidate.variance[kept] / residuals.sigma[kept, None] ** 2 for candidate in candidates]
+        squared = (z * weighed.sigma)[kept] ** 2 / predicted[kept]
+        forms = [candidate.variance[kept] / predicted[kept, None] for candidate in candidates]
         singles = [_Joint.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
         best = max(singles, key=lambda fit: fit.score)
         if again:
