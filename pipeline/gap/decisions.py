@@ -259,6 +259,13 @@ class ShapesDecisions(_Group):
     clear_sigmas: PositiveFloat = _by(
         3.0, "sigmas", "By which an effect at depth steps must move a point for it to bear witness.", _JUDGEMENT
     )
+    wide: PositiveFloat = _by(
+        2.0,
+        "ratio",
+        "How many times the predicted spread the residuals must have for outlines to be looked for beside the registration and "
+        "the spread that they leave, and by how many times they must lower it.",
+        _JUDGEMENT,
+    )
     clear_step: PositiveFloat = _by(
         1.3, "ratio", "How many times the least depth step it must be: what counts as one, matchers do not agree.", _JUDGEMENT
     )
@@ -374,7 +381,13 @@ class RejectionDecisions(_Group):
         0.5, "share", "Of a gap, if it is none of chance, that named effects must close to be the answer.", _JUDGEMENT, lt=1
     )
     gap_sigmas: PositiveFloat = _by(
-        2.0, "standard errors", "By which before may lie above the floor for the two to agree.", _JUDGEMENT
+        2.0, "standard errors", "By which after may differ from before for the two to agree.", _JUDGEMENT
+    )
+    floor_sigmas: PositiveFloat = _by(
+        2.6,
+        "standard errors",
+        "By which a score may lie above the floor for the two to agree: half a percent lies beyond by chance.",
+        _JUDGEMENT,
     )
 
 

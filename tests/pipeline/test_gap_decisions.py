@@ -55,8 +55,8 @@ def test_each_is_used_by_the_diagnosis(group: str, key: str) -> None:
 def test_what_is_called_within_decides_by_what_was_set() -> None:
     gap = Gap(before=0.0015, after=0.0015, floor=0.001, error=0.0, floor_error=0.0001, points=100)
     assert gap.above_floor
-    with deciding(read_decisions(["verdict.gap_sigmas=6"])):
-        assert decided().verdict.gap_sigmas == 6
+    with deciding(read_decisions(["verdict.floor_sigmas=6"])):
+        assert decided().verdict.floor_sigmas == 6
         assert not gap.above_floor
     assert gap.above_floor
 

@@ -79,9 +79,9 @@ class MeanSearch:
     def p_of_rest(self, tried: Sequence[Tried]) -> float | None:
         """p-value of what is left beside some effects, by all that was tried there but mere places; None where nothing was.
 
-        Null draws are wrong by a Gaussian process; a reference that is wrong by a few waves has larger single ones. How much larger
-        is seen slantwise across the wall, where no sensor has an axis, and so much more may all sines gain where there is nothing
-        (as in genomic control, Devlin & Roeder 1999).
+        Null draws are wrong by a Gaussian process; a reference that is wrong by a few waves has larger single ones. How much
+        larger is seen slantwise across the wall, where no sensor has an axis, and so much more may all sines gain where there is
+        nothing (as in genomic control, Devlin & Roeder 1999).
         """
         scores = [item.score for item in tried if not item.name.startswith(PLACE)]
         if not scores:

@@ -69,12 +69,12 @@ class Gap:
     @property
     def above_floor(self) -> bool:
         """Whether before lies above the floor by more than the uncertainty of that."""
-        return self.before - self.floor > decided().verdict.gap_sigmas * self.floor_error
+        return self.before - self.floor > decided().verdict.floor_sigmas * self.floor_error
 
     @property
     def left_open(self) -> bool:
         """Whether after lies above the floor by more than the uncertainty of that."""
-        return self.after - self.floor > decided().verdict.gap_sigmas * self.floor_error
+        return self.after - self.floor > decided().verdict.floor_sigmas * self.floor_error
 
     @property
     def uncertain(self) -> bool:

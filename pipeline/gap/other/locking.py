@@ -121,6 +121,8 @@ def _refined(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt:
     unit = 1 / float(np.ptp(disparity)), 1 / (frequency * max(float(np.ptp(disparity * tangent)), 1e-9))
 
     def less(at: FloatArray) -> float:
+        if np.abs(at).max() > 1:
+            return 0.0
         return -_crowding(disparity, tangent, frequency + at[0] * unit[0], tilt + at[1] * unit[1])
 
     top = minimize(less, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": [[0, 0], [0.1, 0], [0, 0.1]]}).x

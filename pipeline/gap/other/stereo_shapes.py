@@ -61,6 +61,11 @@ class _Witnesses:
         more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
         return np.where((moved == without) | self.held_out, 0.0, more)
 
+    @property
+    def times_predicted(self) -> float:
+        """How many predicted sigmas the residuals spread."""
+        return float(self.sigma[0] / self.residuals.sigma[0])
+
     def registered_with(self, effects: list[Effect]) -> _Witnesses:
         """With the registration and the spread that the residuals have where some effects are in the model."""
         moved = np.nan_to_num(self.raster.moved(effects, self.disparity))
@@ -73,7 +78,8 @@ class _Witnesses:
         moved = [self.raster.moved([*beside, each.effect], self.disparity) for each in found]
         least = decided().shapes.clear_sigmas * self.sigma
         clear = ~self.held_out & np.any([np.abs(each - without) > least for each in moved], axis=0)
-        gains = [float(log_density(self.rough, each, self.sigma)[clear].sum()) for each in moved]
+        settled = [self.registered_with([*beside, each.effect]) for each in found]
+        gains = [log_density(w.rough, each, w.sigma)[clear].sum() for w, each in zip(settled, moved, strict=True)]
         return found[int(np.argmax(gains))]
 
 
@@ -130,6 +136,12 @@ def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
     step, raster = witnesses.raster.step, witnesses.raster
     trials = [(radius, witnesses.gains(beside, _grown(radius, step))) for radius in _RADII]
     radius, gains = max(trials, key=lambda trial: float(trial[1].sum()))
+    if witnesses.times_predicted > decided().shapes.wide:
+        # outlines that grow far spoil the registration and the spread by which points would bear witness of them
+        settled = [(radius, witnesses.registered_with([*beside, _grown(radius, step)])) for radius in _RADII]
+        radius, there = min(settled, key=lambda each: each[1].times_predicted)
+        if there.times_predicted < witnesses.times_predicted / decided().shapes.wide:
+            gains = there.gains(beside, _grown(radius, step))
     gain = witnesses.blocks.tested(gains)
     if gain is None:
         return None
