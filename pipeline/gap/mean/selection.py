@@ -159,7 +159,8 @@ class Choice:
             chosen.append(Chosen(form.candidate, (), self.search.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.search.tried(members)
         best, chosen = self._beyond_places(best, scores)
-        if best.score <= max(empty.decoy, _weak(empty.free)):  # no effect of the catalogue says it as well
+        nearly = (1 - decided().mean.practical_share) * empty.decoy
+        if best.score <= max(nearly, _weak(empty.free)):  # no effect of the catalogue says it as well
             return [], empty.tried
         return chosen, best.tried
 
