@@ -26,7 +26,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks.gap_challenge.cases import Case, make, plan
+from benchmarks.gap_challenge.cases import SENSORS, STRATA, Case, make, plan
 from benchmarks.gap_challenge.score import score
 from benchmarks.gap_challenge.table import markdown
 
@@ -35,22 +35,34 @@ _CONTEXT = multiprocessing.get_context("spawn")
 
 
 def run(
-    count: int, seed: int, jobs: int, out: Path, *, small: bool = False, keep: bool = False, limit_s: float = TIME_LIMIT_S
+    count: int,
+    seed: int,
+    jobs: int,
+    out: Path,
+    *,
+    small: bool = False,
+    keep: bool = False,
+    limit_s: float = TIME_LIMIT_S,
+    stratum: str | None = None,
+    sensor: str | None = None,
 ) -> dict[str, Any]:
-    """Make what is missing, diagnose what has no answer, score. keep: leave the measurements and all that the command writes."""
+    """Make what is missing, diagnose what has no answer, score. keep: leave the measurements and all that the command writes;
+    stratum, sensor: those of the cases alone."""
     out.mkdir(parents=True, exist_ok=True)
-    cases = plan(count, seed, small)
-    _check_same(out / "challenge.json", {"cases": count, "seed": seed, "small": small})
+    every = plan(count, seed, small)
+    cases = [case for case in every if case.stratum == (stratum or case.stratum) and case.sensor == (sensor or case.sensor)]
+    chosen = {key: value for key, value in {"stratum": stratum, "sensor": sensor}.items() if value}
+    _check_same(out / "challenge.json", {"cases": count, "seed": seed, "small": small, **chosen})
     open_cases = [case for case in cases if not _answer(out, case).exists()]
     missing = [
         case for case in open_cases if not _truth(out, case).exists() or not (_folder(out, case) / "measurement.yaml").exists()
     ]
-    print(f"{count} cases, {len(missing)} to make, {len(open_cases)} to diagnose", flush=True)
+    print(f"{len(cases)} cases, {len(missing)} to make, {len(open_cases)} to diagnose", flush=True)
     if missing:
         with ProcessPoolExecutor(jobs, mp_context=_CONTEXT) as pool:
             list(pool.map(_make, [(case, _folder(out, case), _truth(out, case)) for case in missing]))
     _diagnose_all(open_cases, out, jobs, limit_s, keep)
-    found = {"settings": {"cases": count, "seed": seed, "small": small}, **score([_pair(out, case) for case in cases])}
+    found = {"settings": {"cases": count, "seed": seed, "small": small, **chosen}, **score([_pair(out, case) for case in cases])}
     (out / "results.json").write_text(json.dumps(found, indent=1))
     (out / "table.md").write_text(markdown(found))
     return found
@@ -196,9 +208,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--small", action="store_true", help="small cases, as in the test")
     parser.add_argument("--keep", action="store_true", help="keep the measurements and everything the command wrote")
+    parser.add_argument("--stratum", choices=STRATA, help="cases of this kind alone, such as none: without any effect")
+    parser.add_argument("--sensor", choices=SENSORS, help="cases of this sensor alone")
     parser.add_argument("--table", type=Path, help="write the table there too (docs/gap_challenge.md), and its figures beside it")
     arguments = parser.parse_args()
-    found = run(arguments.cases, arguments.seed, arguments.jobs, arguments.out, small=arguments.small, keep=arguments.keep)
+    found = run(
+        arguments.cases,
+        arguments.seed,
+        arguments.jobs,
+        arguments.out,
+        small=arguments.small,
+        keep=arguments.keep,
+        stratum=arguments.stratum,
+        sensor=arguments.sensor,
+    )
     if arguments.table:
         arguments.table.write_text(markdown(found))
         figures = {key: value for key, value in found.items() if key != "rows"}

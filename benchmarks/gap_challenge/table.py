@@ -52,7 +52,8 @@ def markdown(found: Json) -> str:
 
 def _command(settings: Json) -> str:
     words = f"python benchmarks/gap_challenge/run.py --cases {settings['cases']} --seed {settings['seed']}"
-    return f"From `{words}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table docs/gap_challenge.md`."
+    chosen = "".join(f" --{key} {settings[key]}" for key in ("stratum", "sensor") if key in settings)
+    return f"From `{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table docs/gap_challenge.md`."
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:

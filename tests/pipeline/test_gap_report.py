@@ -82,7 +82,7 @@ def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[Ga
     """As it was diagnosed, wherever that is written: of a gap 500 of its errors wide none, where 1000 are asked for."""
     found, measurement = few
     gap = Gap(before=0.006, after=0.001, floor=0.001, error=1e-5, floor_error=1e-5, points=100)
-    strict = read_decisions(["verdict.gap_sigmas=1000"])
+    strict = read_decisions(["verdict.gap_sigmas=1000", "verdict.floor_sigmas=1000"])
     assert report.to_dict(replace(found, gap=gap), measurement)["gap"]["closed"] == 1.0
     assert report.to_dict(replace(found, gap=gap, decisions=strict), measurement)["gap"]["closed"] is None
 
