@@ -171,6 +171,13 @@ class SpreadDecisions(_Group):
         6.0, "log-likelihood", "By which a free form must do better than the catalogue's best.", _DEVELOPMENT
     )
     free_gain: PositiveFloat = _by(15.0, "log-likelihood", "That a free form must gain over the named one.", _DEVELOPMENT)
+    free_share: PositiveFloat = _by(
+        0.15,
+        "share",
+        "Of the named one's gain: up to there a free form is a note. An even noise has 0.75 of the gain of a variance that grows "
+        "with a covariate, and half of that of a variance in one half of the wall.",
+        _JUDGEMENT,
+    )
     free_block_sigmas: PositiveFloat = _by(
         2.0, "scatter of the blocks' sums", "By which the blocks must prefer a free form.", _DEVELOPMENT
     )

@@ -179,9 +179,11 @@ def find_spread(
     needed = by.second_gain if free_score > best.score + ahead else by.least_gain
     agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    empirical = free_score > chosen.score + ahead and _blocks_prefer(squared, chosen.added(forms), free, block)
+    more = free_score > chosen.score + ahead and _blocks_prefer(squared, chosen.added(forms), free, block)
+    empirical = more and free_score > chosen.score + by.free_share * chosen.gain
+    words = f"the spread varies along {free_name} beyond that: no effect of the catalogue explains that part" if more else ""
     if empirical:
-        chosen = best
+        chosen, words = best, ""
     tried = sorted([*tried, SpreadTried(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
     margin = max(by.class_margin, by.class_share * chosen.gain)
     found = []
@@ -209,7 +211,7 @@ def find_spread(
                 candidate.variance @ theta,
             )
         )
-    return found, tried, ""
+    return found, tried, words
 
 
 def _shared_by_neighbours(excess: float, between: float, sigma: FloatArray) -> str:
