@@ -108,14 +108,16 @@ def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     plain = Explained(together, _estimates(first, together), first, points.part, together, tried)
     one = _largest_alone(points, first) if together else None
     if one is None:
-        return _beside(points, plain)
+        return _beside(points, plain) or plain
     by_itself = _beside(points, replace(plain, chosen=[one.chosen], estimates=[one.estimate]))
-    if len(by_itself.estimates) == 1:
+    if by_itself is not None and len(by_itself.estimates) == 1:
         return by_itself
-    found = [by_itself, _beside(points, plain)]
     there = searched_at_best_fit(points)
+    found = [_beside(points, plain) or plain]
+    if by_itself is not None:
+        found.insert(0, by_itself)
     if there is not None and there.chosen:
-        found.append(_beside(points, there))
+        found.append(_beside(points, there) or there)
     possible = [each for each in found if not beyond(points.measurement, each.estimates, each.at)]
     return min(possible, key=lambda each: each.complexity, default=plain)
 
@@ -230,14 +232,14 @@ def _converged(points: SearchedPoints, first: MeanSearch, alone: _Alone) -> _Alo
     return alone
 
 
-def _beside(points: SearchedPoints, chosen: Explained) -> Explained:
-    """With what a search finds beside the effects, unless they are beyond what can be."""
+def _beside(points: SearchedPoints, chosen: Explained) -> Explained | None:
+    """With what a search finds beside the effects; None where there are none, or where they are beyond what can be."""
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or beyond(points.measurement, chosen.estimates, chosen.at):
-        return chosen
+        return None
     again = _again(points, physical, chosen.search.gains_alone)
     if again is None:
-        return chosen
+        return None
     search, at, estimates, beside, tried = again
     return replace(chosen, estimates=estimates, search=search, at=at, beside=beside, tried=tried)
 
