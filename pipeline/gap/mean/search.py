@@ -65,7 +65,7 @@ class MeanSearch:
 
     def _with(self, candidates: list[Candidate]) -> Design:
         """The design with columns for all of them; kept, since the same sets are asked for again and again."""
-        key = tuple(candidate for candidate in candidates if candidate.wave is not None)
+        key = tuple(candidate for candidate in candidates if candidate not in self.design.place)
         if not key:
             return self.design
         if key not in self._holding:

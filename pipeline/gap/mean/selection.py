@@ -157,7 +157,7 @@ class Choice:
         if form is not None and not self.search.may_be_the_reference(members, form):
             chosen = [self.chosen(members, item, scores) for item in members]
             chosen.append(Chosen(form.candidate, (), self.search.p_value(form.score), form.gain, form.score, empty.tried))
-            return chosen, self.search.tried(members)
+            return chosen, self.search.tried((*members, form))
         best, chosen = self._beyond_places(best, scores)
         nearly = (1 - decided().mean.practical_share) * empty.decoy
         if best.score <= max(nearly, _weak(empty.free)):  # no effect of the catalogue says it as well
