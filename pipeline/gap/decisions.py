@@ -266,6 +266,12 @@ class ShapesDecisions(_Group):
     clear_sigmas: PositiveFloat = _by(
         3.0, "sigmas", "By which an effect at depth steps must move a point for it to bear witness.", _JUDGEMENT
     )
+    wider: PositiveFloat = _by(
+        1.5,
+        "ratio",
+        "How many times the least spread of all attempts, with and without such effects, one may leave to be the answer.",
+        _JUDGEMENT,
+    )
     wide: PositiveFloat = _by(
         2.0,
         "ratio",

@@ -125,7 +125,8 @@ def attempt(
 
     What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
     what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
-    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation.
+    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation, of those
+    that leave about as little spread: noise large enough takes the place of any effect.
     """
 
     def beside(found: Attempt) -> Attempt:
@@ -149,7 +150,8 @@ def attempt(
         smooth = Attempt.of(State.of(there, plain, held_points, [], untouched), random, left_out)
         if smooth.named:
             found.append(beside(smooth))
-    return min(found, key=lambda each: each.complexity)
+    widest = decided().shapes.wider * min(each.naming.spreads for each in found)
+    return min((each for each in found if each.naming.spreads <= widest), key=lambda each: each.complexity)
 
 
 def thinned_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import PLACE, REPEATED
@@ -54,7 +55,8 @@ class Naming:
     deviation of the reference.
 
     moving: names of the effects on the mean; p_value, p_alone: of what remains beside all of them, and without any; None where
-    nothing was tried; share: `share_of_spread`.
+    nothing was tried; share: `share_of_spread`; spreads: how many predicted sigmas the residuals spread beside the effects on the
+    mean.
     """
 
     tried: tuple[Tried, ...]
@@ -66,6 +68,7 @@ class Naming:
     notes: tuple[str, ...]
     identifiability: dict[str, Any]
     reference_sigma: float
+    spreads: float
 
     def p_beside(self, named: Sequence[Named]) -> float | None:
         """Of what remains beside those that were kept of the effects on the mean; None where that was not drawn."""
@@ -155,7 +158,8 @@ def name_effects(
     tried = found.chosen[0].tried if found.chosen else found.tried
     shown = tuple(item for item in tried if not item.name.startswith(PLACE))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
-    naming = Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma)
+    spreads = nmad(left / found.at.sigma, 0.0)
+    naming = Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma, spreads)
     angles = [each for each in moving if each.effect is AngleEmpirical]
     if angles and not believes(measurement, AngleEmpirical.tag()):
         return _with_angles(measurement, whole, angles, naming, random, left_out)
