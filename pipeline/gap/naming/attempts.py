@@ -125,8 +125,8 @@ def attempt(
 
     What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
     what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
-    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation, of those
-    that leave about as little spread: noise large enough takes the place of any effect.
+    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation,
+    of those attempts that leave about as little spread: noise, if it is large enough, takes the place of any effect.
     """
 
     def beside(found: Attempt) -> Attempt:
