@@ -37,6 +37,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detection.config import load_train_config
     from pipeline.detection.data import CocoFolder
+    from pipeline.detection.run import detector_folder
+    from pipeline.detection.weights import check_detector
     from pipeline.formats.atomic import check_place, empty_folder
     from pipeline.report.progress import shown_progress
 
@@ -50,6 +52,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     config = load_train_config(path, overrides)
     for split in ("train", "val"):
         CocoFolder(arguments.data_set / split).check_images()  # a mistake there should not wait for TensorFlow
+    if config.training.start is not None:
+        check_detector(detector_folder(config.training.start))
     load_keras(quiet=arguments.quiet)
     from pipeline.detection.training import train
 

@@ -98,6 +98,9 @@ class DetectorConfig(Config):
 class TrainingConfig(Config):
     """How the network learns."""
 
+    start: str | None = Field(
+        None, min_length=1, description="weights to begin with: a trained detector's folder, or default (null: random ones)"
+    )
     epochs: int = Field(350, ge=1, le=100_000, description="most passes over the training images")
     batch: int = Field(2, ge=1, le=1024, description="images per step")
     optimizer: Literal["adamw", "sgd"] = Field("adamw", description="sgd has a momentum of 0.9")

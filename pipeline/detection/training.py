@@ -17,6 +17,7 @@ from pipeline.detection.data import CocoFolder, batches
 from pipeline.detection.figures import write_loss_figure
 from pipeline.detection.model import LOSSES, MaskRCNN, total_loss
 from pipeline.detection.operating_point import set_operating_point
+from pipeline.detection.run import detector_folder
 from pipeline.detection.schedule import has_settled, learning_rate
 from pipeline.formats.atomic import write_json, writing
 from pipeline.formats.inside import inside
@@ -125,9 +126,12 @@ def _optimizer(config: TrainConfig) -> keras.optimizers.Optimizer:
 
 
 def _begun(out: Path, config: TrainConfig, model: MaskRCNN, *, resume: bool) -> History:
-    """The history in `out`, with model and optimizer as they were then; an empty one for a new training."""
+    """The history in `out`, with model and optimizer as they were then; an empty one for a new training, which takes up the
+    weights that its config names."""
     path = out / CHECKPOINT / _STATE
     if not os.path.lexists(path):
+        if config.training.start is not None:
+            weights.take_weights(model, detector_folder(config.training.start))
         return History()
     if not resume:
         raise InputError(

@@ -92,6 +92,12 @@ def load(folder: Path, *, image_px: int | None = None) -> Any:
 
     check_detector(folder)
     model = MaskRCNN(load_config(folder), image_px)
+    take_weights(model, folder)
+    return model
+
+
+def take_weights(model: Any, folder: Path) -> None:
+    """Give a MaskRCNN the weights of the detector in the folder; raises InputError where they are of another network."""
     path = folder / WEIGHTS
     try:
         load_weights(model, path)
@@ -99,4 +105,3 @@ def load(folder: Path, *, image_px: int | None = None) -> Any:
         problem = " ".join(str(error).split())[:200]
         remedy = f"use the {CONFIG} that was saved with the weights"
         raise InputError(f"does not fit the network ({problem})", where=str(path), remedy=remedy) from None
-    return model

@@ -163,6 +163,25 @@ def test_a_killed_training_goes_on_to_the_same_curve(data_set, tmp_path, eager):
     assert np.isfinite(again.predict_on_batch({"image": image})["boxes"]).all()
 
 
+@pytest.mark.slow
+def test_a_training_starts_from_the_weights_that_its_config_names(data_set, tmp_path, eager):
+    """At a learning rate of next to nothing it ends with them."""
+    begun = MaskRCNN(SMALL, seed=7)
+    weights.save(begun, tmp_path / "begun")
+    still = {"batch": 2, "warm_up_steps": 0, "epochs": 1, "learning_rate": 1e-9}
+    config = TrainConfig(detector=SMALL, training=TrainingConfig(start=str(tmp_path / "begun"), **still))
+    train(data_set, config, tmp_path / "went_on")
+    for one, other in zip(begun.weights, weights.load(tmp_path / "went_on" / "best").weights, strict=True):
+        assert_allclose(one, other, atol=1e-7)
+
+
+def test_a_training_does_not_start_from_another_network(data_set, tmp_path):
+    weights.save(MaskRCNN(SMALL.model_copy(update={"pyramid_channels": 40})), tmp_path / "begun")
+    config = TrainConfig(detector=SMALL, training=TrainingConfig(start=str(tmp_path / "begun")))
+    with pytest.raises(InputError, match="does not fit"):
+        train(data_set, config, tmp_path / "out")
+
+
 class _KilledAfter:
     """A progress that interrupts in the middle of an epoch, as Ctrl-C does."""
 
