@@ -80,6 +80,7 @@ RESOLVED = (
     "scarpsim train sets/small --out detector",
     "scarpsim train sets/small --config configs/detectors/fine.yaml --out detector",
     "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.epochs=24 --out detector",
+    "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.start=default --out further",
 )
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
