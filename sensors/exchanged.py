@@ -87,6 +87,10 @@ class _ExchangedEffect:
     def order(self) -> int:
         return self.effect.order
 
+    @property
+    def is_null(self) -> bool:
+        return self.effect.is_null
+
     def apply(self, state: Any, random: KeyedRandom) -> Any:
         if self.stage == Stage.CAMERA:
             return self.effect.apply(state.exchanged(), random).exchanged()

@@ -49,12 +49,12 @@ from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.other.spread import spread_candidates
 from pipeline.cli.json_schema import json_schema
 from scene.keyed_random import KeyedRandom
-from sensors.effects import TLS_EFFECTS
+from sensors.effects import TLS_EFFECTS, catalogue
 from sensors.model import TlsModel
 from sensors.pulses import PulseGeometry
 
 at = PulseGeometry(*np.random.default_rng(1).uniform(0.4, 0.9, (9, 50)))
-residuals = SimpleNamespace(sensor="tls", geometry=at)
+residuals = SimpleNamespace(sensor="tls", geometry=at, candidates=catalogue("tls"))
 toy = next(each for each in mean_families(residuals, None) if each.name == "range_warm_up")
 shimmer = next(each for each in spread_candidates(residuals) if each.name == "range_shimmer")
 model = TlsModel(noise={"range_sigma_m": 0, "angle_sigma_rad": 0}, effects=[{"name": "range_shimmer", "sigma_per_m": 2e-3}])

@@ -51,7 +51,9 @@ class PixelLocking(Effect):
         return replace(state, disparity=state.disparity + amplitude * _wave(matched / period, phase, DEVICE))
 
     def mean(self, at: Any) -> FloatArray:
-        matched = _turned(at.found, at.tangent, at.infinity, math.tan(self.tilt_rad))
+        matched = at.found
+        if self.tilt_rad:
+            matched = _turned(matched, at.tangent, at.infinity, math.tan(self.tilt_rad))
         return np.asarray(self.amplitude_px * _wave(matched / (self.period_px or 1.0), self.phase_rad, HOST))
 
 

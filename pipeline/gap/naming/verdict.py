@@ -69,11 +69,17 @@ class Evidence:
         """Whether the gap with the named effects is above the floor, and most of what it was, by more than its uncertainty; or no
         smaller than without them while more remains than chance would leave."""
         gap = self.gap
-        by = decided().verdict
         if gap is not None and gap.after > gap.before and self.rejects:
             return True
-        if gap is None or gap.closed is None or not gap.left_open:
-            return False
+        return gap is not None and gap.closed is not None and gap.left_open and self.closes_little
+
+    @property
+    def closes_little(self) -> bool:
+        """Whether the gap with the named effects is most of what it was, by more than its uncertainty, or not known at all."""
+        gap = self.gap
+        by = decided().verdict
+        if gap is None or gap.closed is None:
+            return True
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
     def only_too_noisy(self, named: Sequence[Named]) -> bool:

@@ -169,7 +169,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
 
 def _with_moved(evidence: Evidence, there: Measurement, state: State, shown: Shown) -> Evidence:
     """With the share of the wall that moved, where that may be why nothing was named that closes the gap."""
-    if verdict_of(shown.named, evidence) != "unknown" or (shown.named and not evidence.stays_open):
+    if verdict_of(shown.named, evidence) != "unknown" or (shown.named and not evidence.closes_little):
         return evidence
     after = replace(state.residuals, value=shown.value)
     return replace(evidence, moved=moved_share(after, Sight.of(there, after), state.fit))
