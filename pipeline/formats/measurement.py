@@ -31,6 +31,7 @@ from pipeline.formats.measurement_checks import (
 from pipeline.formats.measurement_config import MeasurementConfig, ScanPattern
 from pipeline.formats.point_cloud import SCAN, PointCloud, joined
 from pipeline.formats.points import read_points
+from pipeline.formats.reference_points import ReferencePoints
 from pipeline.formats.rounded_points import check_rounded_points
 from pipeline.formats.scanner_poses import Face, Pose, Scanned, ScannerPose, set_ups
 from pipeline.formats.surface_datum import told_datum
@@ -42,7 +43,7 @@ from scene.errors import InputError
 from scene.frame import WallFrame
 from scene.imported import read_reference
 from scene.mesh import FloatArray, TriangleMesh
-from scene.plane_normals import plane_normals
+from scene.point_planes import PointPlanes
 from scene.raycast import RayCaster
 from scene.winding import check_near, facing
 from sensors.camera import Camera, CameraPair
@@ -137,8 +138,9 @@ class TlsMeasurement(MeasurementBase):
     station: scanner to wall frame, of the first scan where there are several; face: in which it was scanned; scans: of several,
     whose numbers are the points' channel `scan`, empty where there is one; pattern: the nominal directions, None where not known;
     pulses: (m,) those of the pattern that the points are a part of, None for all of them; order: each point's scan line and share
-    of the scan's duration (n,), None where not known, once they were counted (see `with_order`); normals: (v, 3) at the
-    reference's vertices, to which rays are inclined, None where it is to its triangles.
+    of the scan's duration (n,), None where not known, once they were counted (see `with_order`); planes: through the
+    reference's vertices, to which rays are inclined, None where they are to its triangles; reference_error_m: standard deviation
+    of each vertex along the rays.
     """
 
     sensor = "tls"
@@ -149,7 +151,8 @@ class TlsMeasurement(MeasurementBase):
     pattern: ScanPattern | None = None
     pulses: NDArray[np.bool_] | None = None
     order: tuple[FloatArray | None, FloatArray | None] | None = None
-    normals: FloatArray | None = None
+    planes: PointPlanes | None = None
+    reference_error_m: float = 0.0
 
     @property
     def viewpoint(self) -> FloatArray:
@@ -370,10 +373,11 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
         Scanned(_to_wall(each, frame), each.face, number)
         for each, number in zip(config.scanners, set_ups(config.scanners), strict=True)
     )
-    normals = plane_normals(shared["reference"].vertices) if config.incidence == "planes" else None
-    return TlsMeasurement(
-        model=material.model, station=_to_wall(pose, frame), scans=scans, pattern=config.pattern, normals=normals, **shared
-    )
+    station, vertices = _to_wall(pose, frame), shared["reference"].vertices
+    points = ReferencePoints.of(config, vertices, station[0], material.model.noise.range_sigma_m)
+    known: dict[str, Any] = {"planes": points.planes, "reference_error_m": points.error_m}
+    known["notes"] = (*shared.pop("notes"), *points.words)
+    return TlsMeasurement(model=material.model, station=station, scans=scans, pattern=config.pattern, **known, **shared)
 
 
 def _to_wall(pose: ScannerPose, frame: WallFrame) -> Pose:

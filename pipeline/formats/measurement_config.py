@@ -79,8 +79,17 @@ class MeasurementConfig(Config):
         (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]"
     )
     model: Path = Field(description="what the simulation believes about the sensor today")
-    incidence: Literal["triangles", "planes"] = Field(
-        "triangles", description="what rays are inclined to: the triangle hit, or a plane through 24 vertices around it (tls)"
+    incidence: Literal["triangles", "planes"] | None = Field(
+        None,
+        description="what rays are inclined to: the triangle hit, or a plane through 24 vertices around it (tls); none: planes "
+        "where the vertices have noise of their own, as a scan's points have",
+    )
+    reference_error_m: float | None = Field(
+        None,
+        ge=0,
+        le=10,
+        description="standard deviation, along the rays, of the reference's vertices, each with an error of its own [m] (tls); "
+        "none: 0, or what they show where `incidence` is not stated either",
     )
     notes: tuple[str, ...] = Field(
         (), description="what the report should say of the measurement, such as what a reference cannot show"
@@ -97,8 +106,9 @@ class MeasurementConfig(Config):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        if self.sensor == "stereo" and self.incidence != "triangles":
-            raise ValueError("'incidence: planes' is of laser scans; leave it out")
+        for name in ("incidence", "reference_error_m"):
+            if self.sensor == "stereo" and getattr(self, name) is not None:
+                raise ValueError(f"'{name}' is of laser scans; leave it out")
         files = [self.points] if isinstance(self.points, Path) else self.points
         if self.scanners and len(self.scanners) != len(files):
             raise ValueError(f"'scanners' has {len(self.scanners)} poses for {len(files)} files of points; give one for each")

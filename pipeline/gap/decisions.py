@@ -42,6 +42,12 @@ class PointsDecisions(_Group):
     outlier: PositiveFloat = _by(
         5.0, "predicted sigmas, times what the residuals spread of them", "Beyond which a point has no say.", _JUDGEMENT
     )
+    scattered: PositiveFloat = _by(
+        2.0,
+        "times the typical scatter about planes of 24 points, along the ray",
+        "Of a reference made of points: beyond which edges and thin things lie between them, and points have no say.",
+        "beyond it lie the tenth of a workshop's points, and the twelfth of a forest's ground, with most of the far ones",
+    )
     unregistered: PositiveFloat = _by(3.5, "sigmas", "Beyond which a point has no say in the registration.", _JUDGEMENT)
     kept: PositiveFloat = _by(
         0.9, "share", "Of the points whose rays must still meet the reference with an effect in the model.", _JUDGEMENT, le=1

@@ -47,7 +47,7 @@ def build(request: Request, out: Path) -> Understood:
         scans = [scans[0].part(reference.rows), *scans[1:]]
         stations = [_part(stations[0], reference.rows), *stations[1:]]
     scans, stations, echo_words = _single_echoes(scans, stations)
-    model, noise_words = _with_known_errors(model, scans[0], station, reference)
+    model, noise_words = _with_rounding(model, scans[0], station)
     about = {
         "scan": tuple(f"{scan.name}: {len(scan.cloud.points):,} points{_said(scan)}" for scan in scans) + echo_words,
         "scanner": station.words + _of_others(scans, stations),
@@ -59,7 +59,7 @@ def build(request: Request, out: Path) -> Understood:
     if "scanner" in keys and station.pattern is not None and request.reference != HALF and not echo_words:
         keys["pattern"] = station.pattern
     if reference.of_points:
-        keys["incidence"] = "planes"
+        keys |= {"incidence": "planes", "reference_error_m": float(f"{reference.error_m:.3g}")}
     clouds = [_for_file(scan, each) for scan, each in zip(scans, stations, strict=True)]
     content = Content("tls", clouds, reference.mesh, model, _eye(station), ", ".join(scan.name for scan in scans), keys=keys)
     found = Understood(out, about)
@@ -181,19 +181,14 @@ def _model(request: Request) -> tuple[TlsModel, tuple[str, ...]]:
     return preset.model(), (f"of the preset {preset.name}: what its data sheet states, what it does not state by default",)
 
 
-def _with_known_errors(
-    model: TlsModel, scan: RawScan, station: Station, reference: Reference
-) -> tuple[TlsModel, tuple[str, ...]]:
-    """The model with the errors that the files themselves are known to have, in its white noise of the range."""
-    rounding = _rounding_m(scan.cloud.points, station.position)
-    more = {"the reference's error": reference.error_m, "the rounding of the coordinates": rounding}
-    more = {name: value for name, value in more.items() if value > 0.1 * model.noise.range_sigma_m}
-    if not more:
-        return model, (f"range noise {1e3 * model.noise.range_sigma_m:.3g} mm",)
-    total = float(np.sqrt(model.noise.range_sigma_m**2 + sum(value**2 for value in more.values())))
-    parts = ", ".join(f"{1e3 * value:.2g} mm of {name}" for name, value in more.items())
-    words = f"range noise {1e3 * total:.3g} mm: {1e3 * model.noise.range_sigma_m:.3g} mm of the instrument and {parts}"
-    return replace_noise(model, total), (words,)
+def _with_rounding(model: TlsModel, scan: RawScan, station: Station) -> tuple[TlsModel, tuple[str, ...]]:
+    """The model with what rounding did to the coordinates in its white noise of the range."""
+    own, rounding = model.noise.range_sigma_m, _rounding_m(scan.cloud.points, station.position)
+    if rounding <= 0.1 * own:
+        return model, (f"range noise {1e3 * own:.3g} mm",)
+    total = float(np.hypot(own, rounding))
+    parts = f"{1e3 * own:.3g} mm of the instrument and {1e3 * rounding:.2g} mm of the rounding of the coordinates"
+    return replace_noise(model, total), (f"range noise {1e3 * total:.3g} mm: {parts}",)
 
 
 def replace_noise(model: TlsModel, sigma_m: float) -> TlsModel:

@@ -14,7 +14,7 @@ from pipeline.formats.points import SUFFIXES
 from pipeline.formats.scan_geometry import ScanGeometry
 from pipeline.measurement.scans import METRES, RawScan, read_scans
 from pipeline.measurement.station import Station
-from pipeline.measurement.triangulation import BETWEEN, SeenSurface, triangulated
+from pipeline.measurement.triangulation import SeenSurface, triangulated
 from scene.errors import InputError
 from scene.imported import read_mesh
 from scene.mesh import FloatArray, TriangleMesh
@@ -24,11 +24,15 @@ HALF = "half"
 DEMS = (".tif", ".tiff")
 _MUCH_FINER = 0.6
 """Pulses that lie so much closer along a line than lines do are halved instead of the lines."""
+_FEWEST_CHORDS = 100
+_TWICE_AS_LONG, _LEAST_NOISE = 16.0, 0.1
+"""Times the variance of smooth relief about chords that are twice as long, and share of a variance that is noise in any case."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The surface as known, points' frame, m, with its standard error (0: taken as exact) and what is to be said of it.
+    """The surface as known, points' frame, m, with the standard error of its vertices along the rays (0: taken as exact) and what
+    is to be said of it.
 
     rows: (k,) the points of the scan that are compared with it, None for all; of_points: made of a cloud, so that its triangles
     lean by noise and relief between points.
@@ -111,24 +115,39 @@ def half_of(scan: RawScan, station: Station) -> Reference:
     noise = None if station.geometry is None else _noise_along_lines(station.geometry, even)
     if noise is None or surface.smoothed:
         return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, np.flatnonzero(~even), of_points=True)
-    told = f"along its lines points scatter by {1e3 * noise:.2g} mm: {1e3 * noise * BETWEEN:.2g} mm are carried as its error"
-    return Reference(surface.mesh, float(noise * BETWEEN), (said, told), limits, np.flatnonzero(~even), of_points=True)
+    told = f"along its lines points scatter by {1e3 * noise:.2g} mm, which is carried as their error"
+    return Reference(surface.mesh, noise, (said, told), limits, np.flatnonzero(~even), of_points=True)
 
 
 def _noise_along_lines(geometry: ScanGeometry, rows: NDArray[np.bool_]) -> float | None:
     """Robust standard deviation of a range, m, about the chord of its neighbours in a line; None without any.
 
-    Neighbours at r1 and r3, an angle t to either side, put the one between them at 2 r1 r3 cos t / (r1 + r3). Relief between
-    neighbours counts as noise, steps of depth do not.
+    Chords twice as long are as noisy, and four times as far from relief that is smooth over them: what they scatter more is taken
+    off. Relief as rough as noise counts as such, steps of depth do not.
     """
     line, pulse, distance = geometry.line[rows], geometry.pulse[rows], geometry.range_m[rows]
     order = np.lexsort((pulse, line))
     line, pulse, distance = line[order], pulse[order], distance[order]
-    step = np.diff(pulse)
-    together = (line[2:] == line[:-2]) & (step[1:] == step[:-1]) & (step[1:] > 0) & (step[1:] <= 2)
-    chord = 2 * distance[2:] * distance[:-2] * np.cos(step[1:] * geometry.pulses.step) / (distance[2:] + distance[:-2])
-    off = (distance[1:-1] - chord)[together]
-    return float(1.4826 * np.median(np.abs(off)) / np.sqrt(1.5)) if len(off) > 100 else None
+    near, far = (_variance_about_chords(line, pulse, distance, lag, geometry.pulses.step) for lag in (1, 2))
+    if near is None:
+        return None
+    relief = 0.0 if far is None else max(far - near, 0.0) / (_TWICE_AS_LONG - 1)
+    return float(np.sqrt(max(near - relief, _LEAST_NOISE * near)))
+
+
+def _variance_about_chords(
+    line: NDArray[Any], pulse: NDArray[Any], distance: FloatArray, lag: int, step_rad: float
+) -> float | None:
+    """Of a range, m2, in lines in order, about the chord of those `lag` places before and after it; None where there are few.
+
+    Neighbours at r1 and r3, an angle t to either side, put the one between them at 2 r1 r3 cos t / (r1 + r3).
+    """
+    first, middle, last = (slice(start, len(line) - 2 * lag + start) for start in (0, lag, 2 * lag))
+    before, after = pulse[middle] - pulse[first], pulse[last] - pulse[middle]
+    together = (line[last] == line[first]) & (before == after) & (before > 0) & (before <= 2 * lag)
+    ends = distance[last] + distance[first]
+    off = (distance[middle] - 2 * distance[last] * distance[first] * np.cos(after * step_rad) / ends)[together]
+    return float((1.4826 * np.median(np.abs(off))) ** 2 / 1.5) if len(off) > _FEWEST_CHORDS else None
 
 
 def _halves(scan: RawScan, station: Station) -> tuple[NDArray[np.bool_], str]:
@@ -144,5 +163,5 @@ def _of_noise(surface: SeenSurface) -> str:
     smoothed = ", vertices averaged with their neighbours as the coordinates are rounded" if surface.smoothed else ""
     return (
         f"its points scatter by {1e3 * surface.roughness_m:.2g} mm about their neighbours, {1e3 * surface.spacing_m:.2g} mm away "
-        f"(noise and relief){smoothed}: {1e3 * surface.error_m:.2g} mm are carried as its error"
+        f"(noise and relief){smoothed}: {1e3 * surface.error_m:.2g} mm are carried as the error of each"
     )

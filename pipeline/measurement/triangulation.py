@@ -25,7 +25,7 @@ _LONGEST = 6.0
 _MOST_POINTS = 2_000_000
 _COARSE_M = 5e-3
 """Rounding to larger steps tilts triangles: their vertices are averaged."""
-BETWEEN, _OF_SEVEN = np.sqrt(1 / 2), np.sqrt(1 / 7)
+_BETWEEN, _OF_SEVEN = np.sqrt(1 / 2), np.sqrt(1 / 7)
 """Noise in the middle between two vertices, in that of one; and of a mean of a point and its six neighbours."""
 
 
@@ -42,8 +42,9 @@ class SeenSurface:
 
     @property
     def error_m(self) -> float:
-        """Standard deviation of the surface between its vertices, as far as its own points tell."""
-        return float(np.nan_to_num((_OF_SEVEN if self.smoothed else BETWEEN) * self.roughness_m))
+        """Standard deviation of its vertices along the rays, as far as they tell; of averaged ones, which share their points,
+        that of vertices that do not share any and leave the surface between them as noisy."""
+        return float(np.nan_to_num((_OF_SEVEN / _BETWEEN if self.smoothed else 1.0) * self.roughness_m))
 
 
 def triangulated(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray, where: str) -> SeenSurface:

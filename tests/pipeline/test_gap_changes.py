@@ -17,8 +17,9 @@ from pipeline.formats.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import summary, to_dict
 from pipeline.gap.residuals.changes import SceneChange, find_changes
+from pipeline.gap.residuals.rays import RayGeometry
 from pipeline.gap.residuals.sight import Sight
-from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 
 STEPS = [4e-3, 2e-3, 1e-3]
 """20,000, 80,000 and 325,000 points."""

@@ -11,12 +11,13 @@ import yaml
 from pipeline.formats.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.measurement_config import MeasurementConfig
 from pipeline.gap.naming.workflow import diagnose
+from pipeline.gap.residuals.rays import RayGeometry
 from pipeline.gap.residuals.scan_simulation import simulated_ranges
-from pipeline.gap.residuals.tls_residuals import RayGeometry, tls_residuals
+from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.measurement.build import Request, build
 from scene.config import parse
 from scene.errors import InputError
-from scene.plane_normals import plane_normals
+from scene.point_planes import PointPlanes
 from sensors.effects.range_incidence_bias import RangeIncidenceBias
 
 HEIGHT_M = 1.7
@@ -62,7 +63,7 @@ def slant_error(geometry: RayGeometry) -> np.ndarray:
 
 
 def test_planes_tell_the_incidence_where_triangles_lean(level: TlsMeasurement) -> None:
-    planes, triangles = (np.std(slant_error(tls_residuals(each).geometry)) for each in (level, level.changed(normals=None)))
+    planes, triangles = (np.std(slant_error(tls_residuals(each).geometry)) for each in (level, level.changed(planes=None)))
     assert triangles > 0.15, "corners 15 mm apart, with noise of 2.5 mm"
     assert planes < triangles / 5
 
@@ -97,7 +98,7 @@ def test_references_of_points_ask_for_planes_others_do_not(tmp_path: Path) -> No
     build(Request([path], str(mesh), "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "meshed")
     measurement = read_measurement(tmp_path / "meshed")
     assert isinstance(measurement, TlsMeasurement)
-    assert measurement.normals is None
+    assert measurement.planes is None
 
 
 def test_planes_are_not_asked_for_where_nothing_looks_at_them() -> None:
@@ -110,6 +111,6 @@ def test_normals_of_a_sphere_point_to_its_middle() -> None:
     """24 neighbours of 20,000 points on a sphere span 0.06 rad; the plane through them leans by a part of that."""
     vectors = np.random.default_rng(3).standard_normal((20_000, 3))
     radial = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    cosine = np.abs(np.einsum("ni,ni->n", plane_normals(5 * radial), radial))
+    cosine = np.abs(np.einsum("ni,ni->n", PointPlanes.of(5 * radial, np.zeros(3)).normal, radial))
     assert np.degrees(np.arccos(np.clip(cosine, 0, 1))).max() < 3
-    np.testing.assert_allclose(np.linalg.norm(plane_normals(radial[:10]), axis=1), 1, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(PointPlanes.of(radial[:10], np.zeros(3)).normal, axis=1), 1, rtol=1e-12)

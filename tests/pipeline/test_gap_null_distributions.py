@@ -19,9 +19,10 @@ from pipeline.gap.other.stereo_noise import _variogram
 from pipeline.gap.residuals import cells
 from pipeline.gap.residuals.cells import block_numbers
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
+from pipeline.gap.residuals.rays import RayGeometry
 from pipeline.gap.residuals.shared_noise import SharedNoise
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise

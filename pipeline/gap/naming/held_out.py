@@ -45,12 +45,14 @@ def score_effects(
     if not scored or (~trained).sum() < 100:
         return Scored(named, [], [])
     whole = _value(measurement, named, residuals, trained)
+    shared = float(np.mean(residuals.averaged.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
+    patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
 
     def gains(out: list[Named]) -> tuple[float, float]:
         """Of some effects on the points that are scored, and what those that were trained let expect of them."""
         without = _value(measurement, [each for each in named if each not in out], residuals, trained)
         known = np.isfinite(whole.value) & np.isfinite(without.value)
-        tested, learned = (_gain(whole, without, known & rows, residuals.at, reference_sigma) for rows in (~trained, trained))
+        tested, learned = (_gain(whole, without, known & rows, residuals.at, patch_sigma) for rows in (~trained, trained))
         return tested, learned * float(np.sum(known & ~trained)) / max(float(np.sum(known & trained)), 1.0)
 
     found = {item.name: gains([item]) for item in scored}

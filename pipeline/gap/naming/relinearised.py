@@ -82,6 +82,7 @@ class _Alone:
         if beyond(points.measurement, [estimate], points.part):
             return None
         there, found, _ = _with(points, [estimate])
+        found = found.part(np.isin(found.index, points.part.index))
         rough, _, scale = registered(found)
         largest = decided().points.outlier * scale * found.sigma
         value, kept = np.zeros(len(points.part)), _kept(found, points.part)
@@ -263,7 +264,8 @@ def noisier(part: Residuals, variance: float) -> Residuals:
 
 
 def weighed(part: Residuals, spread: list[SpreadFound], scale: float) -> Residuals:
-    """With the spread that the points really have."""
+    """With the spread that the points really have, as it counts for means of neighbours."""
+    part = part.averaged
     if not spread:
         return replace(part, sigma=part.sigma * scale)
     made = (effect_of(each.effect)(**each.parameters) for each in spread if each.parameters)

@@ -131,7 +131,10 @@ def closing(gap: Gap, mended: bool) -> str:
 
 
 def lower_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float]:
-    """The noise that a model would need for the residuals' spread, all of it lowered alike; empty where it fits."""
+    """The noise that a model would need for the residuals' spread, all of it lowered alike; empty where it fits.
+
+    spread: share of the model's own standard deviation.
+    """
     if spread >= 1.0:
         return {}
     values = model.noise.model_dump(include=set(_NOISES))

@@ -220,6 +220,8 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
 def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
     stood = measurement.moved(version.pose)
     draws = np.stack([simulated(stood, version.model, residuals, random.child(number)) for number in range(_DRAWS)])
+    if isinstance(residuals, TlsResiduals):
+        return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_DRAWS)])
     # a cloud without cameras has no place from which to simulate it: its datum counts by its slopes
     return draws + residuals.pose @ version.pose if isinstance(residuals, SurfaceResiduals) else draws
 

@@ -49,6 +49,8 @@ from sensors.model import StereoModel, TlsModel
 STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
 """The steps of `diagnose` and about what each takes, s."""
 _USUAL = Decisions()
+_LEAST_SHARE = 0.1
+"""Of its standard deviation that a model keeps where the reference's error explains all of the spread."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         reference_sigma=naming.reference_sigma,
         largest=decided().points.outlier * state.scale,
         random=random,
-        lower=lower_noise(there.model, naming.share),
+        lower=lower_noise(there.model, _of_model(naming.share, plain)),
     )
     shown, harmful = showing.show(held.named)
     notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *held.words, *harmful]
@@ -165,6 +167,15 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         timings=clock.laps,
         decisions=decided(),
     )
+
+
+def _of_model(share: float, residuals: Residuals) -> float:
+    """A share of the predicted standard deviation as one of the model's, whose part is what the reference's error leaves."""
+    if not isinstance(residuals, TlsResiduals) or not residuals.reference_error_m:
+        return share
+    whole, reference = float(np.median(residuals.sigma**2)), float(np.median(residuals.reference_variance))
+    own = max(whole - reference, _LEAST_SHARE**2 * whole)
+    return float(np.sqrt(max(share**2 * whole - reference, _LEAST_SHARE**2 * own) / own))
 
 
 def _with_moved(evidence: Evidence, there: Measurement, state: State, shown: Shown) -> Evidence:

@@ -85,8 +85,8 @@ def _bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: s
 def sigma_after(found: GapDiagnosis) -> FloatArray:
     """(n,) spread that the model with the named effects predicts, in the observable's unit."""
     match found.model_after, found.residuals:
-        case TlsModel() as model, TlsResiduals(geometry=rays):
-            return np.asarray(np.sqrt(model.variance(rays)))
+        case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
+            return np.asarray(np.sqrt(model.variance(rays) + ranges.reference_variance))
         case StereoModel() as model, SurfaceResiduals() as surface:
             return sigma_of(model, surface)
         case StereoModel() as model, residuals:

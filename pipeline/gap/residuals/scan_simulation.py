@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.formats.measurement import TlsMeasurement
+from pipeline.gap.residuals.rays import RayGeometry
 from scene.backend import dr, mi
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -26,11 +27,12 @@ class DirectedScanner(LaserScanner):
     """A scanner whose pulses leave in the directions of `geometry`, one after another.
 
     Recorded powers, where there are any, take the place of those that the albedo of the reference would give; inclined: so do
-    the geometry's angles of incidence of those to the triangles.
+    the geometry's angles of incidence of those to the triangles; bulge: (n,) by how much nearer the surface lies than those, m.
     """
 
     geometry: PulseGeometry = field(kw_only=True)
     inclined: bool = False
+    bulge: FloatArray | None = None
 
     def emit(self) -> Pulses:
         angles, count = self.geometry, len(self.geometry.azimuth)
@@ -60,20 +62,25 @@ class DirectedScanner(LaserScanner):
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         known = {"power": self.geometry.power, "cos_incidence": self.geometry.cos_incidence if self.inclined else None}
         known = {name: on_device(mi.Float32, np.maximum(each, 1e-9)) for name, each in known.items() if each is not None}
-        return super().measured(pulses, replace(echo, **known), random)
+        echo = replace(echo, **known)
+        if self.bulge is not None:
+            echo = replace(echo, range_m=echo.range_m - on_device(mi.Float64, np.nan_to_num(self.bulge)))
+        return super().measured(pulses, echo, random)
 
 
-def _scanner(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry) -> DirectedScanner:
+def _scanner(
+    measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, bulge: FloatArray | None = None
+) -> DirectedScanner:
     position, rotation = measurement.station
     pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
     config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
-    inclined = measurement.normals is not None
-    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry, inclined=inclined)
+    inclined = measurement.planes is not None
+    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry, inclined=inclined, bulge=bulge)
 
 
-def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, random: KeyedRandom) -> FloatArray:
+def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry, random: KeyedRandom) -> FloatArray:
     """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
-    return _scanner(measurement, model, geometry).ranges(measurement.scene, random)
+    return _scanner(measurement, model, geometry, geometry.bulge_m).ranges(measurement.scene, random)
 
 
 def mean_model(model: TlsModel) -> TlsModel:
@@ -89,6 +96,6 @@ def aimed(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatAr
     return np.array(pulses.aim_azimuth), np.array(pulses.aim_zenith)
 
 
-def simulated_ranges(measurement: TlsMeasurement, geometry: PulseGeometry) -> FloatArray:
+def simulated_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
     """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise."""
     return simulate_ranges(measurement, mean_model(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

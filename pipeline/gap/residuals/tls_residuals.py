@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurement import TlsMeasurement
 from pipeline.formats.measurement_config import ScanPattern
-from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, Rows, part_of, plane_slopes
+from pipeline.gap.decisions import decided
+from pipeline.gap.residuals.rays import RayGeometry, met
+from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, plane_slopes
 from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
+from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.effects.base import Stage
 from sensors.effects.range_empirical import RangeEmpirical
@@ -18,8 +22,6 @@ from sensors.effects.range_noise import RangeNoise
 from sensors.polar import polar, polar_axes
 from sensors.pulses import PulseGeometry
 
-_PROBE_RAD = 6e-4
-"""Angle to the neighbouring rays that tell edges: about the width of a beam."""
 _EDGE_SIGMAS = 3.0
 _LARGEST_SLOPE = 4.0
 """Metres of range per metre across the ray beyond which a point counts as grazing."""
@@ -29,29 +31,8 @@ _LEAST_POWER = 1e-9
 
 
 @dataclass(frozen=True)
-class RayGeometry(PulseGeometry):
-    """Per point what the equations look at, where the beam goes on average by the model, and the measured range (m)."""
-
-    measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
-
-    def part(self, rows: Rows) -> RayGeometry:
-        """The same of some of the points."""
-        return part_of(self, rows)
-
-    @property
-    def plane(self) -> FloatArray:
-        """(n, 2) azimuth and zenith, rad."""
-        return np.stack([self.azimuth, self.zenith], axis=1)
-
-    @property
-    def departure(self) -> FloatArray:
-        """(n,) measured range less that of the reference, m."""
-        return np.asarray(self.measured_m - self.range_m)
-
-
-@dataclass(frozen=True)
 class TlsResiduals(Residuals):
-    """Residuals of ranges, m."""
+    """Residuals of ranges, m. reference_error_m: standard deviation of each vertex of the reference along the rays."""
 
     sensor = "tls"
     planes = ("azimuth", "zenith")
@@ -59,6 +40,30 @@ class TlsResiduals(Residuals):
     noise = RangeNoise, "sigma_m"
     called = "ranges of a laser scan"
     geometry: RayGeometry
+    reference_error_m: float = 0.0
+
+    @property
+    def reference_variance(self) -> FloatArray:
+        """(n,) of the ranges, m2, by the errors of the reference's vertices: their weights squared."""
+        return _reference_variance(self.reference_error_m, self.geometry)
+
+    @property
+    def averaged(self) -> Self:
+        """Neighbours share the errors of the vertices between them."""
+        corner, weight = self.geometry.corner, self.geometry.weight
+        if not self.reference_error_m or corner is None or weight is None:
+            return self
+        shared = np.sum(weight * np.bincount(corner.ravel(), weight.ravel())[corner], axis=1)
+        variance = self.sigma**2 - self.reference_variance + self.reference_error_m**2 * shared
+        return replace(self, sigma=np.sqrt(variance))
+
+    def drawn_reference(self, random: KeyedRandom) -> FloatArray:
+        """(n,) a draw of what the errors of the reference's vertices do to ranges that are measured on it, m."""
+        corner, weight = self.geometry.corner, self.geometry.weight
+        if not self.reference_error_m or corner is None or weight is None:
+            return np.zeros(len(self))
+        errors = self.reference_error_m * random.generator().standard_normal(int(corner.max(initial=0)) + 1)
+        return np.asarray(np.sum(weight * errors[corner], axis=1))
 
     @property
     def depth_m(self) -> FloatArray:
@@ -76,25 +81,30 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     if any(effect.stage == Stage.AIM for effect in model.effects):
         real = aimed(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
-    met = _met(measurement, axes)
-    distance, normal = met.distance, met.normal
+    seen = met(measurement, axes)
+    distance, normal = seen.distance, seen.normal
     geometry = RayGeometry(
         azimuth=azimuth,
         zenith=zenith,
         range_m=distance,
         measured_m=measured,
+        bulge_m=seen.bulge,
+        corner=seen.corner,
+        weight=seen.weight,
         by_azimuth=plane_slopes(normal, axes[0], axes[1], distance) * np.sin(zenith),
         by_zenith=plane_slopes(normal, axes[0], axes[2], distance),
-        cos_incidence=met.cos_incidence,
+        cos_incidence=seen.cos_incidence,
         line=line,
         share=share,
         power=None if intensity is None else np.maximum(intensity, _LEAST_POWER),
     )
     predicted = simulated_ranges(measurement, geometry) if model.effects else distance
-    sigma = np.sqrt(model.variance(geometry))
+    sigma = np.sqrt(model.variance(geometry) + _reference_variance(measurement.reference_error_m, geometry))
     slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
     hit = np.isfinite(predicted) & np.isfinite(distance)
-    flat = (met.curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
+    flat = (seen.curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
+    if seen.scatter is not None:
+        flat &= seen.scatter < decided().points.scattered
     whole = TlsResiduals(
         value=measured - predicted,
         sigma=sigma,
@@ -103,12 +113,19 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         even=hit & flat,
         pose=_pose(axes[0], normal, distance),
         at=(position + distance[:, None] * axes[0])[:, :2],
-        covariates=_covariates(geometry, met.curvature),
+        covariates=_covariates(geometry, seen.curvature),
         index=np.arange(len(measured)),
         geometry=geometry,
         notes=_notes(measurement),
+        reference_error_m=measurement.reference_error_m,
     )
     return whole.part(hit)
+
+
+def _reference_variance(error_m: float, geometry: RayGeometry) -> FloatArray:
+    if not error_m or geometry.weight is None:
+        return np.zeros(len(geometry))
+    return np.asarray(error_m**2 * np.sum(geometry.weight**2, axis=1))
 
 
 def with_order(measurement: TlsMeasurement) -> TlsMeasurement:
@@ -144,40 +161,6 @@ def recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, Float
     middle = np.angle(np.mean(np.exp(1j * azimuth)))  # whichever side of pi the points lie on
     around = middle + np.angle(np.exp(1j * (azimuth - middle)))
     return (around, zenith, measured) if measurement.face == 1 else (around + np.pi, 2 * np.pi - zenith, measured)
-
-
-@dataclass(frozen=True)
-class _Met:
-    """What rays meet. distance: (n,), m; normal: (n, 3) of the triangle, unit; cos_incidence: (n,); curvature: (n,) the largest
-    departure from the triangle's plane within a beam's width, m."""
-
-    distance: FloatArray
-    normal: FloatArray
-    cos_incidence: FloatArray
-    curvature: FloatArray
-
-
-def _met(measurement: TlsMeasurement, axes: list[FloatArray]) -> _Met:
-    """axes: the rays' directions (n, 3), unit, wall frame, and how they turn with azimuth and zenith."""
-    ray, scene, position = axes[0], measurement.scene, measurement.station[0]
-    distance, face = scene.cast(position, ray)
-    face = np.maximum(face, 0)
-    normal = scene.mesh.face_normals(face)
-    curvature = np.zeros(len(ray))
-    for axis in axes[1:]:
-        flat = plane_slopes(normal, ray, axis, distance)
-        for step in (_PROBE_RAD, -_PROBE_RAD):
-            beside = scene.cast(position, ray + step * axis)[0]
-            curvature = np.maximum(curvature, np.nan_to_num(np.abs(beside - distance - step * flat), nan=np.inf))
-    inclined_to = normal if measurement.normals is None else _over_corners(measurement.normals[scene.mesh.faces[face]], normal)
-    return _Met(distance, normal, np.abs(np.einsum("ni,ni->n", ray, inclined_to)), curvature)
-
-
-def _over_corners(normals: FloatArray, outwards: FloatArray) -> FloatArray:
-    """(n, 3) mean directions of normals (n, 3 corners, 3), either way round, turned to the side of `outwards` (n, 3)."""
-    side = np.where(np.einsum("nci,ni->nc", normals, outwards) < 0, -1.0, 1.0)
-    mean = np.einsum("nci,nc->ni", normals, side)
-    return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
 
 
 def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArray:
@@ -260,13 +243,13 @@ def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Mis
     sent = np.arange(pulses_of(pattern)) if measurement.pulses is None else np.flatnonzero(measurement.pulses)
     azimuth, zenith = (sweep[place] for sweep, place in zip(sweeps, np.divmod(sent, len(sweeps[1])), strict=True))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
-    met = _met(measurement, axes)
-    distance = met.distance
-    usable = np.isfinite(distance) & (met.curvature < 0.3)
+    seen_by = met(measurement, axes)
+    distance = seen_by.distance
+    usable = np.isfinite(distance) & (seen_by.curvature < 0.3)
     covariates = {
         "range": distance,
-        "incidence": np.arccos(np.clip(met.cos_incidence, 0, 1)),
-        "log_power": np.log(np.maximum(met.cos_incidence, 1e-6) * (100.0 / distance) ** 2),
+        "incidence": np.arccos(np.clip(seen_by.cos_incidence, 0, 1)),
+        "log_power": np.log(np.maximum(seen_by.cos_incidence, 1e-6) * (100.0 / distance) ** 2),
         "azimuth": azimuth,
         "zenith": zenith,
     }

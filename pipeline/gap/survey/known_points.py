@@ -10,7 +10,8 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.residuals.nominal_pair import NominalPair, moved_pair, project, real_pair
-from pipeline.gap.residuals.tls_residuals import RayGeometry, TlsResiduals
+from pipeline.gap.residuals.rays import RayGeometry
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.survey.planned import StereoView, TlsView
 from scene.mesh import FloatArray
 from sensors.camera import CameraPair

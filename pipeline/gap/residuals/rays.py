@@ -1,0 +1,121 @@
+"""What the rays of a scan meet on the surface as known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.formats.measurement import TlsMeasurement
+from pipeline.gap.residuals.residuals import Rows, part_of, plane_slopes
+from scene.mesh import FloatArray, IntArray
+from scene.point_planes import PointPlanes
+from sensors.pulses import PulseGeometry
+
+_PROBE_RAD = 6e-4
+"""Angle to the neighbouring rays that tell edges: about the width of a beam."""
+_LEAST_COSINE = 0.05
+
+
+@dataclass(frozen=True)
+class RayGeometry(PulseGeometry):
+    """Per point what the equations look at, where the beam goes on average by the model, and the measured range (m).
+
+    bulge_m: by how much nearer the surface lies than the triangle between its points, part of range_m; None: not at all. corner,
+    weight: (n, 3) vertices of the triangle met, and what each says of the place in it; None where the vertices have no errors.
+    """
+
+    measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
+    bulge_m: FloatArray | None = None
+    corner: IntArray | None = None
+    weight: FloatArray | None = None
+
+    def part(self, rows: Rows) -> RayGeometry:
+        """The same of some of the points."""
+        return part_of(self, rows)
+
+    @property
+    def plane(self) -> FloatArray:
+        """(n, 2) azimuth and zenith, rad."""
+        return np.stack([self.azimuth, self.zenith], axis=1)
+
+    @property
+    def departure(self) -> FloatArray:
+        """(n,) measured range less that of the reference, m."""
+        return np.asarray(self.measured_m - self.range_m)
+
+
+@dataclass(frozen=True)
+class Met:
+    """What n rays meet. distance: (n,), m; normal: (n, 3) of the triangle, unit; cos_incidence: (n,); curvature: (n,) the largest
+    departure from the triangle's plane within a beam's width, m.
+
+    Of a reference made of points normal and incidence are those of planes through 24 of them: triangles lean by the noise of
+    their corners, which is that of the distance too, so that whatever is proportional to a slope would seem to be there. bulge:
+    (n,) by how much nearer the surface lies than the triangle, part of the distance, m; scatter: (n,) of the points about planes,
+    over the typical one. corner, weight: (n, 3) as in `RayGeometry`.
+    """
+
+    distance: FloatArray
+    normal: FloatArray
+    cos_incidence: FloatArray
+    curvature: FloatArray
+    bulge: FloatArray | None = None
+    scatter: FloatArray | None = None
+    corner: IntArray | None = None
+    weight: FloatArray | None = None
+
+
+def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
+    """axes: the rays' directions (n, 3), unit, wall frame, and how they turn with azimuth and zenith."""
+    ray, scene, position = axes[0], measurement.scene, measurement.station[0]
+    distance, face = scene.cast(position, ray)
+    face = np.maximum(face, 0)
+    normal = scene.mesh.face_normals(face)
+    curvature = np.zeros(len(ray))
+    for axis in axes[1:]:
+        flat = plane_slopes(normal, ray, axis, distance)
+        for step in (_PROBE_RAD, -_PROBE_RAD):
+            beside = scene.cast(position, ray + step * axis)[0]
+            curvature = np.maximum(curvature, np.nan_to_num(np.abs(beside - distance - step * flat), nan=np.inf))
+    found = Met(distance, normal, np.abs(np.einsum("ni,ni->n", ray, normal)), curvature)
+    if measurement.planes is None and not measurement.reference_error_m:
+        return found
+    corner = scene.mesh.faces[face]
+    weight = _barycentric(position + distance[:, None] * ray, scene.mesh.vertices[corner])
+    found = replace(found, corner=corner, weight=weight)
+    return found if measurement.planes is None else _between_points(found, measurement.planes, ray, scene.mesh.vertices)
+
+
+def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, points: FloatArray) -> Met:
+    """With planes through the points (v, 3) in place of the triangles', and the surface bent as they turn from one to the next.
+
+    Height over a triangle with barycentric coordinates b: the sum over its sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i)
+    (p_j - p_i) / 8 is the height of an arc over its chord.
+    """
+    corner, weight = found.corner, found.weight
+    assert corner is not None
+    assert weight is not None
+    normal = planes.normal[corner]
+    normal = normal * np.where(np.einsum("nki,ni->nk", normal, found.normal) < 0, -1.0, 1.0)[..., None]
+    mean = normal.mean(axis=1)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    at, height = points[corner], np.zeros(len(ray))
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        arc = np.einsum("ni,ni->n", normal[:, j] - normal[:, i], at[:, j] - at[:, i]) / 8
+        height += 4 * weight[:, i] * weight[:, j] * arc
+    cosine = np.abs(np.einsum("ni,ni->n", ray, mean))
+    towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
+    bulge = towards * height / np.maximum(cosine, _LEAST_COSINE)
+    scatter = planes.along(ray, corner).max(axis=1) / planes.typical_m
+    return replace(found, distance=found.distance - bulge, normal=mean, cos_incidence=cosine, bulge=bulge, scatter=scatter)
+
+
+def _barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:
+    """(n, 3) of points (n, 3) in triangles (n, 3 corners, 3)."""
+    one, other, within = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], point - corners[:, 0]
+    a, b, c = (np.einsum("ni,ni->n", *pair) for pair in ((one, one), (one, other), (other, other)))
+    d, e = (np.einsum("ni,ni->n", within, side) for side in (one, other))
+    area = np.maximum(a * c - b * b, 1e-300)
+    second, third = (c * d - b * e) / area, (a * e - b * d) / area
+    return np.stack([1 - second - third, second, third], axis=1)
