@@ -23,12 +23,13 @@ class PointPlanes:
     """Planes of least squares through each point's 24 nearest, itself among them.
 
     normal: (n, 3) unit, either way round; scatter_m: (n,) root mean square distance of the 24 from their plane; typical_m: median
-    of the scatter along the lines from the viewpoint.
+    of the scatter along the lines from the viewpoint; of_noise: whether it is noise of each point's own for the most part.
     """
 
     normal: FloatArray
     scatter_m: FloatArray
     typical_m: float
+    of_noise: bool
 
     @classmethod
     def of(cls, points: FloatArray, viewpoint: FloatArray) -> PointPlanes:
@@ -46,7 +47,8 @@ class PointPlanes:
             normal[rows], scatter[rows] = vectors[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0.0))
         ray = points - viewpoint
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        return cls(normal, scatter, float(np.median(_along(ray, normal, scatter))))
+        of_noise = own_noise(points, viewpoint) is not None
+        return cls(normal, scatter, float(np.median(_along(ray, normal, scatter))), of_noise)
 
     def along(self, rays: FloatArray, point: NDArray[np.int32]) -> FloatArray:
         """(n, k) scatter about the planes of some points (n, k) along unit rays (n, 3), m."""

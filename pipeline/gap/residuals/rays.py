@@ -23,12 +23,14 @@ class RayGeometry(PulseGeometry):
 
     bulge_m: by how much nearer the surface lies than the triangle between its points, part of range_m; None: not at all. corner,
     weight: (n, 3) vertices of the triangle met, and what each says of the place in it; None where the vertices have no errors.
+    plane_normal: (n, 3), scanner frame, of the plane along which a ray that turns goes; None: along the triangles.
     """
 
     measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
     bulge_m: FloatArray | None = None
     corner: IntArray | None = None
     weight: FloatArray | None = None
+    plane_normal: FloatArray | None = None
 
     def part(self, rows: Rows) -> RayGeometry:
         """The same of some of the points."""
@@ -50,8 +52,9 @@ class Met:
     """What n rays meet. distance: (n,), m; normal: (n, 3) of the triangle, unit; cos_incidence: (n,); curvature: (n,) the largest
     departure from the triangle's plane within a beam's width, m.
 
-    Of a reference made of points normal and incidence are those of planes through 24 of them: triangles lean by the noise of
-    their corners, which is that of the distance too, so that whatever is proportional to a slope would seem to be there. bulge:
+    Of a reference made of points the incidence is that to planes through 24 of them, and so is the normal where noise is most of
+    their scatter: triangles lean by the noise of their corners, which is that of the distance too, so that whatever is
+    proportional to a slope would seem to be there. bulge:
     (n,) by how much nearer the surface lies than the triangle, part of the distance, m; scatter: (n,) of the points about planes,
     over the typical one. corner, weight: (n, 3) as in `RayGeometry`.
     """
@@ -87,6 +90,14 @@ def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
     return found if measurement.planes is None else _between_points(found, measurement.planes, ray, scene.mesh.vertices)
 
 
+def turned(found: Met, nominal: FloatArray, real: FloatArray) -> Met:
+    """What rays (n, 3) meet that left in other directions `real`, along the planes that the nominal ones met: where noise is most
+    of a reference's scatter, a ray that turns would go along the noise of a triangle."""
+    before, after = (np.einsum("ni,ni->n", found.normal, each) for each in (nominal, real))
+    distance = found.distance * before / np.where(np.abs(after) > _LEAST_COSINE, after, np.nan)
+    return replace(found, distance=distance, cos_incidence=np.abs(after))
+
+
 def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, points: FloatArray) -> Met:
     """With planes through the points (v, 3) in place of the triangles', and the surface bent as they turn from one to the next.
 
@@ -108,7 +119,8 @@ def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, points: Fl
     towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
     bulge = towards * height / np.maximum(cosine, _LEAST_COSINE)
     scatter = planes.along(ray, corner).max(axis=1) / planes.typical_m
-    return replace(found, distance=found.distance - bulge, normal=mean, cos_incidence=cosine, bulge=bulge, scatter=scatter)
+    slanting = mean if planes.of_noise else found.normal
+    return replace(found, distance=found.distance - bulge, normal=slanting, cos_incidence=cosine, bulge=bulge, scatter=scatter)
 
 
 def _barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from scene.upload import on_device
 from sensors.beam import Echo
 from sensors.effects.base import ShowsIn
 from sensors.model import TlsModel, TlsNoise
-from sensors.pulses import PulseGeometry, Pulses
+from sensors.pulses import PulseGeometry, Pulses, direction
 from sensors.tls import LaserScanner, Pattern, ScannerConfig
 
 _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
@@ -27,12 +27,12 @@ class DirectedScanner(LaserScanner):
     """A scanner whose pulses leave in the directions of `geometry`, one after another.
 
     Recorded powers, where there are any, take the place of those that the albedo of the reference would give; inclined: so do
-    the geometry's angles of incidence of those to the triangles; bulge: (n,) by how much nearer the surface lies than those, m.
+    the geometry's angles of incidence of those to the triangles; between: what of a reference made of points its triangles lack.
     """
 
     geometry: PulseGeometry = field(kw_only=True)
     inclined: bool = False
-    bulge: FloatArray | None = None
+    between: RayGeometry | None = None
 
     def emit(self) -> Pulses:
         angles, count = self.geometry, len(self.geometry.azimuth)
@@ -56,31 +56,47 @@ class DirectedScanner(LaserScanner):
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
         """(n,) recorded ranges, m; NaN without a return."""
         pulses, beam = self.emitted(self.emit(), random)
-        pulses = self.measured(pulses, self.echo(scene, pulses, beam, beam.received), random)
+        straight = replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith) if self._along_planes else pulses
+        pulses = self.measured(pulses, self.echo(scene, straight, beam, beam.received), random)
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         known = {"power": self.geometry.power, "cos_incidence": self.geometry.cos_incidence if self.inclined else None}
         known = {name: on_device(mi.Float32, np.maximum(each, 1e-9)) for name, each in known.items() if each is not None}
         echo = replace(echo, **known)
-        if self.bulge is not None:
-            echo = replace(echo, range_m=echo.range_m - on_device(mi.Float64, np.nan_to_num(self.bulge)))
+        if self.between is not None and self.between.bulge_m is not None:
+            echo = replace(echo, range_m=echo.range_m - on_device(mi.Float64, np.nan_to_num(self.between.bulge_m)))
+        if self._along_planes:
+            echo = replace(echo, range_m=echo.range_m * self._turned(pulses))
         return super().measured(pulses, echo, random)
+
+    @property
+    def _along_planes(self) -> bool:
+        """Whether pulses that turn go along planes, not along the reference's triangles."""
+        return self.between is not None and self.between.plane_normal is not None
+
+    def _turned(self, pulses: Pulses) -> mi.Float64:
+        """(n,) distance along a plane in the direction in which a pulse leaves, over that in the nominal one."""
+        assert self.between is not None
+        assert self.between.plane_normal is not None
+        normal = mi.Vector3d(*(on_device(mi.Float64, np.ascontiguousarray(each)) for each in self.between.plane_normal.T))
+        nominal, real = direction(pulses.azimuth, pulses.zenith), direction(pulses.aim_azimuth, pulses.aim_zenith)
+        return dr.dot(normal, nominal) / dr.dot(normal, real)
 
 
 def _scanner(
-    measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, bulge: FloatArray | None = None
+    measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, between: RayGeometry | None = None
 ) -> DirectedScanner:
     position, rotation = measurement.station
     pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
     config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
     inclined = measurement.planes is not None
-    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry, inclined=inclined, bulge=bulge)
+    return DirectedScanner(position, rotation, pattern, config, model, geometry=geometry, inclined=inclined, between=between)
 
 
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry, random: KeyedRandom) -> FloatArray:
     """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
-    return _scanner(measurement, model, geometry, geometry.bulge_m).ranges(measurement.scene, random)
+    return _scanner(measurement, model, geometry, geometry).ranges(measurement.scene, random)
 
 
 def mean_model(model: TlsModel) -> TlsModel:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.formats.measurement import TlsMeasurement
 from pipeline.formats.measurement_config import ScanPattern
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.rays import RayGeometry, met
+from pipeline.gap.residuals.rays import RayGeometry, met, turned
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, plane_slopes
 from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
 from scene.keyed_random import KeyedRandom
@@ -81,7 +81,12 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     if any(effect.stage == Stage.AIM for effect in model.effects):
         real = aimed(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
-    seen = met(measurement, axes)
+    along_planes = measurement.planes is not None and measurement.planes.of_noise
+    if along_planes:
+        nominal = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
+        seen = turned(met(measurement, nominal), nominal[0], axes[0])
+    else:
+        seen = met(measurement, axes)
     distance, normal = seen.distance, seen.normal
     geometry = RayGeometry(
         azimuth=azimuth,
@@ -91,6 +96,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         bulge_m=seen.bulge,
         corner=seen.corner,
         weight=seen.weight,
+        plane_normal=normal @ rotation if along_planes else None,
         by_azimuth=plane_slopes(normal, axes[0], axes[1], distance) * np.sin(zenith),
         by_zenith=plane_slopes(normal, axes[0], axes[2], distance),
         cos_incidence=seen.cos_incidence,
