@@ -399,6 +399,13 @@ class RejectionDecisions(_Group):
     least_closed: PositiveFloat = _by(
         0.5, "share", "Of a gap, if it is none of chance, that named effects must close to be the answer.", _JUDGEMENT, lt=1
     )
+    most_wide: PositiveFloat = _by(
+        1.5,
+        "times the predicted spread",
+        "That residuals have, with nothing named that explains it, from which on the model is rejected.",
+        _JUDGEMENT,
+        gt=1,
+    )
     gap_sigmas: PositiveFloat = _by(
         2.0, "standard errors", "By which after may differ from before for the two to agree.", _JUDGEMENT
     )

@@ -39,7 +39,7 @@ class Evidence:
     gap: on held-out points, None where there are too few; p_value: of what remains, None where it was not drawn; spread: share of
     the predicted standard deviation that the residuals have where that is clearly less, else 1; far: share of points far out all
     over the wall, 0 where they are as few as noise leaves; moved: of points that lie off the reference together with their
-    neighbours, where that was asked.
+    neighbours, where that was asked; wide: how many predicted sigmas the residuals spread where no effect explains that, else 1.
     """
 
     gap: Gap | None
@@ -47,6 +47,7 @@ class Evidence:
     spread: float = 1.0
     far: float = 0.0
     moved: float = 0.0
+    wide: float = 1.0
 
     @property
     def much_moved(self) -> bool:
@@ -59,10 +60,16 @@ class Evidence:
         return self.p_value is not None and self.p_value <= decided().verdict.least_p
 
     @property
+    def too_wide(self) -> bool:
+        """Whether the residuals spread so much more than predicted that the model is rejected, whatever else says."""
+        return self.wide >= decided().verdict.most_wide
+
+    @property
     def agrees(self) -> bool:
-        """Whether the model without any effect is not rejected: by the gap on held-out points, and by what remains."""
+        """Whether the model without any effect is not rejected: by the gap on held-out points, by what remains, and by how much
+        the residuals spread."""
         measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
-        return measured and not self.rejects and not self.far
+        return measured and not (self.rejects or self.far or self.too_wide)
 
     @property
     def stays_open(self) -> bool:
@@ -84,7 +91,7 @@ class Evidence:
 
     def only_too_noisy(self, named: Sequence[Named]) -> bool:
         """Whether the model's noise is too large and nothing else was found to be wrong."""
-        return self.spread < 1.0 and not named and not self.rejects and not self.far
+        return self.spread < 1.0 and not (named or self.rejects or self.far or self.too_wide)
 
 
 def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
@@ -153,6 +160,13 @@ def much_moved(evidence: Evidence, stable_areas: bool) -> list[str]:
     )
     remedy = "the stable_areas that were given are not stable" if stable_areas else "name stable_areas where nothing moved"
     return [f"{said}; {remedy}, or bring a reference of the same time"]
+
+
+def unexplained(evidence: Evidence, notes: Sequence[str]) -> list[str]:
+    """Words for residuals that spread more than predicted, where no note says more of that already."""
+    if not evidence.too_wide or any("the residuals spread" in note for note in notes):
+        return []
+    return [f"the residuals spread {evidence.wide:.2g} times what the model predicts, and nothing that was tried explains that"]
 
 
 def too_noisy(spread: float, lower: dict[str, float]) -> list[str]:

@@ -28,7 +28,7 @@ from pipeline.gap.naming.families import believes
 from pipeline.gap.naming.held_out import Scored, score_effects
 from pipeline.gap.naming.naming import FREE_FORMS, Naming
 from pipeline.gap.naming.splitting import with_splits
-from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, verdict_of
+from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, unexplained, verdict_of
 from pipeline.gap.naming.verification import Showing, Shown
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
@@ -83,8 +83,8 @@ class GapDiagnosis:
     @property
     def evidence(self) -> Evidence:
         """The numbers that the verdict and its words rest on."""
-        return Evidence(self.gap, self.remaining["p_value"], self.remaining["spread"], self.remaining["far"],
-                        self.remaining["moved"])  # fmt: skip
+        numbers = {name: self.remaining[name] for name in ("p_value", "spread", "far", "moved", "wide")}
+        return Evidence(self.gap, **numbers)
 
     @property
     def mended(self) -> bool:
@@ -142,7 +142,10 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     shown, harmful = showing.show(held.named)
     notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *held.words, *harmful]
     far = held.tails.share if held.tails is not None and held.tails.even else 0.0
-    evidence = _with_moved(Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far), there, state, shown)
+    wide = 1.0 if any(item.spreads for item in shown.named) else naming.spreads
+    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far, wide=wide)
+    notes = [*notes, *unexplained(evidence, notes)]
+    evidence = _with_moved(evidence, there, state, shown)
     if evidence.much_moved:
         shown, _ = replace(showing, lower={}).show([])
         notes = [*much_moved(evidence, bool(there.stable_areas)), *naming.notes]
@@ -297,13 +300,15 @@ class _Clock:
 
 def _remaining(evidence: Evidence, notes: list[str], lower_noise: dict[str, float]) -> dict[str, Any]:
     """As gap.json holds it. spread: share of the predicted one that the residuals have where that is clearly less; far: share of
-    points far out all over the wall; moved: of points off the reference with their neighbours, 0 where that was not asked."""
+    points far out all over the wall; moved: of points off the reference with their neighbours, 0 where that was not asked; wide:
+    how many predicted sigmas they spread where no effect explains that."""
     return {
         "p_value": evidence.p_value,
         "note": "; ".join(notes),
         "spread": evidence.spread,
         "far": evidence.far,
         "moved": evidence.moved,
+        "wide": evidence.wide,
         "lower_noise": lower_noise,
     }
 
