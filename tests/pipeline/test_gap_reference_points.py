@@ -1,4 +1,4 @@
-"""References made of a scan's points: noise of their own, chords, slopes and edges, against closed forms (tests/workshop.py)."""
+"""References made of points: noise of their own, chords, slopes and edges, against closed forms (benchmarks/workshop.py)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import workshop
 import yaml
 
+from benchmarks import workshop
 from pipeline.formats.laz import write_laz
 from pipeline.formats.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.measurement_config import MeasurementConfig

@@ -1,0 +1,95 @@
+"""Known effects put into one half of a scan whose other half is the reference: what is named beside the noise of both.
+
+    OMP_NUM_THREADS=1 python benchmarks/gap_reference_points.py [--out runs/reference_points] [--write]
+
+The scan is that of a workshop in closed form (benchmarks/workshop.py), the effects are those of the injections into real scans
+(benchmarks/gap_injections/formulas.py). --write: the table into docs/gap/README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.gap_injections.bases import put_scanned
+from benchmarks.workshop import scan
+from pipeline.formats.laz import write_laz
+from pipeline.formats.measurement import read_measurement
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
+from pipeline.gap.report.in_words import values as in_words
+from pipeline.measurement.build import build
+from pipeline.measurement.request import Request
+
+PAGE, MARK = Path("docs/gap/README.md"), ("<!-- reference points -->\n", "<!-- end of reference points -->\n")
+STEP_DEG = 0.2
+MODEL = {"sensor": "tls", "noise": {"range_sigma_m": 0.001, "angle_sigma_rad": 5e-5}}
+PUT: dict[str, tuple[str, dict[str, float]]] = {
+    "a cyclic error of 2 mm, 0.6 m": ("range_cyclic", {"amplitude_m": 0.002, "period_m": 0.6, "phase_rad": 0.8}),
+    "an incidence bias of 3 mm": ("range_incidence_bias", {"coefficient_m": 0.003}),
+    "an offset of 4 mm": ("range_offset", {"offset_m": 0.004}),
+    "a wobble of 400 microradians, 9 lines": ("wobble", {"amplitude_rad": 0.0004, "lines_per_cycle": 9, "phase_rad": 0.5}),
+    "a vertical index of 1 mrad": ("vertical_index", {"offset_rad": 0.001}),
+}
+
+
+def made(out: Path) -> Path:
+    """The scan's one half against the other, with a model that says 1 mm."""
+    out.mkdir(parents=True)
+    (out / "model.yaml").write_text(yaml.safe_dump(MODEL))
+    write_laz(out / "scan.laz", PointCloud(scan(STEP_DEG)[0]))
+    build(Request([out / "scan.laz"], "half", model=out / "model.yaml", position=(0.0, 0.0, 0.0)), out / "half")
+    return out / "half"
+
+
+def changed(folder: Path, out: Path, model: dict[str, Any], left_out: tuple[str, ...] = ()) -> Path:
+    """The same measurement with another model, and without some keys of its measurement.yaml."""
+    shutil.copytree(folder, out)
+    (out / "model.yaml").write_text(yaml.safe_dump(model))
+    values = yaml.safe_load((out / "measurement.yaml").read_text())
+    (out / "measurement.yaml").write_text(yaml.safe_dump({key: each for key, each in values.items() if key not in left_out}))
+    return out
+
+
+def row(title: str, folder: Path) -> tuple[str, GapDiagnosis]:
+    """A line of the table."""
+    found = diagnose(read_measurement(folder))
+    named = "; ".join(f"`{each.name}` ({in_words(each)})" for each in found.effects) or "nothing"
+    gap = found.gap
+    figures = "" if gap is None else f"{1e3 * gap.before:.2f} to {1e3 * gap.after:.2f}, floor {1e3 * gap.floor:.2f}"
+    line = f"| {title} | {found.verdict} | {named} | {figures} |"
+    print(line, flush=True)
+    return line, found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/reference_points"))
+    parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE}")
+    arguments = parser.parse_args()
+    shutil.rmtree(arguments.out, ignore_errors=True)
+    folder = made(arguments.out)
+    first, found = row("nothing", folder)
+    lines = ["| put into the half that is compared | verdict | named | gap, mm |", "|---|---|---|---|", first]
+    after = found.model_after.model_dump(mode="json")
+    lines.append(row("nothing, on its own model_after", changed(folder, arguments.out / "after", after))[0])
+    unsaid = ("incidence", "reference_error_m", "notes")
+    mesh = changed(folder, arguments.out / "mesh", MODEL, unsaid)
+    lines.append(row("nothing, the reference as a mesh that says nothing of itself", mesh)[0])
+    for number, (title, (effect, values)) in enumerate(PUT.items()):
+        put_scanned(folder, arguments.out / effect, effect, values, number)
+        lines.append(row(title, arguments.out / effect)[0])
+    if arguments.write:
+        before, after_mark = PAGE.read_text().split(MARK[0]), PAGE.read_text().split(MARK[1])
+        PAGE.write_text(before[0] + MARK[0] + "\n".join(lines) + "\n" + MARK[1] + after_mark[1])
+
+
+if __name__ == "__main__":
+    main()
