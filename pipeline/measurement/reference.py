@@ -123,7 +123,7 @@ def _noise_along_lines(geometry: ScanGeometry, rows: NDArray[np.bool_]) -> float
     """Robust standard deviation of a range, m, about the chord of its neighbours in a line; None without any.
 
     Chords twice as long are as noisy, and four times as far from relief that is smooth over them: what they scatter more is taken
-    off. Relief as rough as noise counts as such, steps of depth do not.
+    off. Relief that is rougher counts as noise, steps of depth do not.
     """
     line, pulse, distance = geometry.line[rows], geometry.pulse[rows], geometry.range_m[rows]
     order = np.lexsort((pulse, line))

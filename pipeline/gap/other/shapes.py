@@ -60,9 +60,12 @@ class WallBlocks:
             return None
         return total
 
-    def std(self, gains: Callable[[float], FloatArray], value: float) -> float:
-        """Standard deviation of a value at the top of its gains, by how the blocks' slopes scatter (sandwich)."""
-        width = 0.05 * value
+    def std(self, gains: Callable[[float], FloatArray], value: float, width: float | None = None) -> float:
+        """Standard deviation of a value at the top of its gains, by how the blocks' slopes scatter (sandwich).
+
+        width: on either side, over which slopes are taken; a twentieth of the value where None.
+        """
+        width = 0.05 * value if width is None else width
         low, middle, high = (self.sums(gains(each)) for each in (value - width, value, value + width))
         slopes, curvature = (high - low) / (2 * width), float((high - 2 * middle + low).sum()) / width**2
         return float(np.linalg.norm(slopes)) / max(-curvature, 1e-12)

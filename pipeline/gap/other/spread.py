@@ -226,9 +226,10 @@ def _shared_by_neighbours(excess: float, between: float, sigma: FloatArray) -> s
 
 def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray, added: FloatArray) -> float:
     """Share of an added variance, of the points `kept` and over the predicted one, that differences of neighbours show."""
-    at, value, predicted = residuals.at[kept], value[kept], residuals.sigma[kept] ** 2
-    other = cKDTree(at).query(at, k=2)[1][:, 1]
-    variance = predicted + predicted[other]
+    part = residuals.part(kept)
+    value, predicted = value[kept], part.sigma**2
+    other = cKDTree(part.at).query(part.at, k=2)[1][:, 1]
+    variance = predicted + predicted[other] - 2 * part.shared_with(other)
     more = (added * predicted + (added * predicted)[other]) / variance
     weight = more / (1 + more) ** 2
     return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * more))

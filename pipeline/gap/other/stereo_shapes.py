@@ -132,21 +132,26 @@ def find_shapes(
 
 
 def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
-    """Radii are whole cells: any between one and the next does the same."""
+    """Radii are whole cells: any between one and the next does the same. Outlines that do not grow alike make it unsure."""
     step, raster = witnesses.raster.step, witnesses.raster
-    trials = [(radius, witnesses.gains(beside, _grown(radius, step))) for radius in _RADII]
-    radius, gains = max(trials, key=lambda trial: float(trial[1].sum()))
+
+    def gains(radius: float) -> FloatArray:
+        return there.gains(beside, _grown(int(radius), step)) if radius else np.zeros(len(witnesses.rough))
+
+    there = witnesses
+    radius = max(_RADII, key=lambda each: float(gains(each).sum()))
     if witnesses.times_predicted > decided().shapes.wide:
         # outlines that grow far spoil the registration and the spread by which points would bear witness of them
-        settled = [(radius, witnesses.registered_with([*beside, _grown(radius, step)])) for radius in _RADII]
-        radius, there = min(settled, key=lambda each: each[1].times_predicted)
-        if there.times_predicted < witnesses.times_predicted / decided().shapes.wide:
-            gains = there.gains(beside, _grown(radius, step))
-    gain = witnesses.blocks.tested(gains)
+        settled = [(each, witnesses.registered_with([*beside, _grown(each, step)])) for each in _RADII]
+        far, best = min(settled, key=lambda each: each[1].times_predicted)
+        if best.times_predicted < witnesses.times_predicted / decided().shapes.wide:
+            radius, there = far, best
+    gain = witnesses.blocks.tested(gains(radius))
     if gain is None:
         return None
     touched = raster.moved([_grown(radius + _NEAR_STEPS, step)], witnesses.disparity) != 0
-    return ShapeFound(_grown(radius, step), {"radius_px": step / np.sqrt(12)}, gain, touched)
+    uneven = min(there.blocks.std(gains, radius, 1.0), float(radius))
+    return ShapeFound(_grown(radius, step), {"radius_px": step * float(np.hypot(np.sqrt(1 / 12), uneven))}, gain, touched)
 
 
 def _grown(radius: int, step: float) -> EdgeFattening:

@@ -97,6 +97,10 @@ class Residuals(ABC):
         """With the spread that counts for means of many neighbours: root n times that of a mean of n."""
         return self
 
+    def shared_with(self, other: NDArray[np.int64]) -> FloatArray:
+        """(n,) covariance of each point's predicted noise with that of another, the row `other` (n,), by the reference's."""
+        return np.zeros(len(other))
+
     @property
     def candidates(self) -> Effects:
         """The effects that may be named."""

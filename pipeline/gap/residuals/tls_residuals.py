@@ -32,7 +32,11 @@ _LEAST_POWER = 1e-9
 
 @dataclass(frozen=True)
 class TlsResiduals(Residuals):
-    """Residuals of ranges, m. reference_error_m: standard deviation of each vertex of the reference along the rays."""
+    """Residuals of ranges, m.
+
+    reference_error_m: standard deviation of each vertex of the reference along the rays; of_relief: whether that is for the most
+    part relief between points, which means of neighbours do not share.
+    """
 
     sensor = "tls"
     planes = ("azimuth", "zenith")
@@ -41,6 +45,7 @@ class TlsResiduals(Residuals):
     called = "ranges of a laser scan"
     geometry: RayGeometry
     reference_error_m: float = 0.0
+    of_relief: bool = False
 
     @property
     def reference_variance(self) -> FloatArray:
@@ -51,17 +56,26 @@ class TlsResiduals(Residuals):
     def averaged(self) -> Self:
         """Neighbours share the errors of the vertices between them."""
         corner, weight = self.geometry.corner, self.geometry.weight
-        if not self.reference_error_m or corner is None or weight is None:
+        if not self.reference_error_m or self.of_relief or corner is None or weight is None:
             return self
         shared = np.sum(weight * np.bincount(corner.ravel(), weight.ravel())[corner], axis=1)
         variance = self.sigma**2 - self.reference_variance + self.reference_error_m**2 * shared
         return replace(self, sigma=np.sqrt(variance))
+
+    def shared_with(self, other: NDArray[np.int64]) -> FloatArray:
+        corner, weight = self.geometry.corner, self.geometry.weight
+        if not self.reference_error_m or corner is None or weight is None:
+            return super().shared_with(other)
+        same = corner[:, :, None] == corner[other][:, None]
+        return np.asarray(self.reference_error_m**2 * np.einsum("nab,na,nb->n", same, weight, weight[other]))
 
     def drawn_reference(self, random: KeyedRandom) -> FloatArray:
         """(n,) a draw of what the errors of the reference's vertices do to ranges that are measured on it, m."""
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
             return np.zeros(len(self))
+        if self.of_relief:
+            return np.asarray(np.sqrt(self.reference_variance) * random.generator().standard_normal(len(self)))
         errors = self.reference_error_m * random.generator().standard_normal(int(corner.max(initial=0)) + 1)
         return np.asarray(np.sum(weight * errors[corner], axis=1))
 
@@ -124,6 +138,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         geometry=geometry,
         notes=_notes(measurement),
         reference_error_m=measurement.reference_error_m,
+        of_relief=measurement.planes is not None and not along_planes,
     )
     return whole.part(hit)
 
