@@ -18,6 +18,7 @@ from pipeline.formats.laz import read_laz
 from pipeline.formats.measurement import Measurement, read_measurement
 from pipeline.gap.decisions import read_decisions
 from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.splitting import split_of_noises
 from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
@@ -46,6 +47,20 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[GapDiagnosis, Measure
     write_scan(folder, 1, step_rad=0.05)
     measurement = read_measurement(folder)
     return diagnose(measurement), measurement
+
+
+@pytest.mark.parametrize(
+    ("name", "alike", "expected"),
+    [
+        ("tls.range_noise", "tls.range_noise_proportional", "the same rock from another range"),
+        ("tls.range_noise_incidence", "tls.range_noise", "the same rock at another angle of incidence"),
+        ("stereo.parallax_noise", "stereo.regularization_noise", "disparities of every pixel"),
+    ],
+)
+def test_noises_are_split_by_what_they_depend_on(name: str, alike: str, expected: str) -> None:
+    """A second distance does not tell white disparities from smooth ones."""
+    item = Named(name, "physical", {"name": name.partition(".")[2]}, {}, (alike,), 0.002, 80.0)
+    assert split_of_noises(item, name.partition(".")[0]).startswith(expected)
 
 
 @pytest.mark.parametrize("pictures", [True, False])

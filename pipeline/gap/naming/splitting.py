@@ -14,6 +14,15 @@ _IN_GENERAL = {
     "tls": "a second station at another range and azimuth, or targets of known position",
     "stereo": "a second distance, or check points of known position across the whole frame",
 }
+_NOISES = {
+    "tls.range_noise_proportional": "the same rock from another range",
+    "tls.range_noise_incidence": "the same rock at another angle of incidence",
+    "tls.range_noise_intensity": "rock of another reflectance at the same range",
+    "tls.angle_noise": "rock that is inclined otherwise at the same range",
+    "stereo.regularization_noise": "disparities of every pixel, of which neighbours share this noise and no white one",
+    "stereo.texture_noise": "rock with another texture",
+}
+"""What shows, of noises that depend on something, whether they do; white noise depends on nothing."""
 
 
 def with_splits(measurement: Measurement, named: list[Named]) -> list[Named]:
@@ -24,10 +33,17 @@ def with_splits(measurement: Measurement, named: list[Named]) -> list[Named]:
     return [replace(item, split_by=_split(found, item)) if item.alike else item for item in named]
 
 
+def split_of_noises(item: Named, sensor: str) -> str:
+    """What would show which of some noises it is, by what they depend on."""
+    return " or ".join(_NOISES[name] for name in (item.name, *item.alike) if name in _NOISES) or _IN_GENERAL[sensor]
+
+
 def _split(found: Identifiability, item: Named) -> str:
+    if item.spreads:
+        return split_of_noises(item, found.sensor)
     known = [found.names.index(name) for name in item.alike if name in found.names]
     if item.name not in found.names or len(known) < len(item.alike):
-        return _IN_GENERAL[found.sensor]  # effects on the spread have no signature in the mean
+        return _IN_GENERAL[found.sensor]  # lost returns, and effects beside edges, have no signature in the mean
     own = found.names.index(item.name)
     cosine = {each.name: max(float(each.cosines[own, other]) for other in known) for each in found.extensions}
     best = min(cosine, key=lambda name: cosine[name])
