@@ -14,7 +14,7 @@ from pipeline.gap.mean.mean_model import MeanModel
 from pipeline.gap.mean.normal_equations import NoiseDraws
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.held_out import _Registered
-from pipeline.gap.other.spread import share_of_spread, standardised
+from pipeline.gap.other.spread import TimesPredicted, standardised
 from pipeline.gap.residuals import cells
 from pipeline.gap.residuals.cells import Cells, patches
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
@@ -132,8 +132,8 @@ def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_tak
     residuals = replace(residuals, sigma=np.full(len(pixels), np.sqrt(WHITE**2 + field.variance)))
     found = Cells.over(residuals.at)
     assert np.nanmean(standardised(residuals, found, residuals.value) ** 2) < 0.8
-    assert share_of_spread(residuals, found, residuals.value, KeyedRandom(1)) == 1.0
-    assert share_of_spread(residuals, found, 0.7 * residuals.value, KeyedRandom(1)) == pytest.approx(0.7, rel=0.2)
+    assert TimesPredicted.of(residuals, found, residuals.value, KeyedRandom(1)).share == 1.0
+    assert TimesPredicted.of(residuals, found, 0.7 * residuals.value, KeyedRandom(1)).share == pytest.approx(0.7, rel=0.2)
 
 
 @pytest.mark.slow

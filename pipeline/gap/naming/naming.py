@@ -29,7 +29,7 @@ from pipeline.gap.naming.families import believes, families_of
 from pipeline.gap.naming.relinearised import Explained, SearchedPoints, at_points, beyond, followed_up, noisier, undone, weighed
 from pipeline.gap.other.locking import find_locking
 from pipeline.gap.other.quantization import find_comb
-from pipeline.gap.other.spread import SpreadFound, SpreadTried, find_spread, share_of_spread
+from pipeline.gap.other.spread import SpreadFound, SpreadTried, TimesPredicted, find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.registration import registered
@@ -55,8 +55,8 @@ class Naming:
     deviation of the reference.
 
     moving: names of the effects on the mean; p_value, p_alone: of what remains beside all of them, and without any; None where
-    nothing was tried; share: `share_of_spread`; spreads: how many predicted sigmas the residuals spread beside the effects on the
-    mean.
+    nothing was tried; times: that they spread within cells, 1 where an effect says why; spreads: how many predicted sigmas the
+    residuals spread beside the effects on the mean.
     """
 
     tried: tuple[Tried, ...]
@@ -64,7 +64,7 @@ class Naming:
     moving: frozenset[str]
     p_value: float | None
     p_alone: float | None
-    share: float
+    times: TimesPredicted
     notes: tuple[str, ...]
     identifiability: dict[str, Any]
     reference_sigma: float
@@ -148,7 +148,7 @@ def name_effects(
     moving = [from_mean(each, found.at) for each in found.estimates]
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
-    share = 1.0 if spread else share_of_spread(found.at, design.cells, left, random)
+    times = TimesPredicted(1.0, False) if spread else TimesPredicted.of(found.at, design.cells, left, random)
     notes = (*part.notes, *_words(left_out), *filter(None, [words]), *_repeats(found.estimates), *_slanting(found))
     p_value = found.search.p_of_rest(found.tried)
     alone = first.tried(()) if moving else ()
@@ -159,7 +159,7 @@ def name_effects(
     shown = tuple(item for item in tried if not item.name.startswith(PLACE))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
     spreads = nmad(left / found.at.sigma, 0.0)
-    naming = Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, share, notes, table, sigma, spreads)
+    naming = Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, times, notes, table, sigma, spreads)
     angles = [each for each in moving if each.effect is AngleEmpirical]
     if angles and not believes(measurement, AngleEmpirical.tag()):
         return _with_angles(measurement, whole, angles, naming, random, left_out)

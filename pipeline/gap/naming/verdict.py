@@ -27,6 +27,9 @@ _NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px",
 STILL_OPEN = (
     "Effects were named, but most of the gap stays open: the model is rejected with them too, and nothing else explains it."
 )
+STILL_WIDE = (
+    "Effects were named, but with them too the residuals spread far more than the model predicts, and nothing explains that."
+)
 NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
 MUCH_MOVED = "Much of the wall is not where the reference has it: of what is left nothing can be said of the sensor."
 TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
@@ -90,8 +93,9 @@ class Evidence:
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
     def only_too_noisy(self, named: Sequence[Named]) -> bool:
-        """Whether the model's noise is too large and nothing else was found to be wrong."""
-        return self.spread < 1.0 and not (named or self.rejects or self.far or self.too_wide)
+        """Whether the model's noise is too large and nothing else was found to be wrong: with a lower one the floor is met."""
+        open_still = self.gap is not None and self.gap.left_open and not self.agrees
+        return self.spread < 1.0 and not (named or self.rejects or self.far or self.too_wide or open_still)
 
 
 def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
@@ -102,7 +106,7 @@ def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
         if evidence.gap is None and not evidence.rejects:
             return "insufficient_data"
         return "no_gap" if evidence.agrees else "unknown"
-    if evidence.stays_open or any(item.kind == "empirical" for item in named):
+    if evidence.stays_open or evidence.too_wide or any(item.kind == "empirical" for item in named):
         return "unknown"
     if len(named) > 1:
         return "several"
@@ -116,7 +120,9 @@ def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> s
     if verdict in ("no_gap", "unknown") and evidence.only_too_noisy(named):
         return TOO_NOISY
     if verdict == "unknown" and not any(item.kind == "empirical" for item in named):
-        return STILL_OPEN if named else NOT_DESCRIBED
+        if not named:
+            return NOT_DESCRIBED
+        return STILL_OPEN if evidence.stays_open else STILL_WIDE
     return VERDICTS[verdict]
 
 

@@ -137,13 +137,13 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         reference_sigma=naming.reference_sigma,
         largest=decided().points.outlier * state.scale,
         random=random,
-        lower=lower_noise(there.model, _of_model(naming.share, plain)),
+        lower=lower_noise(there.model, _of_model(naming.times.share, plain)),
     )
     shown, harmful = showing.show(held.named)
-    notes = [*naming.notes, *too_noisy(naming.share, showing.lower), *held.words, *harmful]
+    notes = [*naming.notes, *too_noisy(naming.times.share, showing.lower), *held.words, *harmful]
     far = held.tails.share if held.tails is not None and held.tails.even else 0.0
-    wide = 1.0 if any(item.spreads for item in shown.named) else naming.spreads
-    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.share, far, wide=wide)
+    wide = 1.0 if any(item.spreads for item in shown.named) else naming.times.value
+    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.times.share, far, wide=wide)
     notes = [*notes, *unexplained(evidence, notes)]
     evidence = _with_moved(evidence, there, state, shown)
     if evidence.much_moved:

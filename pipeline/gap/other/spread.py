@@ -235,18 +235,28 @@ def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray
     return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * more))
 
 
-def share_of_spread(residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> float:
-    """How many of the predicted standard deviations the residuals really spread where that is clearly less, else 1.
+@dataclass(frozen=True)
+class TimesPredicted:
+    """How many of the predicted standard deviations residuals really spread within cells. below: whether blocks all over the wall
+    agree that it is less."""
 
-    No effect takes noise away: the model's own is too large.
-    """
-    z = standardised(residuals, cells, value)
-    kept = np.isfinite(z)
-    squared = np.minimum(z[kept] ** 2, _CUT**2) / _expected_square(residuals, cells, random)
-    means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
-    below = float(means.sum()) < -decided().spread.block_sigmas * float(np.linalg.norm(means))
-    share = float(np.sqrt(squared.mean()))
-    return share if below and share < decided().spread.too_noisy else 1.0
+    value: float
+    below: bool
+
+    @classmethod
+    def of(cls, residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> TimesPredicted:
+        """Of residuals (n,) without the effects on the mean; a few that are far off do not make it more."""
+        z = standardised(residuals, cells, value)
+        kept = np.isfinite(z)
+        squared = np.minimum(z[kept] ** 2, _CUT**2) / _expected_square(residuals, cells, random)
+        means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
+        below = float(means.sum()) < -decided().spread.block_sigmas * float(np.linalg.norm(means))
+        return cls(float(np.sqrt(squared.mean())), below)
+
+    @property
+    def share(self) -> float:
+        """The same where it is clearly less than 1, else 1: no effect takes noise away, the model's own is too large."""
+        return self.value if self.below and self.value < decided().spread.too_noisy else 1.0
 
 
 def _expected_square(residuals: Residuals, cells: Cells, random: KeyedRandom) -> float:
