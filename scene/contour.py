@@ -33,7 +33,7 @@ def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> F
     tops = _highest_vertex(caster.mesh, [_Hull(points) for points in outlines])
     bare = np.flatnonzero(np.isneginf(tops))
     if bare.size:
-        tops[bare] = highest_under(caster, [outlines[index] for index in bare])
+        tops[bare] = highest_under(caster, [outlines[index] for index in bare.tolist()])
     return tops
 
 
