@@ -1,6 +1,6 @@
 """F1 of detectors against the windows that they have learned from: what more training would give.
 
-    python benchmarks/detector_curve.py --set runs/test [--set another] 38448=before 54458=later 70478=default [--write]
+    python benchmarks/detector_curve.py --set runs/test [--set another] 38448=before 54468=later 70488=default [--write]
 
 Each detector is named with its windows, and its folder. Sets and detections as in detector_table.py, the detections kept in a
 folder beside each set's that is named by the windows. Means over the cells of both sensors at a score of 0.95, masks. --write

@@ -152,14 +152,15 @@ def summary(network: dict[str, Score], baseline: dict[str, Score]) -> str:
     """The comparison as a sentence, with the mean over the cells."""
     lowest = next(iter(baseline.values())).confidence
     beaten = sum(score.f1 < ENOUGH for score in baseline.values())
-    cells = [key for key, score in baseline.items() if score.f1 < ENOUGH and not network[key].f1 > score.f1]
+    worse = [key for key, score in baseline.items() if score.f1 < ENOUGH and network[key].f1 < score.f1]
+    level = sum(score.f1 < ENOUGH and network[key].f1 == score.f1 for key, score in baseline.items())
     blocks = [score.true_positives + score.false_negatives for score in network.values()]
     spread = 100 * max(math.sqrt(0.25 / max(count, 1)) for count in blocks)
-    worst = f"; it is not better in: {', '.join(cells)}" if cells else ""
+    better = f"{beaten - len(worse) - level} of the {beaten} cells in which the baseline has less than 95 %"
+    others = [f"level in {level}"] * bool(level) + [f"worse in {', '.join(worse)}"] * bool(worse)
     return (
         f"Mean F1 over {len(network)} cells: detector {100 * mean_f1(network):.1f} %, baseline {100 * mean_f1(baseline):.1f} % "
-        f"(scores of {lowest:g} or more). The detector is better in "
-        f"{beaten - len(cells)} of the {beaten} cells in which the baseline has less than 95 %{worst}. "
+        f"(scores of {lowest:g} or more). The detector is better in {'; '.join([better, *others])}. "
         f"{min(blocks)} to {max(blocks)} blocks a cell; a cell's standard error is at most {spread:.1f} %."
     )
 
