@@ -74,13 +74,13 @@ class Tested:
         truth = json.loads((folder / "test" / "annotations.json").read_text(encoding="utf-8"))
         return cls(placement_of(folder), truth, *(detections(each, folder / "test", out) for each in (model, BASELINE)))
 
-    def on(self, sensor: str) -> Cells:
-        """The cells of one sensor."""
+    def on(self, *sensors: str) -> Cells:
+        """The cells of the sensors, taken together."""
         cells: dict[str, list[int]] = {}
         for image in self.truth["images"]:
-            if image["sensor"] == sensor:
+            if image["sensor"] in sensors:
                 cells.setdefault(f"{image['wall']} {image['noise']} {image['size_class']}", []).append(image["id"])
-        return Cells(self, sensor, cells)
+        return Cells(self, " and ".join(SENSORS[sensor] for sensor in sensors), cells)
 
 
 def placement_of(folder: Path) -> str:
@@ -100,10 +100,10 @@ def detections(model: str, folder: Path, out: Path) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of one set and sensor: ids of images by `wall noise size`."""
+    """The cells of one set: ids of images by `wall noise size`. sensors: whose images, in words."""
 
     tested: Tested
-    sensor: str
+    sensors: str
     images: dict[str, list[int]]
 
     def network(self, bar: Bar) -> dict[str, Score]:
@@ -181,10 +181,19 @@ def means(every: Sequence[Cells]) -> Iterator[str]:
                 reachable = min(bound, reference)
                 lacks = reference - reachable, reachable - found, found - drawn
                 yield (
-                    f"| {cells.tested.placement} | {SENSORS[cells.sensor]} | {size} | {noise} | {found:.0f}, {drawn:.0f} "
+                    f"| {cells.tested.placement} | {cells.sensors} | {size} | {noise} | {found:.0f}, {drawn:.0f} "
                     f"| {boxes_found:.0f}, {boxes_drawn:.0f} | {rival[0]:.0f}, {rival[1]:.0f} | {bound:.0f} | {reference:.0f} "
                     f"| {', '.join(f'{each:.0f}' for each in lacks)} |"
                 )
+
+
+def total(cells: Cells) -> str:
+    """The means over all cells as a sentence."""
+    figures = [f"{100 * mean_f1(each(bar)):.1f}" for each in (cells.network, cells.baseline) for bar in (BARS[0], BARS[2])]
+    return (
+        f"{cells.tested.placement}, {cells.sensors} together, mean F1 of masks over {len(cells.images)} cells at 0.25 and 0.75: "
+        f"detector {figures[0]} and {figures[1]} %, baseline {figures[2]} and {figures[3]} %."
+    )
 
 
 def bound_of(share: float) -> float:
@@ -220,12 +229,13 @@ def main() -> None:
     parser.add_argument("--out", default="found", help="name of the folder, beside each set's, for the detections")
     parser.add_argument("--write", action="store_true", help="put the tables into docs/")
     arguments = parser.parse_args()
-    every = []
-    for folder in arguments.folders:
-        tested = Tested.of(folder, arguments.model, folder.with_name(f"{folder.name}_{arguments.out}"))
-        every += [tested.on(sensor) for sensor in SENSORS]
-    parts = [line for cells in every for line in (f"## {cells.tested.placement}, {SENSORS[cells.sensor]}", "", *tables(cells))]
-    details, overview = "\n".join(parts).rstrip(), "\n".join(means(every))
+    tests = [Tested.of(each, arguments.model, each.with_name(f"{each.name}_{arguments.out}")) for each in arguments.folders]
+    every = [tested.on(sensor) for tested in tests for sensor in SENSORS]
+    parts = [line for cells in every for line in (f"## {cells.tested.placement}, {cells.sensors}", "", *tables(cells))]
+    details, overview = (
+        "\n".join(parts).rstrip(),
+        "\n".join([*means(every), "", *(total(tested.on(*SENSORS)) for tested in tests)]),
+    )
     print(details, overview, sep="\n\n")
     if arguments.write:
         write_between(DOCS / "detector_tables.md", MARKS, details)
