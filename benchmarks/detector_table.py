@@ -1,13 +1,14 @@
 """F1 of a detector and of the threshold baseline, beside the thesis's: four walls x three levels of noise x three sizes.
 
     scarpsim dataset configs/datasets/detector_test.yaml --out runs/detector_test       # goes on where it was interrupted
-    python benchmarks/detector_table.py --set runs/detector_test [--model default] [--write]
+    python benchmarks/detector_table.py --set runs/detector_test [--set another] [--model default] [--write]
 
-To reach: more than the baseline wherever the baseline has less than 95 %. Detections are kept under --out and not made again.
-Confidence 0.95, and an IoU of 0.25 (was the block found?) and of 0.75 (how well is it drawn?) of masks and of boxes; of boxes at
-0.75 the thesis has tables 5-9 to 5-12. The baseline gets the lowest score to count, of a few, that
-is best for it over all cells. Beside it how many blocks stand out from the noise at all. --write puts the tables into
-docs/detector.md.
+Each set, named by where its blocks lie (`rockfall.placement`), gets tables of the stereo pair's maps and of the laser
+scanner's. Detections are kept in a folder beside the set's (--out) and not made again. Confidence 0.95, and an IoU of 0.25 (was
+the block found?) and of 0.75 (how well is it drawn?) of masks and of boxes; of boxes at 0.75 the thesis has tables 5-9 to 5-12.
+To reach: more than the baseline wherever the baseline has less than 95 %. The baseline gets the lowest score to count, of a
+few, that is best for it over the cells of a table. --write puts the tables into docs/detector_tables.md, their means over the
+walls into docs/detector.md.
 """
 
 from __future__ import annotations
@@ -15,23 +16,24 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pipeline.change.annotate import STANDS_OUT
+from documents import write_between
+
 from pipeline.detection.evaluate import Overlap, Score, evaluate
 from pipeline.detection.run import BASELINE, LOWEST_SCORE, detect
-from pipeline.formats.atomic import write_text
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
+DOCS = Path(__file__).parents[1] / "docs"
 MARKS = "<!-- table -->", "<!-- end of table -->"
 CONFIDENCE, FOUND, DRAWN = 0.95, 0.25, 0.75
 BASELINE_SCORES = (LOWEST_SCORE, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
 ENOUGH = 0.95
 SIZES = ("small", "medium", "large")
+SENSORS = {"stereo": "stereo pair", "tls": "laser scanner"}
 THESIS = {
     "glendale-b": {"2.5cm": (82.1, 93.6, 95.1), "5cm": (72.8, 89.0, 94.4), "7.5cm": (39.3, 84.0, 93.3)},
     "bulga-b": {"2.5cm": (86.7, 96.6, 94.1), "5cm": (74.8, 90.8, 94.7), "7.5cm": (46.3, 84.6, 93.1)},
@@ -39,24 +41,8 @@ THESIS = {
     "pilkington": {"2.5cm": (83.1, 94.0, 95.1), "5cm": (59.0, 84.2, 94.9), "7.5cm": (40.1, 75.5, 93.7)},
 }
 """F1 of small, medium and large blocks, %, tables 5-9 to 5-12."""
+LEVELS = tuple(THESIS["glendale-b"])
 Coco = dict[str, Any]
-
-
-def detections(model: str, folder: Path, out: Path) -> list[dict[str, Any]]:
-    """What the model finds in the set's tests, made once."""
-    path = out / "detections.json"
-    if not path.exists():
-        detect(model, [folder], out, confidences=(LOWEST_SCORE,), pictures=False)
-    return list(json.loads(path.read_text(encoding="utf-8"))["annotations"])
-
-
-def cells_of(truth: Coco, sensors: tuple[str, ...]) -> dict[str, list[int]]:
-    """Ids of the images by `wall noise size`."""
-    cells: dict[str, list[int]] = {}
-    for image in truth["images"]:
-        if image["sensor"] in sensors:
-            cells.setdefault(f"{image['wall']} {image['noise']} {image['size_class']}", []).append(image["id"])
-    return cells
 
 
 @dataclass(frozen=True)
@@ -67,108 +53,193 @@ class Bar:
     kind: Overlap
 
     def __str__(self) -> str:
-        return f"F1 at an IoU of {'masks' if self.kind == 'segm' else 'boxes'} of {self.iou:g}, %:"
+        return f"IoU of {'masks' if self.kind == 'segm' else 'boxes'} of {self.iou:g}"
 
 
-def scores(truth: Coco, found: list[dict[str, Any]], confidence: float, bar: Bar, sensors: tuple[str, ...]) -> dict[str, Score]:
-    """By `wall noise size`."""
-    counted = evaluate(truth, found, cells_of(truth, sensors), (confidence,), (bar.iou,), bar.kind)
-    return {score.group: score for score in counted}
+BARS = (Bar(FOUND, "segm"), Bar(FOUND, "bbox"), Bar(DRAWN, "segm"), Bar(DRAWN, "bbox"))
 
 
-def best_scores(truth: Coco, found: list[dict[str, Any]], bar: Bar, sensors: tuple[str, ...]) -> dict[str, Score]:
-    """As `scores`, at the one of BASELINE_SCORES with the largest mean F1."""
-    choices = [scores(truth, found, lowest, bar, sensors) for lowest in BASELINE_SCORES]
-    return max(choices, key=_mean_f1)
+@dataclass(frozen=True)
+class Tested:
+    """A test set and what the two detectors find in it. placement: of its blocks."""
+
+    placement: str
+    truth: Coco
+    network: list[dict[str, Any]]
+    baseline: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, folder: Path, model: str, out: Path) -> Tested:
+        """The set in `folder`; detections, which `out` keeps, are made once."""
+        truth = json.loads((folder / "test" / "annotations.json").read_text(encoding="utf-8"))
+        return cls(placement_of(folder), truth, *(detections(each, folder / "test", out) for each in (model, BASELINE)))
+
+    def on(self, *sensors: str) -> Cells:
+        """The cells of the sensors, taken together."""
+        cells: dict[str, list[int]] = {}
+        for image in self.truth["images"]:
+            if image["sensor"] in sensors:
+                cells.setdefault(f"{image['wall']} {image['noise']} {image['size_class']}", []).append(image["id"])
+        return Cells(self, " and ".join(SENSORS[sensor] for sensor in sensors), cells)
 
 
-def visible(truth: Coco, sensors: tuple[str, ...]) -> dict[str, str]:
-    """By `wall noise size`, how many % of the blocks stand out from the noise, to a filter that knows their shapes."""
-    ratios: dict[int, list[float]] = {image["id"]: [] for image in truth["images"]}
-    for block in truth["annotations"]:
-        ratios[block["image_id"]].append(block.get("signal_to_noise") or 0.0)
-    every = {cell: [one for number in numbers for one in ratios[number]] for cell, numbers in cells_of(truth, sensors).items()}
-    return {cell: f"{100 * sum(one > STANDS_OUT for one in found) / max(len(found), 1):.0f}" for cell, found in every.items()}
+def placement_of(folder: Path) -> str:
+    """Where the blocks of a set lie, by its dataset.json; several, joined by `and`, where its sizes or sources differ."""
+    sources = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))["sources"].values()
+    found = {size["rockfall"]["placement"] for source in sources for size in source["config"]["sizes"].values()}
+    return " and ".join(sorted(found))
 
 
-def table(network: dict[str, Score], baseline: dict[str, Score], last: dict[str, str], head: str) -> Iterator[str]:
-    """Rows of Markdown: detector, baseline and a third figure for each size, in %. head: of the third."""
-    yield "| wall | noise | " + " | ".join(f"{size}: detector, baseline, {head}" for size in SIZES) + " |"
-    yield "|---|---|" + "---|" * len(SIZES)
-    for wall, levels in THESIS.items():
-        for noise in levels:
-            keys = [f"{wall} {noise} {size}" for size in SIZES]
-            if all(key in network for key in keys):
-                cells = [f"{_marked(network[key], baseline[key])}, {100 * baseline[key].f1:.0f}, {last[key]}" for key in keys]
-                yield f"| {wall} | {noise} | " + " | ".join(cells) + " |"
+def detections(model: str, folder: Path, out: Path) -> list[dict[str, Any]]:
+    """What a detector finds in a set's tests, made once."""
+    path = out / (BASELINE if model == BASELINE else "network") / "detections.json"
+    if not path.exists():
+        detect(model, [folder], path.parent, confidences=(LOWEST_SCORE,), pictures=False)
+    return list(json.loads(path.read_text(encoding="utf-8"))["annotations"])
 
 
-def lost(network: dict[str, Score], baseline: dict[str, Score]) -> list[str]:
-    """The cells in which the baseline has less than 95 % and the detector no more than the baseline."""
-    return [key for key, score in baseline.items() if score.f1 < ENOUGH and not network[key].f1 > score.f1]
+@dataclass(frozen=True)
+class Cells:
+    """The cells of one set: ids of images by `wall noise size`. sensors: whose images, in words."""
+
+    tested: Tested
+    sensors: str
+    images: dict[str, list[int]]
+
+    def network(self, bar: Bar) -> dict[str, Score]:
+        """The detector's scores by cell."""
+        return self._scores(self.tested.network, CONFIDENCE, bar)
+
+    def baseline(self, bar: Bar) -> dict[str, Score]:
+        """The baseline's, at the one of BASELINE_SCORES with the largest mean F1."""
+        return max((self._scores(self.tested.baseline, lowest, bar) for lowest in BASELINE_SCORES), key=mean_f1)
+
+    def _scores(self, found: list[dict[str, Any]], confidence: float, bar: Bar) -> dict[str, Score]:
+        counted = evaluate(self.tested.truth, found, self.images, (confidence,), (bar.iou,), bar.kind)
+        return {score.group: score for score in counted}
+
+    @cached_property
+    def visible(self) -> dict[str, float]:
+        """Share of the blocks that stand out from the noise, to a filter that knows their shapes."""
+        return {name: score.stand_out for name, score in self.network(BARS[0]).items()}
+
+
+def tables(cells: Cells) -> Iterator[str]:
+    """Lines of Markdown: a table for each bar."""
+    for bar in BARS:
+        network, baseline = cells.network(bar), cells.baseline(bar)
+        head = "stand out" if bar.iou == FOUND else "thesis"
+        yield from (
+            f"F1 at an {bar}, %:",
+            "",
+            "| wall | noise | " + " | ".join(f"{size}: detector, baseline, {head}" for size in SIZES) + " |",
+        )
+        yield "|---|---|" + "---|" * len(SIZES)
+        for wall in THESIS:
+            for noise in LEVELS:
+                keys = [f"{wall} {noise} {size}" for size in SIZES]
+                third = [100 * cells.visible[key] if bar.iou == FOUND else thesis(key) for key in keys]
+                pairs = [_marked(network[key], baseline[key]) for key in keys]
+                yield (
+                    f"| {wall} | {noise} | "
+                    + " | ".join(f"{pair}, {figure:.0f}" for pair, figure in zip(pairs, third, strict=True))
+                    + " |"
+                )
+        yield from ("", summary(network, baseline), "")
 
 
 def summary(network: dict[str, Score], baseline: dict[str, Score]) -> str:
     """The comparison as a sentence, with the mean over the cells."""
-    means = [100 * _mean_f1(each) for each in (network, baseline)]
     lowest = next(iter(baseline.values())).confidence
     beaten = sum(score.f1 < ENOUGH for score in baseline.values())
-    cells = lost(network, baseline)
+    worse = [key for key, score in baseline.items() if score.f1 < ENOUGH and network[key].f1 < score.f1]
+    level = sum(score.f1 < ENOUGH and network[key].f1 == score.f1 for key, score in baseline.items())
     blocks = [score.true_positives + score.false_negatives for score in network.values()]
     spread = 100 * max(math.sqrt(0.25 / max(count, 1)) for count in blocks)
-    worst = f"; it is not better in: {', '.join(cells)}" if cells else ""
+    better = f"{beaten - len(worse) - level} of the {beaten} cells in which the baseline has less than 95 %"
+    others = [f"level in {level}"] * bool(level) + [f"worse in {', '.join(worse)}"] * bool(worse)
     return (
-        f"Mean F1 over {len(network)} cells: detector {means[0]:.1f} %, baseline {means[1]:.1f} % "
-        f"(scores of {lowest:g} or more). The detector is better in "
-        f"{beaten - len(cells)} of the {beaten} cells in which the baseline has less than 95 %{worst}. "
+        f"Mean F1 over {len(network)} cells: detector {100 * mean_f1(network):.1f} %, baseline {100 * mean_f1(baseline):.1f} % "
+        f"(scores of {lowest:g} or more). The detector is better in {'; '.join([better, *others])}. "
         f"{min(blocks)} to {max(blocks)} blocks a cell; a cell's standard error is at most {spread:.1f} %."
     )
 
 
-def _mean_f1(cells: dict[str, Score]) -> float:
-    return sum(score.f1 for score in cells.values()) / len(cells)
+def means(every: Sequence[Cells]) -> Iterator[str]:
+    """Lines of Markdown: means over the walls, and what parts the shortfall against the thesis has."""
+    heads = ("placement", "sensor", "size", "noise", "masks: 0.25, 0.75", "boxes: 0.25, 0.75", "baseline, masks: 0.25, 0.75")
+    yield f"| {' | '.join((*heads, 'bound', 'thesis', 'lacks: map, found, drawn'))} |"
+    yield "|---|---|---|---|---|---|---|---|---|---|"
+    for cells in every:
+        network, baseline = [cells.network(bar) for bar in BARS], [cells.baseline(bar) for bar in BARS]
+        for size in SIZES:
+            for noise in LEVELS:
+                keys = [f"{wall} {noise} {size}" for wall in THESIS]
+                found, boxes_found, drawn, boxes_drawn = (_mean(100 * scores[key].f1 for key in keys) for scores in network)
+                rival = [_mean(100 * scores[key].f1 for key in keys) for scores in (baseline[0], baseline[2])]
+                bound, reference = _mean(bound_of(cells.visible[key]) for key in keys), _mean(thesis(key) for key in keys)
+                reachable = min(bound, reference)
+                lacks = reference - reachable, reachable - found, found - drawn
+                yield (
+                    f"| {cells.tested.placement} | {cells.sensors} | {size} | {noise} | {found:.0f}, {drawn:.0f} "
+                    f"| {boxes_found:.0f}, {boxes_drawn:.0f} | {rival[0]:.0f}, {rival[1]:.0f} | {bound:.0f} | {reference:.0f} "
+                    f"| {', '.join(f'{each:.0f}' for each in lacks)} |"
+                )
+
+
+def total(cells: Cells) -> str:
+    """The means over all cells as a sentence."""
+    figures = [f"{100 * mean_f1(each(bar)):.1f}" for each in (cells.network, cells.baseline) for bar in (BARS[0], BARS[2])]
+    return (
+        f"{cells.tested.placement}, {cells.sensors} together, mean F1 of masks over {len(cells.images)} cells at 0.25 and 0.75: "
+        f"detector {figures[0]} and {figures[1]} %, baseline {figures[2]} and {figures[3]} %."
+    )
+
+
+def bound_of(share: float) -> float:
+    """F1, %, of a detector that finds that share of the blocks and nothing else."""
+    return 100 * 2 * share / (1 + share)
+
+
+def thesis(cell: str) -> float:
+    """The thesis's F1 of a cell, %."""
+    wall, noise, size = cell.split()
+    return THESIS[wall][noise][SIZES.index(size)]
+
+
+def mean_f1(cells: dict[str, Score]) -> float:
+    """The mean over the cells."""
+    return _mean(score.f1 for score in cells.values())
+
+
+def _mean(values: Iterator[float]) -> float:
+    every = list(values)
+    return sum(every) / len(every)
 
 
 def _marked(score: Score, rival: Score) -> str:
     text = f"{100 * score.f1:.0f}"
-    return f"**{text}**" if score.f1 > rival.f1 else text
+    return f"{f'**{text}**' if score.f1 > rival.f1 else text}, {100 * rival.f1:.0f}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--set", type=Path, required=True, dest="folder", help="the set that detector_test.yaml makes")
+    parser.add_argument("--set", type=Path, required=True, action="append", dest="folders", help="what detector_test.yaml makes")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
-    parser.add_argument("--out", type=Path, help="for the detections (default: a folder beside the set's)")
-    parser.add_argument("--sensors", nargs="+", default=["stereo", "tls"])
-    parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
+    parser.add_argument("--out", default="found", help="name of the folder, beside each set's, for the detections")
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/")
     arguments = parser.parse_args()
-    test, out = arguments.folder / "test", arguments.out or arguments.folder.with_name(f"{arguments.folder.name}_found")
-    truth = json.loads((test / "annotations.json").read_text(encoding="utf-8"))
-    sensors = tuple(arguments.sensors)
-    found, rival = detections(arguments.model, test, out / "network"), detections(BASELINE, test, out / BASELINE)
-    thesis = {
-        f"{wall} {noise} {size}": f"{figure:.0f}"
-        for wall, levels in THESIS.items()
-        for noise, figures in levels.items()
-        for size, figure in zip(SIZES, figures, strict=True)
-    }
-    parts = []
-    seen = visible(truth, sensors)
-    tables: list[tuple[Bar, dict[str, str], str]] = [
-        (Bar(FOUND, "segm"), seen, "stand out"),
-        (Bar(FOUND, "bbox"), seen, "stand out"),
-    ]
-    tables += [(Bar(DRAWN, "segm"), thesis, "thesis"), (Bar(DRAWN, "bbox"), thesis, "thesis")]
-    for bar, third, head in tables:
-        network = scores(truth, found, CONFIDENCE, bar, sensors)
-        baseline = best_scores(truth, rival, bar, sensors)
-        parts += [str(bar), "", *table(network, baseline, third, head), "", summary(network, baseline), ""]
-    text = "\n".join(parts).rstrip()
-    print(text)
+    tests = [Tested.of(each, arguments.model, each.with_name(f"{each.name}_{arguments.out}")) for each in arguments.folders]
+    every = [tested.on(sensor) for tested in tests for sensor in SENSORS]
+    parts = [line for cells in every for line in (f"## {cells.tested.placement}, {cells.sensors}", "", *tables(cells))]
+    details, overview = (
+        "\n".join(parts).rstrip(),
+        "\n".join([*means(every), "", *(total(tested.on(*SENSORS)) for tested in tests)]),
+    )
+    print(details, overview, sep="\n\n")
     if arguments.write:
-        document = DOCUMENT.read_text(encoding="utf-8")
-        first, last = MARKS
-        write_text(DOCUMENT, re.sub(f"{first}.*{last}", lambda _: f"{first}\n{text}\n{last}", document, flags=re.DOTALL))
+        write_between(DOCS / "detector_tables.md", MARKS, details)
+        write_between(DOCS / "detector.md", MARKS, overview)
 
 
 if __name__ == "__main__":

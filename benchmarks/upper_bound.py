@@ -10,11 +10,12 @@ table into docs/detector.md.
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from documents import write_between
 
 from pipeline.change.annotate import STANDS_OUT, AnnotationConfig, block_annotations
 from pipeline.config.bundled import bundled_config
@@ -22,11 +23,12 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.dataset.config import load_dataset_config
 from pipeline.dataset.epoch import with_count
 from pipeline.dataset.plan import planned_epochs, simulation_of
-from pipeline.formats.atomic import write_text
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.site import prepare_site
+from scene.contour import median_under
 from scene.keyed_random import KeyedRandom
+from scene.wall import Wall
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- bound -->", "<!-- end of bound -->"
@@ -49,18 +51,29 @@ def rows(width_m: float, height_m: float) -> Iterator[str]:
                 rockfall = simulation.rockfall.model_copy(update={"placement": placement})
                 way = {"wall": wall, "rockfall": rockfall, "reconstruction": reconstruction, "depth_map": depth_map}
                 found = observed(simulation.model_copy(update=way), config.sizes[size].blocks_per_m2)
-                shares.append(f"{100 * np.mean(np.array(found[0]) > STANDS_OUT):.0f} %")
-                depths += found[1]
-                filled += found[2]
+                shares.append(f"{100 * np.mean(np.array(found.ratios) > STANDS_OUT):.0f} %")
+                depths += found.depths
+                filled += found.filled
             name = f"{reconstruction}, {depth_map}" if reconstruction == "direct" else reconstruction
             figures = f"{100 * np.median(depths):.1f} cm | {100 * np.mean(filled):.0f} %"
             yield f"| {name} | {placement} | {size} | {' | '.join(shares)} | {figures} |"
 
 
-def observed(config: SimulationConfig, blocks_per_m2: float) -> tuple[list[float], list[float], list[float]]:
-    """Of each block of one epoch the signal-to-noise ratio, the niche's depth, m, and the share of its box that it fills."""
+@dataclass(frozen=True)
+class Niches:
+    """Of the blocks of one epoch: signal-to-noise ratios; depths of the niches that show, m, and the shares of their boxes that
+    they fill; rise: how far the blocks' centres lie above the median surface within their contours, m."""
+
+    ratios: list[float]
+    depths: list[float]
+    filled: list[float]
+    rise: list[float]
+
+
+def observed(config: SimulationConfig, blocks_per_m2: float, given: Wall | None = None) -> Niches:
+    """What one epoch shows of its blocks. given: a wall that takes the place of the config's."""
     random, progress = KeyedRandom(config.seed), Progress()
-    site = prepare_site(config, "stereo", random)
+    site = prepare_site(config, "stereo", random, given)
     reference = observe_reference(config, site, random, progress)
     grid = reference.raster.grid
     count = max(1, round(blocks_per_m2 * grid.width * grid.height * grid.gsd**2))
@@ -68,7 +81,11 @@ def observed(config: SimulationConfig, blocks_per_m2: float) -> tuple[list[float
     ratios = [block["signal_to_noise"] or 0.0 for block in epoch.blocks]
     shown = list(block_annotations(epoch.raster.block, AnnotationConfig(minimum_area_px=1)))
     depths = [epoch.blocks[each["block"] - 1]["volume_m3"] / (each["area"] * grid.gsd**2) for each in shown]
-    return ratios, depths, [each["area"] / (each["bbox"][2] * each["bbox"][3]) for each in shown]
+    filled = [each["area"] / (each["bbox"][2] * each["bbox"][3]) for each in shown]
+    solids = epoch.solids
+    outlines = np.split(solids.vertices[:, :2], solids.vertex_start[1:-1])
+    rise = solids.position_m[:, 2] - median_under(reference.caster, outlines)
+    return Niches(ratios, depths, filled, rise.tolist())
 
 
 def main() -> None:
@@ -82,10 +99,7 @@ def main() -> None:
         print(row, flush=True)
         table.append(row)
     if arguments.write:
-        first, last = MARKS
-        text = "\n".join(table)
-        document = re.sub(f"{first}.*{last}", lambda _: f"{first}\n{text}\n{last}", DOCUMENT.read_text(), flags=re.DOTALL)
-        write_text(DOCUMENT, document)
+        write_between(DOCUMENT, MARKS, "\n".join(table))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag
 
 from scene.config import Config
-from scene.contour import highest_under, median_under
+from scene.contour import highest_under, highest_vertex_under, median_under
 from scene.distributions import Distribution, Gaussian
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
@@ -62,14 +62,17 @@ class RockfallConfig(Config):
     subdivisions: int = Field(
         2, ge=0, le=4, description="fineness: a sphere has 20 * 4^n triangles (2: 320), a cube about as many"
     )
-    placement: Literal["relief", "mean_surface"] = Field(
+    placement: Literal["relief", "highest_vertex", "mean_surface"] = Field(
         "relief",
-        description="a block's centre lies at the highest relief within its contour, as in the thesis, or on the median surface "
-        "there, which makes niches about twice as deep",
+        description="a block's centre lies at the highest relief within its contour, at the highest of the wall's vertices "
+        "there, which lies lower on a coarser mesh, or on the median surface, which makes niches about twice as deep",
     )
     safe_zone_offset_m: float = Field(0.5, ge=0, description="distance that blocks keep from the wall's border and its holes")
     minimum_distance_m: float = Field(0.1, ge=0, description="distance between the bounding boxes of two blocks, in x or in y")
     maximum_attempts: int = Field(2000, ge=1, description="positions tried for a block before giving up")
+
+
+_HEIGHTS = {"relief": highest_under, "highest_vertex": highest_vertex_under, "mean_surface": median_under}
 
 
 @dataclass(frozen=True)
@@ -138,8 +141,8 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
     caster: of this mesh, where one exists already. A block keeps its shape and is tried at positions drawn uniformly from the
     safe zone until its bounding box lies in the zone and far enough from the others'; large blocks come first, so that
     small ones do not take their room. Its height follows the thesis, 3.3, with the sign mended: the middle of its z range
-    lies at the largest z of the wall within its contour (`placement: relief`), or at the median z there (`mean_surface`). Where
-    it would then not reach into the rock it is placed anew.
+    lies at the largest z of the wall within its contour (`placement: relief`), of the wall's vertices alone (`highest_vertex`),
+    or at the median z there (`mean_surface`). Where it would then not reach into the rock it is placed anew.
     Raises InputError where blocks are larger than the wall or find no room.
     """
     caster = caster or RayCaster(mesh)
@@ -148,7 +151,7 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
     _require_fit(solids, mesh)
     zone = safe_zone(caster, config.safe_zone_offset_m)
     search = _Placing(config, zone, solids, random)
-    surface_under = highest_under if config.placement == "relief" else median_under
+    surface_under = _HEIGHTS[config.placement]
     position = np.zeros((len(solids), 3))
     area = np.array([np.ptp(solid.bbox[:, :2], axis=0).prod() for solid in solids])
     _require_room(area, zone)

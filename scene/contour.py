@@ -28,6 +28,15 @@ def highest_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArr
     return np.maximum(tops, _highest_vertex(caster.mesh, hulls))
 
 
+def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
+    """(k,) the largest z of the wall's vertices within each contour, m; where it holds none, as `highest_under`."""
+    tops = _highest_vertex(caster.mesh, [_Hull(points) for points in outlines])
+    bare = np.flatnonzero(np.isneginf(tops))
+    if bare.size:
+        tops[bare] = highest_under(caster, [outlines[index] for index in bare.tolist()])
+    return tops
+
+
 def median_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
     """(k,) the median z of the wall over each contour, m; -inf where there is no wall. outlines: as in `highest_under`."""
     found = _heights(caster, [_Hull(points) for points in outlines], edges=False)

@@ -80,7 +80,21 @@ RESOLVED = (
     "scarpsim train sets/small --out detector",
     "scarpsim train sets/small --config configs/detectors/fine.yaml --out detector",
     "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.epochs=24 --out detector",
-    "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.start=default --out further",
+    "scarpsim dataset configs/datasets/detector.yaml --seed 14 --set parts.0.val=0 --set name=detector3 "
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/three",
+    'scarpsim dataset configs/datasets/detector.yaml --seed 15 --set parts.0.train=0 --set "parts.0.walls=[glendale,near]" '
+    '--set "parts.0.noise=[2.5cm,7.5cm]" --set name=detector4 '
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/four",
+    "scarpsim dataset configs/datasets/detector_test.yaml --out sets/detector_test_mean --set name=detector-test-mean-surface "
+    "--set parts.0.test=1 "
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface",
+    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --set training.start=detector/best "
+    "--set training.learning_rate=0.001 --set training.epochs=20 --set training.keep_epochs=10 --out further",
+    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --set training.start=default "
+    "--set training.learning_rate=0.001 --out more",
 )
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
@@ -91,6 +105,7 @@ PARSED = (
     "scarpsim dataset verify sets/small --report-only",
     "scarpsim dataset merge sets/a sets/b --out sets/ab",
     "scarpsim dataset merge sets/one sets/two --out sets/detector",
+    "scarpsim dataset merge sets/one sets/three sets/four --out sets/mixed",
     "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
     "scarpsim detect detector/best runs/bulga",
     "scarpsim detect detector/best runs/bulga --out found",

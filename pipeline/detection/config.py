@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from pipeline.config.overrides import apply_overrides
 from scene.config import Config, load_yaml, parse
 
-CHECKPOINT, BEST, EVENTS, CURVES = "checkpoint", "best", "events", "losses.png"
+CHECKPOINT, BEST, STAGE, EVENTS, CURVES = "checkpoint", "best", "stage", "events", "losses.png"
 """What a training writes into its folder."""
 Loss = Literal["proposal_class", "proposal_box", "class", "box", "mask"]
 
@@ -118,6 +118,11 @@ class TrainingConfig(Config):
     )
     stop_window: int = Field(10, ge=2, le=100_000, description="epochs over which the slope of the validation loss is averaged")
     stop_slope: float = Field(0.0, ge=0, description="stop once the loss falls by less than this per epoch; 0: never")
+    keep_epochs: int = Field(
+        0,
+        ge=0,
+        description="keep the detector of every so many epochs too, in folders stage_0004, ... (0: the best and the last)",
+    )
     seed: int = Field(1, ge=0, lt=2**63, description="of weights, order, flips and samples")
 
 

@@ -12,7 +12,7 @@ import keras
 import numpy as np
 
 from pipeline.detection import weights
-from pipeline.detection.config import BEST, CHECKPOINT, CURVES, EVENTS, TrainConfig
+from pipeline.detection.config import BEST, CHECKPOINT, CURVES, EVENTS, STAGE, TrainConfig
 from pipeline.detection.data import CocoFolder, batches
 from pipeline.detection.figures import write_loss_figure
 from pipeline.detection.model import LOSSES, MaskRCNN, total_loss
@@ -58,7 +58,7 @@ class History:
 def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = False, progress: Progress | None = None) -> History:
     """Train a detector on DATA_SET/train, validate on DATA_SET/val; the best and the last go to out/best and out/checkpoint.
 
-    At the end the best one's scores are shifted as `set_operating_point` says.
+    At the end the scores of the best one, and of those that `keep_epochs` keeps, are shifted as `set_operating_point` says.
 
     With `resume` it goes on after the last whole epoch in `out`, to the same losses as without the interruption. Raises
     InputError for a data set without these folders and for an `out` that holds another training.
@@ -85,7 +85,8 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
             _save(out, config, model, history)
             write_loss_figure(history.training, history.validation, out / CURVES)
     with progress.stage("scores"):
-        set_operating_point(out / BEST, folders[1])
+        for folder in (out / BEST, *sorted(out.glob(f"{STAGE}_*"))):
+            set_operating_point(folder, folders[1])
     return history
 
 
@@ -163,6 +164,8 @@ def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> 
         np.savez(temporary, **values)
     if history.total[-1] == min(history.total):
         weights.save(model, out / BEST)
+    if config.training.keep_epochs and epoch % config.training.keep_epochs == 0:
+        weights.save(model, out / f"{STAGE}_{epoch:04d}")
     state = {**names, "config": config.model_dump(mode="json"), "training": history.training, "validation": history.validation}
     write_json(folder / _STATE, state)
     for old in folder.glob("epoch_*"):

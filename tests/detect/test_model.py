@@ -145,7 +145,7 @@ def test_a_training_step_is_deterministic(data_set, eager):
 
 @pytest.mark.slow
 def test_a_killed_training_goes_on_to_the_same_curve(data_set, tmp_path, eager):
-    short = {"batch": 2, "warm_up_steps": 2, "epochs": 3, "learning_rate": 1e-3}
+    short = {"batch": 2, "warm_up_steps": 2, "epochs": 3, "learning_rate": 1e-3, "keep_epochs": 2}
     config = TrainConfig(detector=SMALL, training=TrainingConfig(**short))
     whole = train(data_set, config, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
@@ -155,8 +155,15 @@ def test_a_killed_training_goes_on_to_the_same_curve(data_set, tmp_path, eager):
     resumed = train(data_set, config, tmp_path / "killed", resume=True)
     assert resumed.training == whole.training
     assert resumed.validation == whole.validation
-    for name in ("best/detector.yaml", "best/model.weights.h5", "losses.png", "checkpoint/state.json"):
+    for name in (
+        "best/detector.yaml",
+        "best/model.weights.h5",
+        "losses.png",
+        "checkpoint/state.json",
+        "stage_0002/model.weights.h5",
+    ):
         assert (tmp_path / "killed" / name).is_file()
+    assert not (tmp_path / "killed" / "stage_0003").exists()
     assert set(whole.training[0]) == {"loss", *LOSSES}
     again = weights.load(tmp_path / "killed" / "best")
     image = _batch(data_set / "train")["image"]

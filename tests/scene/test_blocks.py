@@ -123,6 +123,20 @@ def test_the_relief_is_that_within_the_contour(wall: TriangleMesh, size: float) 
     assert np.all(tops >= exact - 8e-3)
 
 
+def test_a_block_at_the_highest_vertex_lies_there_or_where_there_is_none_at_the_highest_relief(wall: TriangleMesh) -> None:
+    """Vertices are 0.08 m apart, so that a contour of 0.04 m holds one or none."""
+    holding = set()
+    for size in (0.04, 0.4):
+        blocks = place_blocks(config(count=30, size_m=size, placement="highest_vertex"), wall, RANDOM)
+        tops = highest_under(RayCaster(wall), outlines(blocks))
+        for outline, height, top in zip(outlines(blocks), blocks.position_m[:, 2], tops, strict=True):
+            lines = ConvexHull(outline).equations
+            inside = np.all(wall.vertices[:, :2] @ lines[:, :2].T + lines[:, 2] <= 0, axis=1)
+            holding.add(bool(inside.any()))
+            assert height == pytest.approx(wall.vertices[inside, 2].max() if inside.any() else top, abs=1e-12)
+    assert holding == {True, False}
+
+
 def test_a_block_on_the_mean_surface_lies_at_the_median_height_and_takes_more_rock(wall: TriangleMesh) -> None:
     caster = RayCaster(wall)
     volumes = {}

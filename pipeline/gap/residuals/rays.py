@@ -54,9 +54,8 @@ class Met:
 
     Of a reference made of points the incidence is that to planes through 24 of them, and so is the normal where noise is most of
     their scatter: triangles lean by the noise of their corners, which is that of the distance too, so that whatever is
-    proportional to a slope would seem to be there. bulge:
-    (n,) by how much nearer the surface lies than the triangle, part of the distance, m; scatter: (n,) of the points about planes,
-    over the typical one. corner, weight: (n, 3) as in `RayGeometry`.
+    proportional to a slope would seem to be there. bulge: (n,) by how much nearer the surface then lies than the triangle, part of
+    the distance, m; scatter: (n,) of the points about planes, over the typical one. corner, weight: (n, 3) as in `RayGeometry`.
     """
 
     distance: FloatArray
@@ -99,28 +98,37 @@ def turned(found: Met, nominal: FloatArray, real: FloatArray) -> Met:
 
 
 def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, points: FloatArray) -> Met:
-    """With planes through the points (v, 3) in place of the triangles', and the surface bent as they turn from one to the next.
-
-    Height over a triangle with barycentric coordinates b: the sum over its sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i)
-    (p_j - p_i) / 8 is the height of an arc over its chord.
-    """
-    corner, weight = found.corner, found.weight
+    """With planes through the points (v, 3); where these are noise, in place of the triangles, and the surface bent over those."""
+    corner = found.corner
     assert corner is not None
-    assert weight is not None
     normal = planes.normal[corner]
     normal = normal * np.where(np.einsum("nki,ni->nk", normal, found.normal) < 0, -1.0, 1.0)[..., None]
     mean = normal.mean(axis=1)
     mean /= np.linalg.norm(mean, axis=1, keepdims=True)
-    at, height = points[corner], np.zeros(len(ray))
+    cosine = np.abs(np.einsum("ni,ni->n", ray, mean))
+    scatter = planes.along(ray, corner).max(axis=1) / planes.typical_m
+    found = replace(found, cos_incidence=cosine, scatter=scatter)
+    if not planes.of_noise:
+        return found
+    towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
+    bulge = towards * _height(found, normal, points) / np.maximum(cosine, _LEAST_COSINE)
+    return replace(found, distance=found.distance - bulge, normal=mean, bulge=bulge)
+
+
+def _height(found: Met, normal: FloatArray, points: FloatArray) -> FloatArray:
+    """(n,) of a surface over its triangles whose normals at the corners are (n, 3 corners, 3).
+
+    With barycentric coordinates b the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i) (p_j - p_i) / 8 is the
+    height of an arc over its chord.
+    """
+    corner, weight = found.corner, found.weight
+    assert corner is not None
+    assert weight is not None
+    at, height = points[corner], np.zeros(len(corner))
     for i, j in ((0, 1), (1, 2), (2, 0)):
         arc = np.einsum("ni,ni->n", normal[:, j] - normal[:, i], at[:, j] - at[:, i]) / 8
         height += 4 * weight[:, i] * weight[:, j] * arc
-    cosine = np.abs(np.einsum("ni,ni->n", ray, mean))
-    towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
-    bulge = towards * height / np.maximum(cosine, _LEAST_COSINE)
-    scatter = planes.along(ray, corner).max(axis=1) / planes.typical_m
-    slanting = mean if planes.of_noise else found.normal
-    return replace(found, distance=found.distance - bulge, normal=slanting, cos_incidence=cosine, bulge=bulge, scatter=scatter)
+    return height
 
 
 def _barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:

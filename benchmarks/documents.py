@@ -1,0 +1,15 @@
+"""Tables of measurements in documents."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from pipeline.formats.atomic import write_text
+
+
+def write_between(path: Path, marks: tuple[str, str], text: str) -> None:
+    """Put a text between two marks of a document, in place of what is there."""
+    first, last = marks
+    document = path.read_text(encoding="utf-8")
+    write_text(path, re.sub(f"{first}.*{last}", lambda _: f"{first}\n{text}\n{last}", document, flags=re.DOTALL))
