@@ -54,8 +54,8 @@ class Met:
 
     Of a reference made of points the incidence is that to planes through 24 of them, and so is the normal where noise is most of
     their scatter: triangles lean by the noise of their corners, which is that of the distance too, so that whatever is
-    proportional to a slope would seem to be there. bulge: (n,) by how much nearer the surface then lies than the triangle, part of
-    the distance, m; scatter: (n,) of the points about planes, over the typical one. corner, weight: (n, 3) as in `RayGeometry`.
+    proportional to a slope would seem to be there. bulge: (n,) by how much nearer the surface then lies than the triangle, part
+    of the distance, m; scatter: (n,) of the points about planes, over the typical one. corner, weight: as in `RayGeometry`.
     """
 
     distance: FloatArray
@@ -98,7 +98,7 @@ def turned(found: Met, nominal: FloatArray, real: FloatArray) -> Met:
 
 
 def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, points: FloatArray) -> Met:
-    """With planes through the points (v, 3); where these are noise, in place of the triangles, and the surface bent over those."""
+    """With planes through the points (v, 3); where those are noise, in place of triangles, and the surface bent over these."""
     corner = found.corner
     assert corner is not None
     normal = planes.normal[corner]
