@@ -25,6 +25,7 @@ class AngleNoise(Effect):
         "The beam's directions scatter more than the model says: seen on slanting rock, where a direction's error becomes depth."
     )
     act = "Simulate and plan with the value found; set the tripod firmly, out of the wind, and check that it does not turn."
+    told_by = "rock that is inclined otherwise at the same range"
     sensor = "tls"
     stage = Stage.AIM
     shows_in = ShowsIn.SPREAD

@@ -70,7 +70,8 @@ class Effect(Config, ABC):
     What else is to be known of it stands here too, so that no other place decides by its name:
     shows_in; looks_at: its own pulse or pixel (`element`), neighbouring ones, or the whole scan or image; needs: fields that a
     measurement must have; catalogue: whether `scarpsim gap` may name it; empirical: a term that has no name; planned: whether a
-    plan takes it into account; means, act: what it says of an instrument, and what to do about it, in sentences;
+    plan takes it into account; means, act: what it says of an instrument, and what to do about it, in sentences; told_by: what to
+    measure to tell it, if it is a noise that depends on something, from others;
     searched: of a sine; sets: of its parameters that are tried (default: all that switch it on,
     together); trials: a parameter that is not fitted, with the values that are tried; shared: whether neighbours scatter alike;
     held_out_gain: log score on held-out data up to which it is not believed.
@@ -88,6 +89,7 @@ class Effect(Config, ABC):
     planned: ClassVar[bool] = False
     means: ClassVar[str] = ""
     act: ClassVar[str] = ""
+    told_by: ClassVar[str] = ""
     searched: ClassVar[Search | None] = None
     sets: ClassVar[tuple[tuple[str, ...], ...]] = ()
     trials: ClassVar[tuple[str, tuple[float, ...]] | None] = None

@@ -16,6 +16,7 @@ class RangeNoiseIncidence(RangeSpread):
     name: Literal["range_noise_incidence"] = "range_noise_incidence"
     means = "Ranges scatter more on slanting rock."
     act = "Simulate and plan with the value found; give slanting parts a station that faces them."
+    told_by = "the same rock at another angle of incidence"
     sigma_m: float = parameter(
         "standard deviation at 60 degrees of incidence", unit="m", source="Soudarissanane et al. 2011", typical=0.002, ge=0, le=10
     )

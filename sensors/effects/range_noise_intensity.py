@@ -22,6 +22,7 @@ class RangeNoiseIntensity(RangeSpread):
         "Simulate and plan with the value found; scan dry rock, nearer, or at a lower pulse rate, which gives each "
         "pulse more energy."
     )
+    told_by = "rock of another reflectance at the same range"
     needs = ("power",)
     trials = ("exponent", (-0.5, -0.75, -1.0))
     a_m: float = parameter(

@@ -16,6 +16,7 @@ class RangeNoiseProportional(RangeSpread):
     name: Literal["range_noise_proportional"] = "range_noise_proportional"
     means = "Ranges scatter more the farther the rock: less light returns, or the air is unsteady."
     act = "Simulate and plan with the value found; move nearer, or average several scans."
+    told_by = "the same rock from another range"
     ppm: float = parameter("standard deviation per range", unit="ppm", source="datasheets", typical=20.0, ge=0, le=1e5)
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:

@@ -29,6 +29,7 @@ class RegularizationNoise(NodeNoise):
         "Simulate and plan with the value found: averaging neighbours does not lower it. A matcher with less smoothing, "
         "or another look, does."
     )
+    told_by = "disparities of every pixel, of which neighbours share this noise and no white one"
     order = 30
     sigma_px: float = parameter("standard deviation at the nodes", unit="px", source="empirical", typical=0.2, ge=0, le=1000)
 

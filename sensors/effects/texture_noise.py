@@ -35,6 +35,7 @@ class TextureNoise(Effect):
     name: Literal["texture_noise"] = "texture_noise"
     means = "Disparities scatter more where the rock has little texture."
     act = "Simulate and plan with the value found; side light, sharper focus and finer pixels bring texture out."
+    told_by = "rock with another texture"
     sensor = "stereo"
     stage = Stage.MATCH
     shows_in = ShowsIn.SPREAD

@@ -159,7 +159,7 @@ def test_missing_rock_is_positive_of_both_sensors(few: tuple[GapDiagnosis, Measu
     residuals = replace(found.residuals, unit_m=np.full(len(deeper), unit), sigma=sigma, value=deeper)
     case = replace(found, residuals=residuals, before=deeper, after=deeper)
     if sensor == "stereo":
-        own = {field.name: getattr(residuals, field.name) for field in fields(residuals)}
+        own = {field.name: getattr(residuals, field.name) for field in fields(StereoResiduals)}
         geometry = PixelGeometry(**dict.fromkeys((field.name for field in fields(PixelGeometry)), deeper))
         case = replace(case, residuals=StereoResiduals(**own | {"geometry": geometry}), model_after=StereoModel())
     report.write(tmp_path, case, measurement)

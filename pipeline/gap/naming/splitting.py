@@ -8,21 +8,13 @@ from pipeline.formats.measurement import Measurement
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
 from pipeline.gap.survey.planned import measured_survey
+from sensors.effects import effect_of
 
 _POINTS = 4000
 _IN_GENERAL = {
     "tls": "a second station at another range and azimuth, or targets of known position",
     "stereo": "a second distance, or check points of known position across the whole frame",
 }
-_NOISES = {
-    "tls.range_noise_proportional": "the same rock from another range",
-    "tls.range_noise_incidence": "the same rock at another angle of incidence",
-    "tls.range_noise_intensity": "rock of another reflectance at the same range",
-    "tls.angle_noise": "rock that is inclined otherwise at the same range",
-    "stereo.regularization_noise": "disparities of every pixel, of which neighbours share this noise and no white one",
-    "stereo.texture_noise": "rock with another texture",
-}
-"""What shows, of noises that depend on something, whether they do; white noise depends on nothing."""
 
 
 def with_splits(measurement: Measurement, named: list[Named]) -> list[Named]:
@@ -34,8 +26,9 @@ def with_splits(measurement: Measurement, named: list[Named]) -> list[Named]:
 
 
 def split_of_noises(item: Named, sensor: str) -> str:
-    """What would show which of some noises it is, by what they depend on."""
-    return " or ".join(_NOISES[name] for name in (item.name, *item.alike) if name in _NOISES) or _IN_GENERAL[sensor]
+    """What would show which of some noises it is, by what they depend on; white noise depends on nothing."""
+    told = (effect_of(name).told_by for name in (item.name, *item.alike))
+    return " or ".join(filter(None, told)) or _IN_GENERAL[sensor]
 
 
 def _split(found: Identifiability, item: Named) -> str:

@@ -86,7 +86,9 @@ def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
     corner = scene.mesh.faces[face]
     weight = _barycentric(position + distance[:, None] * ray, scene.mesh.vertices[corner])
     found = replace(found, corner=corner, weight=weight)
-    return found if measurement.planes is None else _between_points(found, measurement.planes, ray, scene.mesh.vertices)
+    if measurement.planes is None:
+        return found
+    return _between_points(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
 
 
 def turned(found: Met, nominal: FloatArray, real: FloatArray) -> Met:
@@ -97,10 +99,13 @@ def turned(found: Met, nominal: FloatArray, real: FloatArray) -> Met:
     return replace(found, distance=distance, cos_incidence=np.abs(after))
 
 
-def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, points: FloatArray) -> Met:
-    """With planes through the points (v, 3); where those are noise, in place of triangles, and the surface bent over these."""
-    corner = found.corner
-    assert corner is not None
+_Triangles = tuple[IntArray, FloatArray, FloatArray]
+"""Of those met: their corners (n, 3), the weights of these (n, 3), and where they are (n, 3 corners, 3)."""
+
+
+def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, triangles: _Triangles) -> Met:
+    """With planes through the points; where those are noise, in place of triangles, and the surface bent over these."""
+    corner = triangles[0]
     normal = planes.normal[corner]
     normal = normal * np.where(np.einsum("nki,ni->nk", normal, found.normal) < 0, -1.0, 1.0)[..., None]
     mean = normal.mean(axis=1)
@@ -111,20 +116,18 @@ def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, points: Fl
     if not planes.of_noise:
         return found
     towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
-    bulge = towards * _height(found, normal, points) / np.maximum(cosine, _LEAST_COSINE)
+    bulge = towards * _height(normal, triangles) / np.maximum(cosine, _LEAST_COSINE)
     return replace(found, distance=found.distance - bulge, normal=mean, bulge=bulge)
 
 
-def _height(found: Met, normal: FloatArray, points: FloatArray) -> FloatArray:
+def _height(normal: FloatArray, triangles: _Triangles) -> FloatArray:
     """(n,) of a surface over its triangles whose normals at the corners are (n, 3 corners, 3).
 
     With barycentric coordinates b the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i) (p_j - p_i) / 8 is the
     height of an arc over its chord.
     """
-    corner, weight = found.corner, found.weight
-    assert corner is not None
-    assert weight is not None
-    at, height = points[corner], np.zeros(len(corner))
+    _, weight, at = triangles
+    height = np.zeros(len(weight))
     for i, j in ((0, 1), (1, 2), (2, 0)):
         arc = np.einsum("ni,ni->n", normal[:, j] - normal[:, i], at[:, j] - at[:, i]) / 8
         height += 4 * weight[:, i] * weight[:, j] * arc

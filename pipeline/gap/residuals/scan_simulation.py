@@ -56,7 +56,7 @@ class DirectedScanner(LaserScanner):
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
         """(n,) recorded ranges, m; NaN without a return."""
         pulses, beam = self.emitted(self.emit(), random)
-        straight = replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith) if self._along_planes else pulses
+        straight = replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith) if self._planes is not None else pulses
         pulses = self.measured(pulses, self.echo(scene, straight, beam, beam.received), random)
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
@@ -66,22 +66,21 @@ class DirectedScanner(LaserScanner):
         echo = replace(echo, **known)
         if self.between is not None and self.between.bulge_m is not None:
             echo = replace(echo, range_m=echo.range_m - on_device(mi.Float64, np.nan_to_num(self.between.bulge_m)))
-        if self._along_planes:
-            echo = replace(echo, range_m=echo.range_m * self._turned(pulses))
+        if self._planes is not None:
+            echo = replace(echo, range_m=echo.range_m * _turned(pulses, self._planes))
         return super().measured(pulses, echo, random)
 
     @property
-    def _along_planes(self) -> bool:
-        """Whether pulses that turn go along planes, not along the reference's triangles."""
-        return self.between is not None and self.between.plane_normal is not None
+    def _planes(self) -> FloatArray | None:
+        """(n, 3) normals of the planes along which pulses that turn go, None where they go along the reference's triangles."""
+        return None if self.between is None else self.between.plane_normal
 
-    def _turned(self, pulses: Pulses) -> mi.Float64:
-        """(n,) distance along a plane in the direction in which a pulse leaves, over that in the nominal one."""
-        assert self.between is not None
-        assert self.between.plane_normal is not None
-        normal = mi.Vector3d(*(on_device(mi.Float64, np.ascontiguousarray(each)) for each in self.between.plane_normal.T))
-        nominal, real = direction(pulses.azimuth, pulses.zenith), direction(pulses.aim_azimuth, pulses.aim_zenith)
-        return dr.dot(normal, nominal) / dr.dot(normal, real)
+
+def _turned(pulses: Pulses, normal: FloatArray) -> mi.Float64:
+    """(n,) distance along planes with normals (n, 3) in the direction in which a pulse leaves, over that in the nominal one."""
+    across = mi.Vector3d(*(on_device(mi.Float64, np.ascontiguousarray(each)) for each in normal.T))
+    nominal, real = direction(pulses.azimuth, pulses.zenith), direction(pulses.aim_azimuth, pulses.aim_zenith)
+    return dr.dot(across, nominal) / dr.dot(across, real)
 
 
 def _scanner(
