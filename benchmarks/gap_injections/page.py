@@ -60,10 +60,11 @@ Mended on 24 November 2026, after 45 of 76 right and 9 wrong:
 Since the evening of 24 November 2026 the error of a reference made of points is carried beside the instrument's noise, edges
 between its points have no say, and residuals that spread far more than predicted are no agreement
 ([why](README.md#references-made-of-points)). These 76 gained nothing by it, 45 right and 12 wrong after 48 and 10: on the
-forest's ground and on the rocks most of that error is relief. A fifth of the points fewer are looked at, and more relief counts as
-the reference's:
+forest's ground and on the rocks most of that error is relief. A fifth of the points fewer are looked at, and more relief counts
+as the reference's:
 
-- missed since: 21 and 22 (noise of 1 and 2 mm beside relief of 2.3 mm; the second is described as growing with the range), 34, 39;
+- missed since: 21 and 22 (noise of 1 and 2 mm beside relief of 2.3 mm; the second is described, as growing with the range), 34
+  and 39;
 - 41 (an offset of 10 mm among trees) is described as an error of an angle beside a wave of the range; 50 has an incidence bias
   beside it;
 - the rock face's own intensity bias is named less often than before (42, 44), and no gap is closed by it.
