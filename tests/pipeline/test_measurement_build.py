@@ -188,8 +188,10 @@ def test_half_of_a_scan_is_compared_with_the_other(case: Case, tmp_path: Path) -
     assert set(lines % 2) == {1}
     assert "every second line" in found.about["reference"][0]
     assert "nothing that changes slowly" in measurement.notes[0]
+    assert isinstance(measurement, TlsMeasurement)
     assert measurement.pattern is None
-    assert measurement.model.noise.range_sigma_m > 0.003
+    assert measurement.model.noise.range_sigma_m == 0.003, "of the instrument alone"
+    assert measurement.reference_error_m > 0.003
 
 
 def test_another_epoch_is_meshed_as_the_scanner_sees_it(case: Case, tmp_path: Path) -> None:
