@@ -18,6 +18,7 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.documents import write_between
 from benchmarks.gap_injections.bases import put_scanned
 from benchmarks.workshop import scan
 from pipeline.formats.laz import write_laz
@@ -28,7 +29,7 @@ from pipeline.gap.report.in_words import values as in_words
 from pipeline.measurement.build import build
 from pipeline.measurement.request import Request
 
-PAGE, MARK = Path("docs/gap/README.md"), ("<!-- reference points -->\n", "<!-- end of reference points -->\n")
+PAGE, MARKS = Path("docs/gap/README.md"), ("<!-- reference points -->", "<!-- end of reference points -->")
 STEP_DEG = 0.2
 MODEL = {"sensor": "tls", "noise": {"range_sigma_m": 0.001, "angle_sigma_rad": 5e-5}}
 PUT: dict[str, tuple[str, dict[str, float]]] = {
@@ -87,8 +88,7 @@ def main() -> None:
         put_scanned(folder, arguments.out / effect, effect, values, number)
         lines.append(row(title, arguments.out / effect)[0])
     if arguments.write:
-        before, after_mark = PAGE.read_text().split(MARK[0]), PAGE.read_text().split(MARK[1])
-        PAGE.write_text(before[0] + MARK[0] + "\n".join(lines) + "\n" + MARK[1] + after_mark[1])
+        write_between(PAGE, MARKS, "\n".join(lines))
 
 
 if __name__ == "__main__":
