@@ -12,7 +12,7 @@ compares the two.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -28,15 +28,13 @@ from pipeline.registration.register import IcpConfig, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.run.site import SensorSite
 from pipeline.surface.mesh import mesh_observation
-from scene.backend import mi
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray, TriangleMesh
 from scene.raycast import RayCaster
-from scene.upload import on_device
+from sensors.chosen import asked_for, looking_around
 from sensors.model import StereoModel, TlsModel
 from sensors.observation import Observation
-from sensors.pulses import Pulses
 from sensors.stereo import StereoPair
 from sensors.tls import LaserScanner
 
@@ -45,35 +43,6 @@ _LATTICE_POINTS = 4000
 _MARGIN_CELLS = 3
 _MARGIN_M = 0.05
 """Around a window, so that it stays covered when noise moves the cells."""
-
-
-@dataclass(frozen=True)
-class ChosenCells(StereoPair):
-    """A stereo pair that is asked for some cells of the left depth map only. chosen: (n,) their numbers, counted by row."""
-
-    chosen: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, dtype=np.uint32))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return len(self.chosen), 1
-
-    def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
-        index = on_device(mi.UInt32, self.chosen)
-        return index, *self.centres(index)
-
-
-@dataclass(frozen=True)
-class ChosenPulses(LaserScanner):
-    """A laser scanner that sends some pulses of its pattern only. chosen: (n,) their numbers, counted along the lines."""
-
-    chosen: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, dtype=np.uint32))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return len(self.chosen), 1
-
-    def emit(self) -> Pulses:
-        return self.pulses_at(on_device(mi.UInt32, self.chosen))
 
 
 @dataclass(frozen=True)
@@ -227,10 +196,8 @@ def _silent(model: Model) -> Model:
 
 def _asked(sensor: StereoPair | LaserScanner, model: Model, cells: NDArray[np.uint32] | None = None) -> Any:
     """The sensor with another model, asked for all its cells or for some."""
-    if cells is None:
-        return replace(sensor, model=model, truth=False)  # type: ignore[arg-type]
-    own = {each.name: getattr(sensor, each.name) for each in fields(sensor)} | {"model": model, "truth": False, "chosen": cells}
-    return ChosenCells(**own) if isinstance(sensor, StereoPair) else ChosenPulses(**own)
+    asked = replace(sensor, model=model, truth=False)  # type: ignore[arg-type]
+    return asked if cells is None else asked_for(asked, cells)
 
 
 def _checked(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
@@ -247,8 +214,7 @@ def _checked(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserSc
             where="reconstruction, surface",
             allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
         )
-    names = sorted({effect.name for effect in site.sensor.model.effects if effect.looks_at != "element"})
-    if names:
+    if names := looking_around(site.sensor.model):
         raise InputError(
             f"{', '.join(names)}: looks at the whole picture or scan, and only windows of it are simulated",
             where="sensor.effects",

@@ -18,8 +18,6 @@ well as its roughness tells it; normals estimated from noise determine nothing, 
 from __future__ import annotations
 
 import dataclasses
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -37,6 +35,7 @@ from pipeline.registration.closest_points import (
     scan_order,
 )
 from pipeline.registration.rigid import RigidTransform, rotation_matrix
+from pipeline.threads import executor
 from scene.config import Config
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
@@ -225,8 +224,8 @@ def register_to(
     moving = checked_cloud(moving, "moving points")
     if threads == 1:  # a pool of one thread would only cost the hand-over
         return _Alignment(surface, normals, moving, config, map).run(random)
-    with _executor(threads) as executor:
-        return _Alignment(surface, normals, moving, config, executor.map).run(random)
+    with executor(threads) as pool:
+        return _Alignment(surface, normals, moving, config, pool.map).run(random)
 
 
 def fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, threads: int | None = None) -> Fit:
@@ -234,9 +233,9 @@ def fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, thr
     normals = _normals(surface, config)
     local = checked_cloud(points, "points") - surface.origin
     gate = config.outlier_threshold_m(config.outlier_threshold_decay_iteration)
-    with _executor(threads) as executor:
+    with executor(threads) as pool:
         blocks = blocks_of(local[scan_order(local)])
-        moments = surface.moments(blocks, RigidTransform.identity(), gate, normals, executor.map)
+        moments = surface.moments(blocks, RigidTransform.identity(), gate, normals, pool.map)
     squares = np.trace(moments[3:6, 3:6]) if normals is None else moments[6, 6]
     inliers = int(moments[-1, -1])
     return Fit(len(local), inliers, float(np.sqrt(squares / inliers)) if inliers else float("nan"))
@@ -251,10 +250,6 @@ def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
             "point_to_plane needs the reference's normals", where="icp.method", remedy="give them or use point_to_point"
         )
     return surface.normals
-
-
-def _executor(threads: int | None) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads or len(os.sched_getaffinity(0)))
 
 
 @dataclass(frozen=True)

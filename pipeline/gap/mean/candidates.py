@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -145,22 +145,26 @@ class SineGrid:
         fixed = {**self.fixed, key: period}
         return Candidate(self.name, None, parameters, names, fixed, self.empirical, form, self.wave, period, angle=self.angle)
 
-    def chunks(self, rows: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
-        """Some frequencies at a time, with their columns (n, 2 f) times `rows` (n,): sine and cosine of each, one after another.
+    @property
+    def chunks(self) -> list[SineGrid]:
+        """Some frequencies at a time."""
+        starts = range(0, len(self.frequencies), _CHUNK)
+        return [replace(self, frequencies=self.frequencies[start : start + _CHUNK]) for start in starts]
+
+    def columns(self, rows: FloatArray) -> FloatArray:
+        """(n, 2 f) columns times `rows` (n,): sine and cosine of each frequency, one after another.
 
         Frequencies are evenly spaced, so that each is the one before turned by the same angle.
         """
         count = len(self.frequencies)
         spacing = float(self.frequencies[1] - self.frequencies[0]) if count > 1 else 0.0
-        factor, turn = self.wave.factor * rows, np.exp(2j * np.pi * spacing * self.wave.x)
-        for start in range(0, count, _CHUNK):
-            stop = min(start + _CHUNK, count)
-            columns = np.empty((2 * (stop - start), len(factor)))
-            phasor = factor * np.exp(2j * np.pi * float(self.frequencies[start]) * self.wave.x)
-            for row in range(stop - start):
-                columns[2 * row], columns[2 * row + 1] = phasor.imag, phasor.real
-                phasor = phasor * turn
-            yield slice(start, stop), columns.T
+        turn = np.exp(2j * np.pi * spacing * self.wave.x)
+        columns = np.empty((2 * count, len(rows)))
+        phasor = self.wave.factor * rows * np.exp(2j * np.pi * float(self.frequencies[0]) * self.wave.x)
+        for row in range(count):
+            columns[2 * row], columns[2 * row + 1] = phasor.imag, phasor.real
+            phasor = phasor * turn
+        return columns.T
 
     def part(self, rows: Rows) -> SineGrid:
         """The grid on some of the points."""

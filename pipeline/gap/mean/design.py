@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import Candidate, SineGrid, moved_to, precision_of
-from pipeline.gap.mean.mean_model import Covariance, MeanFit, MeanModel, Projected, fitted
+from pipeline.gap.mean.mean_model import Covariance, MeanFit, MeanModel, Projected, column_blocks, fitted
 from pipeline.gap.mean.normal_equations import Equations, NoiseDraws, Waves, assembled, extended, wave_products
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.threads import side_by_side
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
@@ -257,7 +258,8 @@ class Design:
 
 def _without(pose: FloatArray, columns: FloatArray) -> FloatArray:
     """A shift and a turn of a distant sensor are so much alike that the normal equations would lose what tells them apart."""
-    return columns - pose @ (pose.T @ columns)
+    found = side_by_side(lambda part: part - pose @ (pose.T @ part), column_blocks(columns))
+    return np.concatenate(found, axis=1)
 
 
 def _places(plain: list[Candidate], start: int) -> dict[Candidate, list[int]]:

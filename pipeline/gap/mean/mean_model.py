@@ -12,10 +12,11 @@ the covariance too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 from scipy import sparse
@@ -27,6 +28,7 @@ from scipy.special import j0
 from pipeline.gap.mean.within_noise import WithinNoise
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
+from pipeline.threads import side_by_side
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
@@ -40,6 +42,7 @@ _MOST_RATIOS = 6
 _WORSE = 12.0
 """A length of correlation whose likelihood falls short of the best by more, whatever is fitted, is not carried along."""
 _RIDGE = 1e-12
+_AT_ONCE = 32
 _NO_SLOPE = 1e-6
 """Share of a slope's square that a cell's points have to leave beside its mean and the other slope for it to be one."""
 _NOTHING = 1e-14
@@ -87,11 +90,13 @@ class MeanModel:
         self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))
         scale = typical * np.sqrt(self._total)
         distance = cdist(cells.centre, cells.centre) / cells.side_m
-        self._bases: list[tuple[FloatArray, FloatArray]] = []
-        for kernel in _correlations(distance):
-            half = self._whitened(kernel * np.outer(scale, scale))
+
+        def basis(correlation: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
+            half = self._whitened(correlation(distance) * np.outer(scale, scale))
             values, vectors = eigh(self._whitened(half.T), driver="evd", overwrite_a=True)
-            self._bases.append((np.maximum(values, 0.0), vectors))
+            return np.maximum(values, 0.0), vectors
+
+        self._bases: list[tuple[FloatArray, FloatArray]] = side_by_side(basis, _CORRELATIONS)
         self._white = Covariance(0, 0.0, np.ones(len(self._total)))
 
     def __len__(self) -> int:
@@ -112,14 +117,15 @@ class MeanModel:
         `Projected.kept` of what there is already.
         """
         ratios = [0.0, *map(float, _RATIOS)]
-        tops = np.empty((len(designs), len(self._bases)), dtype=int)
-        heights = np.empty(tops.shape)
-        for row, design in enumerate(designs):
-            normal = _Normal.of(design, value)
-            for basis in range(len(self._bases)):
-                tops[row, basis], heights[row, basis] = _highest(
-                    [partial(normal.log_likelihood, self._at(basis, ratio)) for ratio in ratios]
-                )
+        normals = [_Normal.of(design, value) for design in designs]
+
+        def highest(which: tuple[_Normal, int]) -> tuple[int, float]:
+            normal, basis = which
+            return _highest([partial(normal.log_likelihood, self._at(basis, ratio)) for ratio in ratios])
+
+        shape = len(designs), len(self._bases)
+        found = side_by_side(highest, product(normals, range(len(self._bases))))
+        tops, heights = (np.reshape(part, shape) for part in zip(*found, strict=True))
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
         narrower = copy(self)
         narrower._bases = [self._bases[basis] for basis in kept]
@@ -173,6 +179,9 @@ class MeanModel:
 
     def project(self, weighted: FloatArray) -> Projected:
         """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
+        return Projected.of(side_by_side(self._projected, column_blocks(weighted)))
+
+    def _projected(self, weighted: FloatArray) -> Projected:
         planes = self.planes(weighted)
         within = self.within(weighted, planes)
         return Projected(within, self._weighed(within), self.between(planes[: self.cells]))
@@ -191,16 +200,31 @@ class MeanModel:
         return [draws if index == at.length else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
 
 
-def _correlations(distance: FloatArray) -> Iterator[FloatArray]:
-    """Correlation matrices for cells at these distances, in cells."""
-    for length in _ROUGH:
-        reach = np.sqrt(3.0) * distance / length
-        yield (1 + reach) * np.exp(-reach)
-    for length in _SMOOTH:
-        yield np.exp(-0.5 * (distance / length) ** 2)
-    for length in _WAVY:
-        waves = length * np.geomspace(*_BAND)
-        yield np.mean([j0(2 * np.pi * distance / wave) for wave in waves], axis=0)
+def column_blocks(columns: FloatArray) -> list[FloatArray]:
+    """Some columns (n, k) at a time, for what is done to each of them."""
+    return [columns[:, start : start + _AT_ONCE] for start in range(0, max(columns.shape[1], 1), _AT_ONCE)]
+
+
+def _rough(length: float, distance: FloatArray) -> FloatArray:
+    reach = np.sqrt(3.0) * distance / length
+    return np.asarray((1 + reach) * np.exp(-reach))
+
+
+def _smooth(length: float, distance: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * (distance / length) ** 2))
+
+
+def _wavy(length: float, distance: FloatArray) -> FloatArray:
+    waves = length * np.geomspace(*_BAND)
+    return np.asarray(np.mean([j0(2 * np.pi * distance / wave) for wave in waves], axis=0))
+
+
+_CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
+    *(partial(_rough, length) for length in _ROUGH),
+    *(partial(_smooth, length) for length in _SMOOTH),
+    *(partial(_wavy, length) for length in _WAVY),
+]
+"""Correlations of cells at some distances, in cells."""
 
 
 @dataclass(frozen=True)
@@ -211,6 +235,17 @@ class Projected:
     within: FloatArray
     weighed: FloatArray
     between: list[FloatArray]
+
+    @classmethod
+    def of(cls, parts: Sequence[Projected]) -> Projected:
+        """The columns of some, one after another."""
+        if len(parts) == 1:
+            return parts[0]
+        within = np.concatenate([each.within for each in parts], axis=1)
+        white = all(each.weighed is each.within for each in parts)
+        weighed = within if white else np.concatenate([each.weighed for each in parts], axis=1)
+        bases = zip(*(each.between for each in parts), strict=True)
+        return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
 
     def some(self, columns: list[int]) -> Projected:
         """Some of the columns."""
@@ -224,10 +259,7 @@ class Projected:
 
     def beside(self, other: Projected) -> Projected:
         """These columns and then those of another."""
-        between = [np.concatenate(pair, axis=1) for pair in zip(self.between, other.between, strict=True)]
-        within = np.concatenate([self.within, other.within], axis=1)
-        white = self.weighed is self.within and other.weighed is other.within
-        return Projected(within, within if white else np.concatenate([self.weighed, other.weighed], axis=1), between)
+        return Projected.of([self, other])
 
 
 @dataclass(frozen=True)

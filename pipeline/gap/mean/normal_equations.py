@@ -12,12 +12,15 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
+from pipeline.threads import side_by_side
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
 _SMALLEST = 1e-9
 """Share of a column that others have to leave of it, in variance, for its gain to be told from rounding."""
 _RIDGE = 1e-12
+_AT_ONCE = 8
+"""Covariances."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +38,18 @@ class Waves:
     @classmethod
     def of(cls, model: MeanModel, grids: list[SineGrid], fixed: Projected, value: Projected, noise: NoiseDraws) -> Waves:
         """Of all sines of some grids."""
-        parts: list[tuple[FloatArray, ...]] = []
         beside = np.concatenate([fixed.weighed, value.weighed], axis=1)
-        for grid in grids:
-            for _, columns in grid.chunks(model.root):
-                planes = model.planes(columns)
-                means = planes[: model.cells]
-                products = columns.T @ beside
-                on_nodes = model.noise.on_nodes(columns, means)
-                own = (_squares(columns) - _squares(planes) - _squares(model.noise.halved(on_nodes))) / model.noise.white
-                parts.append((products, own, noise.products(model.within(columns, planes, noise.rows), on_nodes), means.T))
+
+        def some(grid: SineGrid) -> tuple[FloatArray, ...]:
+            columns = grid.columns(model.root)
+            planes = model.planes(columns)
+            means = planes[: model.cells]
+            on_nodes = model.noise.on_nodes(columns, means)
+            own = (_squares(columns) - _squares(planes) - _squares(model.noise.halved(on_nodes))) / model.noise.white
+            drawn = noise.products(model.within(columns, planes, noise.rows), on_nodes)
+            return columns.T @ beside, own, drawn, means.T
+
+        parts = side_by_side(some, [part for grid in grids for part in grid.chunks])
         count = fixed.within.shape[1]
         if not parts:
             empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
@@ -83,7 +88,7 @@ def _squares(columns: FloatArray) -> FloatArray:
 
 def wave_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
     """(2 w, k) of all sines with further columns (n, k), which are within cells and weighed."""
-    found = [columns.T @ weighed for grid in grids for _, columns in grid.chunks(root)]
+    found = side_by_side(lambda part: part.columns(root).T @ weighed, [part for grid in grids for part in grid.chunks])
     return np.concatenate(found) if found else np.zeros((0, weighed.shape[1]))
 
 
@@ -110,8 +115,14 @@ class Equations:
 
     def some(self, chosen: list[int]) -> Equations:
         """At some of the covariances."""
-        arrays = (self.fixed, self.right, self.constant, self.wave_fixed, self.wave_own, self.wave_right)
-        return Equations([self.at[index] for index in chosen], *(array[chosen] for array in arrays))
+        return Equations([self.at[index] for index in chosen], *(array[chosen] for array in self._arrays))
+
+    def _part(self, rows: slice) -> Equations:
+        return Equations(self.at[rows], *(array[rows] for array in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[FloatArray, ...]:
+        return self.fixed, self.right, self.constant, self.wave_fixed, self.wave_own, self.wave_right
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
         """(C, v) with the fixed columns `base`."""
@@ -127,6 +138,12 @@ class Equations:
     def profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Largest log-likelihoods over the covariances: (v,) of `base`, (f, v) with each list of columns added, (w, v) with each
         sine added."""
+        parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.at), _AT_ONCE)]
+        found = side_by_side(lambda part: part._profile(base, fixed), parts)
+        plain, gains, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
+        return plain, gains, waves
+
+    def _profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
         count = self.right.shape[2]
         wanted = sorted({column for columns in fixed for column in columns})
         place = {column: row for row, column in enumerate(wanted)}
@@ -174,24 +191,23 @@ def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: P
     between = model.between(waves.means)
     gram, right = fixed.within.T @ fixed.weighed, fixed.within.T @ value.weighed
     square = np.einsum("nv,nv->v", value.within, value.weighed)
-    columns: list[tuple[FloatArray, ...]] = []
-    for each in at:
+
+    def at_one(each: Covariance) -> tuple[FloatArray, ...]:
         basis, y, sines = fixed.between[each.length], value.between[each.length], between[each.length]
         weight = each.weight[:, None]
         turned = (sines * weight).T
         pairs = turned.reshape(-1, 2, len(weight)), sines.T.reshape(-1, 2, len(weight))
         constant = 0.5 * (np.log(each.weight).sum() - np.sum(y * weight * y, axis=0) - square)
-        columns.append(
-            (
-                gram + (basis * weight).T @ basis,
-                right + (basis * weight).T @ y,
-                constant,
-                waves.fixed + turned @ basis,
-                waves.own + pairs[0] @ pairs[1].transpose(0, 2, 1),
-                waves.right + turned @ y,
-            )
+        return (
+            gram + (basis * weight).T @ basis,
+            right + (basis * weight).T @ y,
+            constant,
+            waves.fixed + turned @ basis,
+            waves.own + pairs[0] @ pairs[1].transpose(0, 2, 1),
+            waves.right + turned @ y,
         )
-    return Equations(at, *(np.stack(parts) for parts in zip(*columns, strict=True)))
+
+    return Equations(at, *(np.stack(parts) for parts in zip(*side_by_side(at_one, at), strict=True)))
 
 
 def extended(

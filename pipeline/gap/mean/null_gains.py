@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.gap.mean.design import DRAWS, Design
+from pipeline.gap.mean.mean_model import Covariance
+from pipeline.threads import side_by_side
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 
@@ -27,13 +29,15 @@ class NullGains:
         near = design.equations.some(design.likely[:_NEAR_NULL])
         draws = design.model.null_draws(design.null, DRAWS, random.child("between"))
         sines = design.model.between(design.waves.means)
-        right, constant, waves = [], [], []
-        for at in near.at:
+
+        def values(at: Covariance) -> tuple[FloatArray, FloatArray, FloatArray]:
             weighted = draws[at.length] * at.weight[:, None]
-            constant.append(0.5 * (np.log(at.weight).sum() - np.sum(draws[at.length] * weighted, axis=0)))
-            right.append(design.drawn + design.fixed.between[at.length].T @ weighted)
-            waves.append(design.waves.noise + sines[at.length].T @ weighted)
-        drawn = near.of_values(np.stack(right), np.stack(constant), np.stack(waves))
+            constant = 0.5 * (np.log(at.weight).sum() - np.sum(draws[at.length] * weighted, axis=0))
+            right = design.drawn + design.fixed.between[at.length].T @ weighted
+            return right, constant, design.waves.noise + sines[at.length].T @ weighted
+
+        right, constant, waves = (np.stack(part) for part in zip(*side_by_side(values, near.at), strict=True))
+        drawn = near.of_values(right, constant, waves)
         plain, fixed, searched = drawn.profile(design.base, design.plain_columns)
         return cls(
             {

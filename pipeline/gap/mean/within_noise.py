@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
 
 from pipeline.gap.residuals.shared_noise import NodeField
 from scene.keyed_random import KeyedRandom
@@ -41,7 +42,7 @@ class WithinNoise:
             return cls(1.0, nodes, means, field.covariance, field.covariance)
         white = max(1 - field.variance * float(np.mean(inverse_sigma**2)), _LEAST_WHITE)
         prior = cholesky(field.covariance, lower=True)
-        matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * cho_solve((prior, True), np.eye(len(prior)))
+        matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * inverse_of(prior)
         return cls(white, nodes, means, prior, cholesky(matrix, lower=True))
 
     def of_means(self) -> FloatArray:
@@ -78,3 +79,9 @@ class WithinNoise:
             own = solve_triangular(self.prior, own, lower=True, trans="T")
         shared = self.nodes[rows].T @ white - self.means.T @ spread
         return self.solved(own - shared / np.sqrt(self.white))
+
+
+def inverse_of(root: FloatArray) -> FloatArray:
+    """(q, q) inverse of the matrix whose lower Cholesky factor is given."""
+    half = np.tril(dpotri(root, lower=True)[0])
+    return np.asarray(half + np.tril(half, -1).T)

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 from scipy.sparse import csr_array
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
+from pipeline.gap.mean.within_noise import inverse_of
 from pipeline.gap.naming.entries import Named, settled_with
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.registration import pose_of
@@ -107,7 +108,7 @@ class _Registered:
         if nodes.shape[1]:
             matrix = (nodes.T @ nodes.multiply(1 / own[:, None]) - node_sums.T @ node_sums.multiply(held[:, None])).toarray()
             prior = cholesky(field.covariance, lower=True)
-            root = cholesky(matrix + cho_solve((prior, True), np.eye(len(prior))), lower=True)
+            root = cholesky(matrix + inverse_of(prior), lower=True)
             right = nodes.T @ weighed - node_sums.T @ (held * sums)
             square -= np.sum(solve_triangular(root, right, lower=True) ** 2)
             size += 2 * np.sum(np.log(np.diag(root)) + np.log(np.diag(prior)))

@@ -9,6 +9,7 @@ Floor: the same score of draws of the model itself; no higher than the score aft
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +20,7 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.nominal_pair import NominalPair, project
+from pipeline.gap.residuals.disparity_simulation import simulate_disparities
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals
 from pipeline.gap.residuals.several_scans import simulate_departures
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -28,7 +29,6 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.model import StereoModel, TlsModel
-from sensors.stereo import REDUCTION, StereoPair
 
 MEASURE = "mean continuous ranked probability score of patches (mean and spread of their residuals) against simulated ones"
 LOSS_MEASURE = "mean Brier score of pulses (lost or not) against the chance of losing them"
@@ -106,40 +106,22 @@ class Version:
     pose: FloatArray
 
 
-def simulated(measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
-    """(n,) simulated minus geometric observable of the residuals' points, NaN without a return.
+def _simulated(
+    measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
+) -> FloatArray:
+    """(d, n) simulated minus geometric observable of the residuals' points, NaN without a return, for each source of random
+    numbers.
 
     measurement: with its sensor where it stood, against which `residuals` may be those of another place.
     """
     match measurement, model, residuals:
         case TlsMeasurement(), TlsModel(), TlsResiduals():
-            return simulate_departures(measurement, model, residuals, random)
+            return np.stack([simulate_departures(measurement, model, residuals, random) for random in randoms])
         case StereoMeasurement(), StereoModel(), StereoResiduals():
-            return _simulated_disparities(measurement, model, residuals, random)
+            return simulate_disparities(measurement, model, residuals, randoms)
         case SurfaceMeasurement(), StereoModel(), SurfaceResiduals():
-            return simulated_distances(model, residuals, random)
+            return np.stack([simulated_distances(model, residuals, random) for random in randoms])
     raise TypeError("measurement, model and residuals are of different sensors")
-
-
-def _simulated_disparities(
-    measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, random: KeyedRandom
-) -> FloatArray:
-    """Of the depth map's cell that holds each pixel; the finest depth map of whose grid the pixels are, or come nearest to.
-
-    measurement: with its cameras where they stood, against which `residuals` may be those of another place. Cells are two pixels
-    wide at least; by how much the reference's disparity differs between the middle of a cell and the pixel is taken off.
-    """
-    nominal, g = NominalPair.of(measurement), residuals.geometry
-    quality = min(REDUCTION, key=lambda name: float(np.mean(np.abs(np.mod(g.u, REDUCTION[name]) - REDUCTION[name] / 2))))
-    step = REDUCTION[quality]
-    pair = StereoPair(measurement.cameras, measurement.frame, model, quality)
-    points = pair.observe(measurement.scene, random).points
-    rows = np.clip((g.v / step).astype(int), 0, points.shape[0] - 1)
-    columns = np.clip((g.u / step).astype(int), 0, points.shape[1] - 1)
-    seen = points[rows, columns]
-    found = nominal.disparity(project(nominal.pair.left, seen), project(nominal.pair.right, seen))
-    middle = nominal.of_surface(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
-    return np.asarray(found - g.disparity - (middle - nominal.of_surface(measurement.scene, g.u, g.v)))
 
 
 def measure_gap(
@@ -219,7 +201,7 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
 
 def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
     stood = measurement.moved(version.pose)
-    draws = np.stack([simulated(stood, version.model, residuals, random.child(number)) for number in range(_DRAWS)])
+    draws = _simulated(stood, version.model, residuals, [random.child(number) for number in range(_DRAWS)])
     if isinstance(residuals, TlsResiduals):
         return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_DRAWS)])
     # a cloud without cameras has no place from which to simulate it: its datum counts by its slopes

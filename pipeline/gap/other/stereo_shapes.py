@@ -20,6 +20,7 @@ from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.threads import side_by_side
 from scene.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening
@@ -83,6 +84,9 @@ class _Witnesses:
         return found[int(np.argmax(gains))]
 
 
+_Trial = Callable[[_Witnesses, list[Effect]], ShapeFound | None]
+
+
 def find_shapes(
     measurement: StereoMeasurement, residuals: StereoResiduals, rough: FloatArray, held_out: BoolArray
 ) -> list[ShapeFound]:
@@ -112,7 +116,10 @@ def find_shapes(
         touched = np.any([np.zeros(len(rough), dtype=bool), *(each.touched for each in found)], axis=0)
         return _smoothing(replace(untouched, held_out=held_out | touched), beside)
 
-    trials: dict[str, Callable[[_Witnesses, list[Effect]], ShapeFound | None]] = {
+    def asked(trial: _Trial) -> ShapeFound | None:
+        return trial(witnesses, [*believed, *(each.effect for each in found)])
+
+    trials: dict[str, _Trial] = {
         EdgeFattening.tag(): _fattening,
         Smoothing.tag(): smoothing,
         OcclusionFill.tag(): _filling,
@@ -120,11 +127,12 @@ def find_shapes(
     for name in {effect.name for effect in believed}:
         del trials[name]
     while trials:
-        beside = [*believed, *(each.effect for each in found)]
-        tried = {name: each for name, trial in trials.items() if (each := trial(witnesses, beside)) is not None}
+        shapes = zip(trials, side_by_side(asked, trials.values()), strict=True)
+        tried = {name: each for name, each in shapes if each is not None}
         if not tried:
             break
         feigned = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
+        beside = [*believed, *(each.effect for each in found)]
         likely = [witnesses.likelier(beside, feigned)] if feigned else []
         found.append(max([*likely, *tried.values()], key=lambda each: each.gain))
         del trials[found[-1].name]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
+from pipeline.threads import side_by_side
 from scene.mesh import FloatArray
 from sensors.effects import Effects, catalogue
 from sensors.effects.base import Effect, Sensor
@@ -39,6 +40,10 @@ class Geometry(Protocol):
     @property
     def departure(self) -> FloatArray:
         """(n,) measured minus geometric observable, m or px, without any effect of the model."""
+
+
+def _order(values: FloatArray) -> NDArray[np.int32]:
+    return np.argsort(values, kind="stable").astype(np.int32)
 
 
 def part_of(columns: _Columns, rows: Rows) -> _Columns:
@@ -114,7 +119,7 @@ class Residuals(ABC):
     @cached_property
     def orders(self) -> dict[str, NDArray[np.int32]]:
         """(n,) rows by the value of each covariate, rising, and where that is the same as they are."""
-        return {name: np.argsort(values, kind="stable").astype(np.int32) for name, values in self.covariates.items()}
+        return dict(zip(self.covariates, side_by_side(_order, self.covariates.values()), strict=True))
 
     def of_points(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
         """(m,) values (n,) of these residuals at the measurement's points `index` (m,); NaN where there is no residual."""

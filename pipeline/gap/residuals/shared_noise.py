@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import block_diag
 
@@ -88,11 +89,25 @@ def _on_nodes(effect: NodeNoise, pixels: FloatArray, area: float) -> NodeField:
     around = step * np.stack(np.meshgrid(_NEAR, _NEAR, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float64)
     table = effect.covariance(around).reshape(len(_NEAR), -1)
     scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / (step**2 * float(table.sum()))
-    apart = np.rint((nodes[:, None] - nodes[None]) / step).astype(np.int64)
-    near = np.abs(apart).max(axis=2) <= _NEAR[-1]
-    matrix = np.zeros(near.shape)
-    matrix[near] = scale * table[tuple((apart[near] + _NEAR[-1]).T)]
+    matrix = _stationary(np.rint(nodes / step).astype(np.int64), scale * table)
     return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
+
+
+def _stationary(place: NDArray[np.int64], table: FloatArray) -> FloatArray:
+    """(q, q) covariance of nodes at `place` ((q, 2), in steps of their grid), which is 0 but for those near each other.
+
+    table: of two that are apart by `_NEAR` steps along either axis.
+    """
+    corner, margin = place.min(axis=0), len(_NEAR) // 2
+    number = np.full(np.ptp(place, axis=0) + 1 + 2 * margin, -1)
+    inside = place - corner + margin
+    number[tuple(inside.T)] = np.arange(len(place))
+    matrix = np.zeros((len(place), len(place)))
+    for (row, column), covariance in np.ndenumerate(table):
+        other = number[inside[:, 0] - _NEAR[row], inside[:, 1] - _NEAR[column]]
+        there = other >= 0
+        matrix[np.flatnonzero(there), other[there]] = covariance
+    return matrix
 
 
 def _bilinear(pixels: FloatArray, step_px: float) -> tuple[sparse.csr_array, FloatArray]:

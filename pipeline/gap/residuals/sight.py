@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from pipeline.gap.residuals.residuals import Residuals, Rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.threads import side_by_side
 from scene.mesh import FloatArray, area_normals
 
 NEIGHBOURS = 8
@@ -22,6 +23,7 @@ NEIGHBOURS = 8
 _FARTHEST = 3.0
 """Spacings beyond which two points are no neighbours, whatever lies between."""
 _SAMPLE, _NEAR, _ROUNDS = 2000, 48, 6
+_AT_ONCE = 100_000
 _AROUND = 24
 """Two rings: the neighbours among which the cells of a few points are found."""
 _LARGEST_CELL = 4.0
@@ -133,7 +135,9 @@ class Sight:
         """(n,) median of each point and its ring of neighbours."""
         found = np.empty(len(z))
         for group, near in self._rings:
-            found[group] = np.median(z[group][near], axis=1)
+            own = z[group]
+            parts = [near[start : start + _AT_ONCE] for start in range(0, len(near), _AT_ONCE)]
+            found[group] = np.concatenate(side_by_side(partial(_medians_of, own), parts))
         return found
 
     @cached_property
@@ -171,6 +175,11 @@ class Sight:
             area = np.minimum(area, _LARGEST_CELL * np.median(area[touching]))
             total += np.bincount(corners.ravel(), np.repeat(area / 3, 3), len(total))
         return total[rows]
+
+
+def _medians_of(values: FloatArray, rows: NDArray[np.int32]) -> FloatArray:
+    """(m,) medians of the values of some rows (m, k)."""
+    return np.asarray(np.median(values[rows], axis=1))
 
 
 def _origins(measurement: TlsMeasurement, index: NDArray[np.int64]) -> FloatArray:

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from pipeline.change.robust import nmad
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.threads import side_by_side
 from scene.mesh import FloatArray
 
 _CELLS, _WINDOW = 36, 9
@@ -30,10 +31,13 @@ def standardized(residuals: Residuals, plane: FloatArray, quiet: NDArray[np.bool
 
 def spread(residuals: Residuals, z: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:
     """(n,) largest NMAD that z has, of quiet points, among those of about the same value of one of the covariates."""
-    scale = np.full(len(z), nmad(z[quiet], 0.0))
-    for name, order in residuals.orders.items():
-        scale = np.maximum(scale, _spread_along(residuals.covariates[name], z, order[quiet[order]]))
-    return scale
+
+    def along(name: str) -> FloatArray:
+        order = residuals.orders[name]
+        return _spread_along(residuals.covariates[name], z, order[quiet[order]])
+
+    whole = np.full(len(z), nmad(z[quiet], 0.0))
+    return np.max([whole, *side_by_side(along, residuals.orders)], axis=0)
 
 
 def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:

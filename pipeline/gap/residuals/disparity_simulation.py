@@ -1,0 +1,53 @@
+"""A stereo pair asked for the depth map's cells that hold given pixels, so that a measurement can be simulated pixel by pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurement import StereoMeasurement
+from pipeline.gap.residuals.nominal_pair import NominalPair, project
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from scene.keyed_random import KeyedRandom
+from scene.mesh import FloatArray
+from sensors.chosen import asked_for, looking_around
+from sensors.model import StereoModel
+from sensors.stereo import REDUCTION, StereoPair
+
+
+def simulate_disparities(
+    measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, randoms: Sequence[KeyedRandom]
+) -> FloatArray:
+    """(d, n) of the depth map's cell that holds each pixel, for each source of random numbers; the finest depth map of whose grid
+    the pixels are, or come nearest to.
+
+    measurement: with its cameras where they stood, against which `residuals` may be those of another place. Cells are two pixels
+    wide at least; by how much the reference's disparity differs between the middle of a cell and the pixel is taken off.
+    """
+    nominal, g = NominalPair.of(measurement), residuals.geometry
+    quality = min(REDUCTION, key=lambda name: float(np.mean(np.abs(np.mod(g.u, REDUCTION[name]) - REDUCTION[name] / 2))))
+    step, pair = REDUCTION[quality], StereoPair(measurement.cameras, measurement.frame, model, quality)
+    height, width = pair.shape
+    rows = np.clip((g.v / step).astype(int), 0, height - 1)
+    columns = np.clip((g.u / step).astype(int), 0, width - 1)
+    middle = nominal.of_surface(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
+    beside = g.disparity + (middle - nominal.of_surface(measurement.scene, g.u, g.v))
+    drawn = []
+    for seen in _points(pair, measurement, rows * width + columns, randoms):
+        disparity = nominal.disparity(project(nominal.pair.left, seen), project(nominal.pair.right, seen))
+        drawn.append(disparity - beside)
+    return np.stack(drawn)
+
+
+def _points(
+    pair: StereoPair, measurement: StereoMeasurement, cells: NDArray[np.int64], randoms: Sequence[KeyedRandom]
+) -> list[FloatArray]:
+    """(n, 3) of each source of random numbers: what is recorded in these cells (n,), of which those alone are traced where no
+    effect looks at others."""
+    if looking_around(pair.model):
+        return [pair.observe(measurement.scene, random).points.reshape(-1, 3)[cells] for random in randoms]
+    chosen, place = np.unique(cells, return_inverse=True)
+    some = asked_for(pair, chosen.astype(np.uint32))
+    return [some.observe(measurement.scene, random).points.reshape(-1, 3)[place] for random in randoms]
