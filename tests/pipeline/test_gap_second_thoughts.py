@@ -92,7 +92,7 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
     there, residuals, _ = settled(read_measurement(tmp_path / "case"))
     assert isinstance(there, StereoMeasurement)
     noise = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
-    seen = simulated(there, there.model.model_copy(update={"noise": noise}), residuals, KeyedRandom(1))
+    (seen,) = simulated(there, there.model.model_copy(update={"noise": noise}), residuals, [KeyedRandom(1)])
     nominal, u, v = NominalPair.of(there), there.cloud.extra["pixel_x"], there.cloud.extra["pixel_y"]
     between = nominal.of_surface(there.scene, u + 0.5, v + 0.5) - nominal.of_surface(there.scene, u, v)
     assert np.nanstd(between[residuals.index[residuals.smooth]]) > 0.01, "px of disparity on smooth surface"

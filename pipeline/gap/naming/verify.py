@@ -106,7 +106,7 @@ class Version:
     pose: FloatArray
 
 
-def _simulated(
+def simulated(
     measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
     """(d, n) simulated minus geometric observable of the residuals' points, NaN without a return, for each source of random
@@ -201,7 +201,7 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
 
 def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
     stood = measurement.moved(version.pose)
-    draws = _simulated(stood, version.model, residuals, [random.child(number) for number in range(_DRAWS)])
+    draws = simulated(stood, version.model, residuals, [random.child(number) for number in range(_DRAWS)])
     if isinstance(residuals, TlsResiduals):
         return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_DRAWS)])
     # a cloud without cameras has no place from which to simulate it: its datum counts by its slopes

@@ -1,0 +1,35 @@
+"""Work side by side: results in their order, in the context of the caller, and errors of the work itself."""
+
+from __future__ import annotations
+
+import threading
+from contextvars import ContextVar
+
+import pytest
+
+from pipeline.threads import side_by_side
+
+VALUE: ContextVar[int] = ContextVar("value", default=0)
+
+
+def test_results_come_in_the_order_of_the_items() -> None:
+    last = threading.Event()
+
+    def work(number: int) -> int:
+        last.wait(0.05 if number == 0 else 0)  # the first is done last
+        return number**2
+
+    assert side_by_side(work, range(20)) == [number**2 for number in range(20)]
+
+
+def test_what_the_caller_decided_by_counts() -> None:
+    token = VALUE.set(7)
+    try:
+        assert side_by_side(lambda item: item + VALUE.get(), [1, 2]) == [8, 9]
+    finally:
+        VALUE.reset(token)
+
+
+def test_an_error_of_the_work_is_raised() -> None:
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(lambda item: 1 / item, [1, 0])
