@@ -197,11 +197,19 @@ class TlsMeasurement(MeasurementBase):
 
 @dataclass(frozen=True, kw_only=True)
 class StereoMeasurement(MeasurementBase):
-    """A surface that a stereo pair gave. cameras: the nominal calibration, world frame."""
+    """A surface that a stereo pair gave.
+
+    cameras: the nominal calibration, world frame; shaped_px: (n,) what those of the model's effects that look at neighbouring
+    pixels add to each point's disparity, where that was found once for cameras that stand about here, None where it was not.
+    """
 
     sensor = "stereo"
     model: StereoModel
     cameras: CameraPair
+    shaped_px: FloatArray | None = None
+
+    def part(self, rows: NDArray[np.int64]) -> Self:
+        return super().part(rows).changed(shaped_px=None if self.shaped_px is None else self.shaped_px[rows])
 
     @property
     def viewpoint(self) -> FloatArray:

@@ -13,7 +13,7 @@ from gap_cases import write_scan
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.naming import workflow
-from pipeline.gap.naming.attempts import State
+from pipeline.gap.naming.attempts import Starts, State
 from pipeline.gap.naming.entries import Named, with_effects
 from pipeline.gap.naming.held_out import Scored
 from pipeline.gap.naming.naming import FREE_FORMS
@@ -78,7 +78,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
     monkeypatch.setattr(workflow, "_with_tails", lambda *given: (given[2], None))
     monkeypatch.setattr(workflow, "with_splits", lambda _, items: items)
-    found = workflow._held(there, plain, nowhere, KeyedRandom(1))
+    found = workflow._held(Starts(there, plain, nowhere), KeyedRandom(1))
     assert [item.name for item in found.named] == kept
     assert found.words == ["tls.range_empirical dropped: it does not hold on blocks that were held out"]
     assert seen == [False, True]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from pipeline.gap.residuals.changes import SceneChange, find_changes, once_each
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, shaped_px
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -90,8 +91,13 @@ class State:
 
     @property
     def part(self) -> tuple[Measurement, Residuals]:
-        """What selection may look at."""
-        return few(self.shaped, self.residuals, self.chosen)
+        """What selection may look at. What effects on the shape do there, cameras that move by millimetres hardly change."""
+        there, residuals = self.shaped, self.residuals
+        if isinstance(there, StereoMeasurement) and isinstance(residuals, StereoResiduals):
+            shaped = np.zeros(len(there.cloud.points))
+            shaped[residuals.index] = shaped_px(there, residuals.geometry)
+            there = there.changed(shaped_px=shaped)
+        return few(there, residuals, self.chosen)
 
 
 @dataclass(frozen=True)
@@ -118,9 +124,45 @@ class Attempt:
         return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(state.shapes) + len(state.changes)
 
 
-def attempt(
-    there: Measurement, plain: Residuals, held_points: BoolArray, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]
-) -> Attempt:
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """From what naming may start. there, plain: the measurement and its residuals; held_points: (n,) of its points those that no
+    step before the last may look at."""
+
+    there: Measurement
+    plain: Residuals
+    held_points: BoolArray
+
+    @cached_property
+    def _shapes(self) -> tuple[list[ShapeFound], BoolArray]:
+        return _shapes(self.there, self.plain, self.held_points)
+
+    @cached_property
+    def first(self) -> State:
+        """Beside the effects where the surface is not smooth."""
+        return self.beside(*self._shapes)
+
+    @cached_property
+    def staying(self) -> State:
+        """The same, with the sensor where it stood without them."""
+        return State.of(self.there, self.plain, self.held_points, *self._shapes, resettled=False)
+
+    @cached_property
+    def smooth(self) -> State:
+        """Without such effects."""
+        return self.beside([], np.zeros(len(self.held_points), dtype=bool))
+
+    def seen_beside(self, named: list[Named]) -> tuple[list[ShapeFound], BoolArray]:
+        """The effects where the surface is not smooth that show with some others in the model, and (n,) the points they touch."""
+        seen = settled_with(self.there, named, self.plain.index[~self.held_points[self.plain.index]])
+        return _shapes(seen.measurement, seen.residuals, self.held_points)
+
+    def beside(self, shapes: list[ShapeFound], touched: BoolArray) -> State:
+        """Beside some of those, and the (n,) points that they touch."""
+        return State.of(self.there, self.plain, self.held_points, shapes, touched)
+
+
+def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> Attempt:
     """What the naming started from in the end, and what it named. left_out: as of `name_effects`.
 
     What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
@@ -132,22 +174,18 @@ def attempt(
     def beside(found: Attempt) -> Attempt:
         if not found.named:
             return found
-        seen = settled_with(there, found.named, plain.index[~held_points[plain.index]])
-        again = State.of(there, plain, held_points, *_shapes(seen.measurement, seen.residuals, held_points))
-        names = {each.name for each in again.shapes}
+        shapes, touched = starts.seen_beside(found.named)
+        names = {each.name for each in shapes}
         # rays that are not quite where they are thought to be look like a low-pass
         feigned = Smoothing.tag() in names - found.shapes
-        return found if names == found.shapes or feigned else Attempt.of(again, random, left_out)
+        return found if names == found.shapes or feigned else Attempt.of(starts.beside(shapes, touched), random, left_out)
 
-    shapes = _shapes(there, plain, held_points)
-    first = Attempt.of(State.of(there, plain, held_points, *shapes), random, left_out)
+    first = Attempt.of(starts.first, random, left_out)
     found = [beside(first)]
     if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0):
-        staying = State.of(there, plain, held_points, *shapes, resettled=False)
-        found.append(beside(Attempt.of(staying, random, left_out)))
+        found.append(beside(Attempt.of(starts.staying, random, left_out)))
     if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
-        untouched = np.zeros(len(held_points), dtype=bool)
-        smooth = Attempt.of(State.of(there, plain, held_points, [], untouched), random, left_out)
+        smooth = Attempt.of(starts.smooth, random, left_out)
         if smooth.named:
             found.append(beside(smooth))
     widest = decided().shapes.wider * min(each.naming.spreads for each in found)

@@ -15,7 +15,7 @@ from pipeline.formats.measurement import FILE, Measurement, TlsMeasurement
 from pipeline.formats.measurement_checks import check_noise
 from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import Tried
-from pipeline.gap.naming.attempts import State, attempt, few, thinned_rows
+from pipeline.gap.naming.attempts import Starts, State, attempt, few, thinned_rows
 from pipeline.gap.naming.entries import (
     Named,
     from_missing,
@@ -124,7 +124,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     clock.lap("residuals")
     if plain.smooth.sum() < decided().points.fewest:
         return _insufficient(measurement, plain, clock)
-    held = _held(there, plain, held_points, random)
+    held = _held(Starts(there, plain, held_points), random)
     state, naming = held.state, held.naming
     clock.lap("naming")
     showing = Showing(
@@ -210,16 +210,10 @@ class _Held:
     words: list[str]
 
 
-def _held(
-    there: Measurement,
-    plain: Residuals,
-    held_points: BoolArray,
-    random: KeyedRandom,
-    left_out: frozenset[tuple[str, bool]] = frozenset(),
-) -> _Held:
+def _held(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, bool]] = frozenset()) -> _Held:
     """What is named and holds on held-out blocks; where a free form does not, what is named without any. The effects come with
     what would split each class."""
-    first = attempt(there, plain, held_points, random, left_out)
+    first, there, plain = attempt(starts, random, left_out), starts.there, starts.plain
     state, naming = first.state, first.naming
     losses = _missing(there, state)
     lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
@@ -229,7 +223,7 @@ def _held(
     words += [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
     nameable = any(not each.empirical for each in plain.candidates)
     if nameable and FREE_FORMS not in left_out and any(item.kind == "empirical" and not item.spreads for item in scored.failed):
-        again = _held(there, plain, held_points, random, left_out | {FREE_FORMS})
+        again = _held(starts, random, left_out | {FREE_FORMS})
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])
     words += [f"{item.name} only mentioned: beside the others it gains {item.gain:.1f} on new blocks" for item in scored.weak]

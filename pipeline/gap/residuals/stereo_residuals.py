@@ -179,9 +179,18 @@ def _mean_error(model: StereoModel, geometry: PixelGeometry, measurement: Stereo
     """(n,) what those of the model's effects that are not in the cameras add to the disparity, px."""
     beside = [effect for effect in model.effects if not effect.empirical and not isinstance(effect, CameraEffect | RasterEffect)]
     found = np.asarray(sum((effect.mean(geometry) for effect in beside), np.zeros(len(geometry))))
-    shapes = [effect for effect in model.effects if isinstance(effect, RasterEffect)]
-    raster = DisparityRaster.of(measurement, geometry) if shapes else None
-    return found if raster is None else found + raster.moved(shapes, geometry.disparity)
+    return found + shaped_px(measurement, geometry)
+
+
+def shaped_px(measurement: StereoMeasurement, geometry: PixelGeometry) -> FloatArray:
+    """(n,) what those of the model's effects that look at neighbouring pixels add to the disparity, px."""
+    shapes = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+    if not shapes:
+        return np.zeros(len(geometry))
+    if measurement.shaped_px is not None:
+        return measurement.shaped_px
+    raster = DisparityRaster.of(measurement, geometry)
+    return np.zeros(len(geometry)) if raster is None else raster.moved(shapes, geometry.disparity)
 
 
 def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatArray:
