@@ -13,8 +13,9 @@ import os
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -73,7 +74,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", str(arguments.threads))
-    from pipeline.detection.keras_backend import keras_ready
+    from pipeline.detection.keras_backend import computing_in, keras_ready
 
     keras_ready()
     import keras
@@ -86,14 +87,21 @@ def main() -> None:
     tf.config.threading.set_inter_op_parallelism_threads(1)
     config = load_train_config(arguments.config)
     crop, size, channels = config.training.crop_px, config.detector.image_px, config.detector.normalisation.channels
+    batch = examples(config.training.batch, crop or size, config.detector.most_blocks, channels)
+
     learner = MaskRCNN(config.detector, crop)
     learner.compile(optimizer=keras.optimizers.AdamW(1e-4), jit_compile=False)
-    batch = examples(config.training.batch, crop or size, config.detector.most_blocks, channels)
-    whole, alone = processor_seconds(lambda: learner.train_on_batch(batch), bare(learner.pyramid, batch["image"], backward=True))
+
+    def step(precision: Literal["float32", "bfloat16"]) -> None:
+        with computing_in(precision):
+            learner.train_on_batch(batch)
+
+    works = partial(step, "float32"), partial(step, "bfloat16"), bare(learner.pyramid, batch["image"], backward=True)
+    whole, half, alone = processor_seconds(*works)
     count = config.training.batch
     print(
         f"training at {crop or size} px, {count} a step: {count / whole:.2f} images/s, bare {count / alone:.2f}, "
-        f"ratio {alone / whole:.2f}"
+        f"ratio {alone / whole:.2f}; with training.precision=bfloat16 {count / half:.2f}, {whole / half:.2f} times as many"
     )
     finder = MaskRCNN(config.detector)
     image = examples(4, size, config.detector.most_blocks, channels)["image"]

@@ -1,105 +1,175 @@
-"""What single choices of the detector's training are worth: trainings of equal length, each with one choice undone.
+"""What single choices of the detector's training are worth: short trainings of equal length, each with one choice undone.
 
-    python benchmarks/detector_ablation.py --out runs/ablation [--epochs 24] [--seeds 1 2] [--placement mean_surface] [--write]
+    python benchmarks/detector_ablation.py --set sets/mixed --test sets/detector_test --test sets/detector_test_mean \
+        --out runs/ablation [--epochs 8] [--seeds 1 2] [--write]
 
-Medium blocks at 2.5 cm of noise, walls and sensors of configs/datasets/detector.yaml. Every network starts from random weights;
-the score that counts is set on the validation images, F1 is of test epochs. What is there already is not made again. A
-difference from the first row is of the means over the seeds; its standard error comes from the seeds' spread, pooled over the
-rows. --write puts the table into docs/detector.md.
+Small and medium blocks at one level of noise out of sets as detector_table.py and docs/detector.md have them. Every network
+starts from random weights; the score that counts is set on the validation images, F1 is of all tests together. What is in --out
+already is not made again. The first row is trained once for each of --seeds, which tells how much chance does; the others are
+trained with the first of them and set against the mean of that row. --write puts the table into docs/detector.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
-from collections.abc import Iterator, Sequence
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from documents import write_between
 
 from pipeline.config.bundled import bundled_config
-from pipeline.dataset.config import load_dataset_config
-from pipeline.dataset.run import make_dataset
 from pipeline.detection.config import BEST, load_train_config
+from pipeline.detection.data import CocoFolder
 from pipeline.detection.evaluate import evaluate
+from pipeline.detection.operating_point import set_operating_point
 from pipeline.detection.run import LOWEST_SCORE, detect
 from pipeline.detection.training import train
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- ablation -->", "<!-- end of ablation -->"
 CONFIDENCE, OVERLAPS = 0.95, (0.25, 0.75)
-SET = ("parts.0.noise=[2.5cm]", "parts.0.sizes=[medium]", "parts.0.train=4", "parts.0.val=2", "parts.0.test=2", "name=ablation")
+BATCH = 4
+"""Half of the config's: trainings are so short that steps count more than their noise."""
+NOISE, SIZES = "2.5cm", ("small", "medium")
+ONE_WALL = {"wall": "glendale", "sensor": "stereo", "size_class": "medium"}
+"""The images on which scores are set where validation is not over all."""
+Coco = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Change:
-    """A choice undone: overrides of the training's config and of the data set's."""
+    """A choice undone.
+
+    training: overrides of the training's config; ignore: whether faint blocks are left out of the loss; one_wall: the network is
+    that of the first row, with its scores set on ONE_WALL alone.
+    """
 
     name: str
     training: tuple[str, ...] = ()
-    data: tuple[str, ...] = ()
+    ignore: bool = True
+    one_wall: bool = False
 
 
 CHANGES = (
     Change("as it is"),
-    Change("no mirror images", ("training.flips=false",)),
+    Change("mirrored left-right alone", ("training.flips=left_right",)),
     Change("smallest anchor 8 px in place of 4", ("detector.proposal.anchor_sizes_px=[8, 14, 24, 48, 128]",)),
     Change("box losses weighted 0.2 (proposals) and 0.5", ("training.loss_weights={proposal_box: 0.2, box: 0.5}",)),
-    Change("no block left out of the loss", data=("annotation.ignore_below=0",)),
+    Change("faint blocks (ratio below 2) count in the loss", ignore=False),
+    Change("scores set on one wall, sensor and size", one_wall=True),
 )
 
 
-def f1(change: Change, seed: int, arguments: argparse.Namespace) -> list[float]:
-    """Of a training with that change and seed, at each of OVERLAPS, %."""
+def figures(change: Change, seed: int, arguments: argparse.Namespace) -> list[float]:
+    """F1 of a training with that change and seed, by size and overlap, %."""
     folder = arguments.out / f"{CHANGES.index(change)}_{seed}"
-    test = data_set(change, arguments) / "test"
-    found = folder / "found" / "detections.json"
-    if not found.exists():
-        overrides = (f"training.epochs={arguments.epochs}", f"training.seed={seed}", *change.training)
-        config = load_train_config(bundled_config("detectors", "fine"), overrides)
-        train(test.parent, config, folder, resume=True)
-        detect(str(folder / BEST), [test], found.parent, confidences=(LOWEST_SCORE,), pictures=False)
-    truth = json.loads((test / "annotations.json").read_text(encoding="utf-8"))
-    predictions = json.loads(found.read_text(encoding="utf-8"))["annotations"]
-    return [100 * score.f1 for score in evaluate(truth, predictions, None, (CONFIDENCE,), OVERLAPS)]
+    tests = [part(each / "test", arguments.out / f"test_{number}") for number, each in enumerate(arguments.tests)]
+    found = [folder / f"found_{number}" / "detections.json" for number in range(len(tests))]
+    if not all(path.exists() for path in found):
+        detector = one_wall(seed, folder, arguments) if change.one_wall else trained(change, seed, folder, arguments)
+        for test, path in zip(tests, found, strict=True):
+            detect(str(detector), [test], path.parent, confidences=(LOWEST_SCORE,), pictures=False)
+    counts = np.zeros((len(SIZES), len(OVERLAPS), 2))
+    for test, path in zip(tests, found, strict=True):
+        truth, predictions = content(test), json.loads(path.read_text(encoding="utf-8"))["annotations"]
+        groups = {size: [image["id"] for image in truth["images"] if image["size_class"] == size] for size in SIZES}
+        for score in evaluate(truth, predictions, groups, (CONFIDENCE,), OVERLAPS):
+            right, wrong = 2 * score.true_positives, score.false_positives + score.false_negatives
+            counts[SIZES.index(score.group), OVERLAPS.index(score.iou)] += right, right + wrong
+    return list(100 * (counts[..., 0] / counts[..., 1]).ravel())
 
 
-def data_set(change: Change, arguments: argparse.Namespace) -> Path:
-    """The set that a change learns from, made once."""
-    folder = Path(arguments.out / f"set_{CHANGES.index(change) if change.data else 0}")
-    if not (folder / "test").is_dir():
-        overrides = (*SET, f"sizes.medium.rockfall.placement={arguments.placement}", *change.data)
-        make_dataset(load_dataset_config(bundled_config("datasets", "detector"), overrides), folder)
-    return folder
+def trained(change: Change, seed: int, folder: Path, arguments: argparse.Namespace) -> Path:
+    """The detector of a training with that change."""
+    base = (
+        f"training.epochs={arguments.epochs}",
+        f"training.seed={seed}",
+        f"training.batch={BATCH}",
+        "training.precision=bfloat16",
+    )
+    config = load_train_config(bundled_config("detectors", "fine"), (*base, *change.training))
+    name = "set" if change.ignore else "set_that_ignores_nothing"
+    for split in ("train", "val"):
+        part(arguments.folder / split, arguments.out / name / split, ignore=change.ignore)
+    train(arguments.out / name, config, folder, resume=True)
+    return Path(folder / BEST)
 
 
-def rows(figures: Sequence[Sequence[Sequence[float]]]) -> Iterator[str]:
-    """The table's, in Markdown. figures: F1 by change, seed and overlap, %."""
-    yield f"| change | F1, {len(figures[0])} trainings: {OVERLAPS[0]:g} | {OVERLAPS[1]:g} | against the first row |"
-    yield "|---|---|---|---|"
-    values = np.array(figures)
-    means = values.mean(axis=1)
-    error = np.sqrt(values.var(axis=1, ddof=1).mean(axis=0) * 2 / values.shape[1]) if values.shape[1] > 1 else [math.nan] * 2
-    for change, mean in zip(CHANGES, means, strict=True):
-        gains = ", ".join(f"{gain:+.1f} +- {one:.1f}" for gain, one in zip(mean - means[0], error, strict=True))
-        yield f"| {change.name} | {mean[0]:.1f} % | {mean[1]:.1f} % | {'' if change is CHANGES[0] else gains} |"
+def one_wall(seed: int, folder: Path, arguments: argparse.Namespace) -> Path:
+    """The detector of the first row with its scores set on ONE_WALL; that row comes first."""
+    validation = part(
+        arguments.folder / "val",
+        arguments.out / "one_wall" / "val",
+        wanted=lambda image: all(image[key] == value for key, value in ONE_WALL.items()),
+    )
+    shutil.copytree(arguments.out / f"0_{seed}" / BEST, folder / BEST, dirs_exist_ok=True)
+    set_operating_point(folder / BEST, CocoFolder(validation))
+    return Path(folder / BEST)
+
+
+def part(folder: Path, out: Path, *, ignore: bool = True, wanted: Callable[[Coco], bool] = lambda image: True) -> Path:
+    """The images of a COCO folder at NOISE and of SIZES that are wanted, copied to `out` once."""
+    if (out / "annotations.json").exists():
+        return out
+    whole = content(folder)
+    chosen = [image for image in whole["images"] if image["noise"] == NOISE and image["size_class"] in SIZES and wanted(image)]
+    numbers = {image["id"] for image in chosen}
+    annotations = [each if ignore else {**each, "ignore": 0} for each in whole["annotations"] if each["image_id"] in numbers]
+    out.mkdir(parents=True, exist_ok=True)
+    for image in chosen:
+        shutil.copy(folder / image["file_name"], out)
+    text = json.dumps({**whole, "images": chosen, "annotations": annotations})
+    (out / "annotations.json").write_text(text, encoding="utf-8")
+    return out
+
+
+def content(folder: Path) -> Coco:
+    """A folder's annotations."""
+    return dict(json.loads((folder / "annotations.json").read_text(encoding="utf-8")))
+
+
+def rows(arguments: argparse.Namespace) -> Iterator[str]:
+    """The table's, in Markdown, as they are made."""
+    heads = [f"{size}: {', '.join(f'{overlap:g}' for overlap in OVERLAPS)}" for size in SIZES]
+    yield f"| change | {' | '.join(heads)} | against the first row |"
+    yield "|---" * (2 + len(SIZES)) + "|"
+    base: list[list[float]] = []
+    for change in CHANGES:
+        for seed in arguments.seeds if change is CHANGES[0] else arguments.seeds[:1]:
+            base += [figures(change, seed, arguments)] if change is CHANGES[0] else []
+        if change is CHANGES[0]:
+            mean, last = np.mean(base, axis=0), "seeds lie apart by " + pairs(np.ptp(base, axis=0), "{:.1f}")
+        else:
+            mean = np.array(figures(change, arguments.seeds[0], arguments))
+            last = pairs(mean - np.mean(base, axis=0), "{:+.1f}")
+        yield f"| {change.name} | {pairs(mean, '{:.1f}').replace('; ', ' | ')} | {last} |"
+
+
+def pairs(values: Any, form: str) -> str:
+    """Numbers by size and overlap, the sizes' apart by semicolons."""
+    return "; ".join(", ".join(form.format(value) for value in row) for row in np.reshape(values, (len(SIZES), len(OVERLAPS))))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--set", type=Path, required=True, dest="folder", help="to learn from, with train/ and val/")
+    parser.add_argument("--test", type=Path, required=True, action="append", dest="tests", help="what detector_test.yaml makes")
     parser.add_argument("--out", type=Path, required=True, help="for sets and detectors")
-    parser.add_argument("--epochs", type=int, default=24, help="passes over the training images")
+    parser.add_argument("--epochs", type=int, default=8, help="passes over the training images")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--placement", choices=("relief", "mean_surface"), default="relief")
     parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
     arguments = parser.parse_args()
-    text = "\n".join(rows([[f1(change, seed, arguments) for seed in arguments.seeds] for change in CHANGES]))
-    print(text)
+    table = []
+    for row in rows(arguments):
+        print(row, flush=True)
+        table.append(row)
     if arguments.write:
-        write_between(DOCUMENT, MARKS, text)
+        write_between(DOCUMENT, MARKS, "\n".join(table))
 
 
 if __name__ == "__main__":

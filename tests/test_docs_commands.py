@@ -93,8 +93,11 @@ RESOLVED = (
     "--set sizes.large.rockfall.placement=mean_surface",
     "scarpsim train sets/mixed --config configs/detectors/fine.yaml --set training.start=detector/best "
     "--set training.learning_rate=0.001 --set training.epochs=20 --set training.keep_epochs=10 --out further",
-    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --set training.start=default "
-    "--set training.learning_rate=0.001 --out more",
+    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 3 --set training.start=further/best "
+    "--set training.learning_rate=0.001 --set training.epochs=20 --set training.keep_epochs=10 "
+    "--set training.precision=bfloat16 --out more",
+    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 4 --set training.start=default "
+    "--set training.learning_rate=0.001 --set training.precision=bfloat16 --out more",
 )
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 

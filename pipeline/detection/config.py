@@ -112,7 +112,14 @@ class TrainingConfig(Config):
     loss_weights: dict[Loss, Annotated[float, Field(gt=0, le=1e6)]] = Field(
         {}, description="by what losses are multiplied before they are added; 1 for the others, as the thesis has it"
     )
-    flips: bool = Field(True, description="mirror images left-right and up-down at random")
+    precision: Literal["float32", "bfloat16"] = Field(
+        "float32",
+        description="bfloat16: convolutions and products with 8 bits of mantissa, weights and losses in float32; faster on "
+        "processors that have it (avx512_bf16, amx), on TensorFlow alone",
+    )
+    flips: bool | Literal["left_right"] = Field(
+        True, description="mirror images at random, left-right and up-down (true), left-right alone, or not (false)"
+    )
     crop_px: int | None = Field(
         None, ge=64, multiple_of=64, description="train on random windows of this side (default: whole images)"
     )

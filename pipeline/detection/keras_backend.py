@@ -9,6 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 from scene.errors import InputError
 from scene.extras import how_to_install
@@ -42,6 +43,34 @@ def check_installed() -> str:
             remedy=how_to_install("detect"),
         )
     return backend
+
+
+@contextmanager
+def computing_in(precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
+    """Compiled functions called in the body compute convolutions and products in that precision; variables stay float32.
+
+    Raises InputError for bfloat16 on another backend than TensorFlow.
+    """
+    if precision == "float32":
+        yield
+        return
+    import keras
+
+    backend = keras.backend.backend()
+    if backend != "tensorflow":
+        raise InputError(
+            f"is bfloat16 with KERAS_BACKEND={backend}",
+            where="training.precision",
+            allowed="bfloat16 on tensorflow, float32 on every backend",
+        )
+    import tensorflow as tf
+
+    option = "auto_mixed_precision_onednn_bfloat16"
+    tf.config.optimizer.set_experimental_options({option: True})
+    try:
+        yield
+    finally:
+        tf.config.optimizer.set_experimental_options({option: False})
 
 
 @contextmanager

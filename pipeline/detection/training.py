@@ -15,6 +15,7 @@ from pipeline.detection import weights
 from pipeline.detection.config import BEST, CHECKPOINT, CURVES, EVENTS, STAGE, TrainConfig
 from pipeline.detection.data import CocoFolder, batches
 from pipeline.detection.figures import write_loss_figure
+from pipeline.detection.keras_backend import computing_in
 from pipeline.detection.model import LOSSES, MaskRCNN, total_loss
 from pipeline.detection.operating_point import set_operating_point
 from pipeline.detection.run import detector_folder
@@ -78,7 +79,7 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     for epoch in range(len(history.training), training.epochs):
         if has_settled(history.total, training):
             break
-        with progress.stage(f"epoch {epoch + 1}"):
+        with progress.stage(f"epoch {epoch + 1}"), computing_in(training.precision):
             history.training.append(_learn(model, folders[0], config, epoch, steps, progress))
             history.validation.append(_validate(model, folders[1], config))
             logged.add(epoch, history)

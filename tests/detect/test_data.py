@@ -80,6 +80,18 @@ def test_a_mirrored_map_has_its_blocks_mirrored(tmp_path, axis):
     assert_array_equal(mirrored(turned, axis).boxes, labelled.boxes)
 
 
+@pytest.mark.parametrize(("flips", "turned"), [(True, True), ("left_right", False), (False, False)])
+def test_maps_are_mirrored_along_the_axes_asked_for(tmp_path, flips, turned):
+    """The topmost rows have no data; left and right differ in where the blocks are."""
+    folder = CocoFolder(make_set(tmp_path, 8, 3, side=64, blocks=1))
+    config, training = DetectorConfig(image_px=64, most_blocks=4), TrainingConfig(batch=1, flips=flips)
+    examples = list(batches(folder, config, training, 0, learning=True))
+    assert any(example["image"][0, 0, 0, 1] == 1 for example in examples) is turned
+    plain = [folder.labelled(index).labels for index in range(8)]
+    as_it_is = [any(np.array_equal(example["labels"][0], labels) for labels in plain) for example in examples]
+    assert all(as_it_is) is (flips is False)
+
+
 def test_blocks_to_ignore_are_marked_as_such_for_the_loss(tmp_path):
     """COCO's `ignore` and `iscrowd`: -1 where a block counts 1 and an empty place 0."""
     folder = make_set(tmp_path, 1, 4, blocks=3)
