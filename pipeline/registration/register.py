@@ -35,11 +35,11 @@ from pipeline.registration.closest_points import (
     scan_order,
 )
 from pipeline.registration.rigid import RigidTransform, rotation_matrix
-from pipeline.threads import executor
 from scene.config import Config
 from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from scene.threads import executor
 
 _LEVELS = (2**13, 2**17)
 """Sizes of the random subsets that come before all the points; each is used where the points are at least four times as many."""

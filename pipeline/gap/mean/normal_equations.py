@@ -12,9 +12,9 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
-from pipeline.threads import side_by_side
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
+from scene.threads import side_by_side
 
 _SMALLEST = 1e-9
 """Share of a column that others have to leave of it, in variance, for its gain to be told from rounding."""

@@ -20,8 +20,8 @@ from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from pipeline.threads import side_by_side
 from scene.mesh import FloatArray
+from scene.threads import side_by_side
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.occlusion_fill import OcclusionFill

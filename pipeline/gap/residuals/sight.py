@@ -15,8 +15,8 @@ from pipeline.gap.residuals.residuals import Residuals, Rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.threads import side_by_side
 from scene.mesh import FloatArray, area_normals
+from scene.threads import side_by_side
 
 NEIGHBOURS = 8
 """The ring around a point of a raster."""

@@ -7,7 +7,7 @@ from contextvars import ContextVar
 
 import pytest
 
-from pipeline.threads import side_by_side
+from scene.threads import side_by_side
 
 VALUE: ContextVar[int] = ContextVar("value", default=0)
 
