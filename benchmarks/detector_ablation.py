@@ -138,16 +138,18 @@ def rows(arguments: argparse.Namespace) -> Iterator[str]:
     heads = [f"{size}: {', '.join(f'{overlap:g}' for overlap in OVERLAPS)}" for size in SIZES]
     yield f"| change | {' | '.join(heads)} | against the first row |"
     yield "|---" * (2 + len(SIZES)) + "|"
-    base: list[list[float]] = []
-    for change in CHANGES:
-        for seed in arguments.seeds if change is CHANGES[0] else arguments.seeds[:1]:
-            base += [figures(change, seed, arguments)] if change is CHANGES[0] else []
-        if change is CHANGES[0]:
-            mean, last = np.mean(base, axis=0), "seeds lie apart by " + pairs(np.ptp(base, axis=0), "{:.1f}")
-        else:
-            mean = np.array(figures(change, arguments.seeds[0], arguments))
-            last = pairs(mean - np.mean(base, axis=0), "{:+.1f}")
-        yield f"| {change.name} | {pairs(mean, '{:.1f}').replace('; ', ' | ')} | {last} |"
+    first, *others = CHANGES
+    seeds = [figures(first, seed, arguments) for seed in arguments.seeds]
+    base = np.mean(seeds, axis=0)
+    yield row(first, base, "seeds lie apart by " + pairs(np.ptp(seeds, axis=0), "{:.1f}"))
+    for change in others:
+        found = np.array(figures(change, arguments.seeds[0], arguments))
+        yield row(change, found, pairs(found - base, "{:+.1f}"))
+
+
+def row(change: Change, values: Any, last: str) -> str:
+    """One line of it. values: F1 by size and overlap, %; last: its last cell."""
+    return f"| {change.name} | {pairs(values, '{:.1f}').replace('; ', ' | ')} | {last} |"
 
 
 def pairs(values: Any, form: str) -> str:
@@ -165,9 +167,9 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
     arguments = parser.parse_args()
     table = []
-    for row in rows(arguments):
-        print(row, flush=True)
-        table.append(row)
+    for line in rows(arguments):
+        print(line, flush=True)
+        table.append(line)
     if arguments.write:
         write_between(DOCUMENT, MARKS, "\n".join(table))
 

@@ -19,5 +19,8 @@ def executor(threads: int | None = None) -> ThreadPoolExecutor:
 
 def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """`work` of every item, in their order; for work that NumPy does without Python's lock, and that no other item touches."""
+    every = list(items)
+    if len(every) < 2:  # a pool would only cost the hand-over
+        return [work(item) for item in every]
     with executor() as pool:
-        return [found.result() for found in [pool.submit(copy_context().run, work, item) for item in items]]
+        return [found.result() for found in [pool.submit(copy_context().run, work, item) for item in every]]

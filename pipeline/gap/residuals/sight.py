@@ -24,6 +24,7 @@ _FARTHEST = 3.0
 """Spacings beyond which two points are no neighbours, whatever lies between."""
 _SAMPLE, _NEAR, _ROUNDS = 2000, 48, 6
 _AT_ONCE = 100_000
+"""Points whose neighbours are looked at together, whatever the number of threads: 7 MB of values."""
 _AROUND = 24
 """Two rings: the neighbours among which the cells of a few points are found."""
 _LARGEST_CELL = 4.0
