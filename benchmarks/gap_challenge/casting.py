@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
+AT_ONCE = 1_000_000
+"""Rays in memory with what is computed of each (some 300 bytes)."""
 
 
 class Surface:
@@ -26,9 +28,16 @@ class Surface:
 
         origin: (3,) or (n, 3).
         """
+        start = np.broadcast_to(origin, ray.shape)
+        distance, normal = np.empty(len(ray)), np.empty(ray.shape)
+        for first in range(0, len(ray), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            distance[part], normal[part] = self._cast(start[part], ray[part])
+        return distance, normal
+
+    def _cast(self, start: Array, ray: Array) -> tuple[Array, Array]:
         import open3d as o3d
 
-        start = np.broadcast_to(origin, ray.shape)
         found = self._scene.cast_rays(o3d.core.Tensor(np.concatenate([start, ray], axis=1).astype(np.float32)), nthreads=1)
         face = found["primitive_ids"].numpy().astype(np.int64)
         hit = np.isfinite(found["t_hit"].numpy())

@@ -104,7 +104,7 @@ def of_nodes(count: int, sigma_px: float) -> list[float]:
     pixels = 4.0 * np.stack(np.meshgrid(np.arange(120.0), np.arange(120.0)), axis=-1).reshape(-1, 2)
     number, every = np.arange(len(pixels)), np.ones(len(pixels), dtype=bool)
     zero = np.zeros(len(pixels))
-    geometry = PixelGeometry(pixels[:, 0], pixels[:, 1], *[zero] * 9)
+    geometry = PixelGeometry(pixels[:, 0], pixels[:, 1], *[zero] * 10)
     model = StereoModel(noise=StereoNoise(parallax_sigma_px=0.3, regularization_sigma_px=0.0))
     field = SharedNoise((RegularizationNoise(sigma_px=1.0, step_px=32.0),), pixels).field(len(pixels))
     nodes = sigma_px * np.linalg.cholesky(field.covariance)

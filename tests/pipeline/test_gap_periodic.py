@@ -33,7 +33,7 @@ def residuals(error: FloatArray) -> StereoResiduals:
     at, count = PIXELS / 40.0, len(PIXELS)
     pose = np.stack([np.ones(count), *at.T, at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=1)
     every, covariates = np.ones(count, dtype=bool), {"image_x": PIXELS[:, 0], "image_y": PIXELS[:, 1]}
-    nowhere = PixelGeometry(*[np.zeros(count)] * 11)
+    nowhere = PixelGeometry(*[np.zeros(count)] * 12)
     value = error + SIGMA * np.random.default_rng(7).standard_normal(count)
     sigma, unit = np.full(count, SIGMA), np.full(count, 0.1)
     return StereoResiduals(value, sigma, unit, every, every, pose, at, covariates, np.arange(count), nowhere)

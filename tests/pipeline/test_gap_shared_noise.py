@@ -28,7 +28,7 @@ STRIDE, SIDE = 4, 40
 NOISE = RegularizationNoise(sigma_px=0.3, step_px=32.0)
 WHITE = 0.2
 SIGMA = float(np.sqrt(WHITE**2 + NOISE.total_variance))
-NOWHERE = PixelGeometry(*[np.zeros(1)] * 11)
+NOWHERE = PixelGeometry(*[np.zeros(1)] * 12)
 
 
 def raster(side: int = SIDE) -> FloatArray:

@@ -21,7 +21,7 @@ from pipeline.gap.residuals.changes import SceneChange, find_changes, once_each
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
-from pipeline.gap.residuals.stereo_residuals import StereoResiduals, shaped_px
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -95,7 +95,7 @@ class State:
         there, residuals = self.shaped, self.residuals
         if isinstance(there, StereoMeasurement) and isinstance(residuals, StereoResiduals):
             shaped = np.zeros(len(there.cloud.points))
-            shaped[residuals.index] = shaped_px(there, residuals.geometry)
+            shaped[residuals.index] = residuals.geometry.shaped
             there = there.changed(shaped_px=shaped)
         return few(there, residuals, self.chosen)
 

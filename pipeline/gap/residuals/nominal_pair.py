@@ -28,7 +28,8 @@ _HIDDEN_SHARE = 2e-4
 class PixelGeometry:
     """Per point: left pixel (u, v) and row in the right image (px), disparity of the reference and as found (px), point and unit
     normal of the reference (n, 3), wall frame, m, distances to the middles of both images (px), tangent of the angle between the
-    rectified row and axis, and the disparity of a point at infinity (px)."""
+    rectified row and axis, disparity of a point at infinity, and what effects that look at neighbouring pixels add to that of the
+    reference (px)."""
 
     u: FloatArray
     v: FloatArray
@@ -41,6 +42,7 @@ class PixelGeometry:
     radius_right: FloatArray
     tangent: FloatArray
     infinity: FloatArray
+    shaped: FloatArray
 
     def __len__(self) -> int:
         return len(self.u)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -98,10 +98,11 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     real = real_pair(nominal, model.effects, measurement)
     geometry, curvature, depth = _reference(nominal, real, measurement.scene, u, v, measured)
     hidden = is_hidden(measurement.scene, real.right.position, geometry.point)
+    geometry = replace(geometry, shaped=_shaped_px(measurement, geometry))
     hit = np.isfinite(geometry.disparity)
     slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
     covariates = _covariates(nominal, geometry, depth, curvature)
-    mean = _mean_error(model, geometry, measurement) + _empirical(model, covariates)
+    mean = _mean_error(model, geometry) + _empirical(model, covariates)
     even = hit & ~hidden & (curvature < _EDGE_PX)
     whole = StereoResiduals(
         value=measured - geometry.disparity - mean,
@@ -162,6 +163,7 @@ def _reference(
         radius_right=np.hypot(right[0] - camera.width / 2, right[1] - camera.height / 2),
         tangent=nominal.tangent(u, v),
         infinity=np.full(len(u), nominal.geometry.offset),
+        shaped=np.zeros(len(u)),
     )
     return geometry, curvature, distance
 
@@ -175,14 +177,14 @@ def _pose(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
     return np.stack([(column - base) / step for column in columns], axis=1)
 
 
-def _mean_error(model: StereoModel, geometry: PixelGeometry, measurement: StereoMeasurement) -> FloatArray:
+def _mean_error(model: StereoModel, geometry: PixelGeometry) -> FloatArray:
     """(n,) what those of the model's effects that are not in the cameras add to the disparity, px."""
     beside = [effect for effect in model.effects if not effect.empirical and not isinstance(effect, CameraEffect | RasterEffect)]
     found = np.asarray(sum((effect.mean(geometry) for effect in beside), np.zeros(len(geometry))))
-    return found + shaped_px(measurement, geometry)
+    return found + geometry.shaped
 
 
-def shaped_px(measurement: StereoMeasurement, geometry: PixelGeometry) -> FloatArray:
+def _shaped_px(measurement: StereoMeasurement, geometry: PixelGeometry) -> FloatArray:
     """(n,) what those of the model's effects that look at neighbouring pixels add to the disparity, px."""
     shapes = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
     if not shapes:
