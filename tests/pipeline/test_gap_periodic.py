@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
+from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.naming.entries import Estimate, from_mean
+from pipeline.gap.naming.families import families_of
+from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.registration import residuals_of
 from pipeline.gap.residuals.residuals import Residuals
@@ -85,6 +88,21 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
     effect = DisparityEmpirical.model_validate(entry)
     curve = surface_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
     assert np.std(curve - curve.mean() - (error - error.mean())) < 0.25 * np.std(error)
+
+
+@pytest.mark.parametrize(("points", "least"), [(12_000, 34), (300, 0)])
+def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_path: Path, points: int, least: int) -> None:
+    """A read-out in blocks may repeat tens of times over an image, twelve of which is what a wall's shape may do; a raster with
+    fewer than two columns a cycle shows another wave."""
+    make(Case(0, (3, 1), "none", "stereo", (), points, 6_000), tmp_path / "case", tmp_path / "truth.json")
+    measurement = read_measurement(tmp_path / "case")
+    found = residuals_of(measurement)
+    waves = [each for each in families_of(measurement, found) if isinstance(each, SineGrid) and each.name == "image_x"]
+    shortest = float(found.covariates["image_x"].std()) / max(float(each.frequencies[-1]) for each in waves)
+    reach, step = float(np.ptp(found.covariates["image_x"])), spacing(found.covariates["image_x"])
+    assert step is not None
+    assert shortest >= 0.99 * 2 * step
+    assert least <= reach / shortest < 42
 
 
 @pytest.mark.parametrize(("lines", "cycles"), [(300, 0.3), (2000, 0.3), (8000, 1.0)])

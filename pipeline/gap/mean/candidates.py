@@ -17,9 +17,9 @@ Explanation = tuple[str, bool]
 _KNOTS = 5
 _STEPS = 13
 """Places at which a step in a covariate is tried: quantiles of it."""
-_MOST_CYCLES = 12.0
-_MOST_CYCLES_OF_A_CIRCLE = 40.0
-"""In a field of view: a divided circle is off tens of times a turn, where what lies along a wall is not."""
+MOST_CYCLES = 12.0
+MOST_CYCLES_OF_A_SENSOR = 40.0
+"""In a field of view: a divided circle, or columns read out in blocks, repeat tens of times; what lies along a wall does not."""
 _CHUNK = 32
 PLACE = "place along"
 HARMONICS, FOLDED, SURFACE = "harmonics", "folded", "surface"
@@ -192,15 +192,17 @@ def frequencies(low: float, high: float, step: float, most: int = 200) -> FloatA
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
-def free_forms(covariate: str, values: FloatArray, highest: float = np.inf) -> list[Candidate | SineGrid]:
+def free_forms(
+    covariate: str, values: FloatArray, highest: float = np.inf, most_cycles: float = MOST_CYCLES
+) -> list[Candidate | SineGrid]:
     """Forms of one covariate that stand for no effect: a line, a parabola, a smooth curve, a step, a wave.
 
-    highest: frequency from which on a wave is an effect of the catalogue.
+    highest: frequency from which on a wave is an effect of the catalogue; most_cycles: of a wave over the reach of the values.
     """
     x = _standardised(values)
     smooth = _smooth(x)
     steps = np.unique(np.quantile(x, np.linspace(0, 1, _STEPS + 2)[1:-1]))
-    waves = _waves(x, _MOST_CYCLES, highest * float(values.std()))
+    waves = _waves(x, most_cycles, highest * float(values.std()))
     return [
         _free(covariate, "line", smooth[:, :1]),
         _free(covariate, "parabola", smooth[:, :2]),
@@ -219,7 +221,7 @@ def angle_forms(angle: str, covariate: str, values: FloatArray, lever: FloatArra
     x = _standardised(values)
     smooth = _smooth(x) * lever[:, None]
     forms = [_free(covariate, "line", smooth[:, :1]), _free(covariate, "smooth", smooth)]
-    waves = _waves(x, _MOST_CYCLES_OF_A_CIRCLE) if angle == covariate else []
+    waves = _waves(x, MOST_CYCLES_OF_A_SENSOR) if angle == covariate else []
     found = [SineGrid(covariate, "amplitude", _wave(lever, x, tried), tried, {}, True, angle) for tried in waves]
     return [*(replace(form, angle=angle) for form in forms), *found]
 
@@ -235,9 +237,14 @@ def _smooth(x: FloatArray) -> FloatArray:
     return np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
 
 
+def reach_of(x: FloatArray) -> float:
+    """What all values but a few cover, which a wave's cycles are counted over."""
+    return float(np.ptp(np.quantile(x, [0.005, 0.995])))
+
+
 def _waves(x: FloatArray, most_cycles: float, highest: float = np.inf) -> list[FloatArray]:
     """Frequencies to try, as one list; none where there are fewer than two."""
-    reach = float(np.ptp(np.quantile(x, [0.005, 0.995])))
+    reach = reach_of(x)
     if reach <= 0:
         return []
     tried = frequencies(0.8 / reach, most_cycles / reach, 0.5 / reach)

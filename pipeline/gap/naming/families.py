@@ -8,7 +8,18 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import Candidate, SineGrid, angle_forms, free_forms, places, repeated, surface_form
+from pipeline.gap.mean.candidates import (
+    MOST_CYCLES,
+    MOST_CYCLES_OF_A_SENSOR,
+    Candidate,
+    SineGrid,
+    angle_forms,
+    free_forms,
+    places,
+    reach_of,
+    repeated,
+    surface_form,
+)
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import Residuals
@@ -19,6 +30,7 @@ from sensors.effects.angle_empirical import AngleEmpirical
 
 PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
 """Sines, and along what: an error that repeats but is no sine is not theirs."""
+_IMAGE = ("image_x", "image_y")
 _NOT_FREE = ("edge_step", "line", "disparity_fraction")
 _MOST_POINTS = 5_000
 """By which one sees whether one form holds another."""
@@ -42,7 +54,7 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
         form
         for name, values in part.covariates.items()
         if name not in _NOT_FREE and np.ptp(values) > 0
-        for form in free_forms(name, values, highest=lowest.get(name, np.inf))
+        for form in free_forms(name, values, lowest.get(name, np.inf), _most_cycles(name, values))
     ]
     if isinstance(part, TlsResiduals):
         angles = _of_angles(part)
@@ -50,6 +62,14 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
     first, second = part.planes
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
     return [*named, *free, both, *_repeated(part), *places(part.at)]
+
+
+def _most_cycles(name: str, values: FloatArray) -> float:
+    """Of a wave along a covariate; along an image's axes as many as a sensor may have and its raster can show."""
+    if name not in _IMAGE:
+        return MOST_CYCLES
+    step = spacing(values)
+    return MOST_CYCLES_OF_A_SENSOR if step is None else min(MOST_CYCLES_OF_A_SENSOR, reach_of(values) / (2 * step))
 
 
 def _of_angles(part: TlsResiduals) -> list[Candidate | SineGrid]:
@@ -87,7 +107,7 @@ def _repeated(part: Residuals) -> list[Candidate]:
     step = spacing(found["image_x"]) if "image_x" in found else None
     if step is None:
         return []
-    pixels = {name: found[name] for name in ("image_x", "image_y")}
+    pixels = {name: found[name] for name in _IMAGE}
     return [form for name, values in pixels.items() for form in repeated(name, (values - values.min()) / step, step)]
 
 
