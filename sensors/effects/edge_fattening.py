@@ -6,6 +6,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from scene.mesh import FloatArray
 from sensors.effects.base import parameter
@@ -19,7 +20,8 @@ class EdgeFattening(RasterEffect):
     """d(p) = max of d(q) over |q - p| <= r, q on the near side of a depth step: outlines grow by r, niches' rims shrink.
 
     A depth step is where neighbouring cells differ by more than one pixel of the image that is matched: semi-global matching's
-    discontinuities (Hirschmueller 2008). Slopes below that stay as they are. Half-occluded cells within r get the foreground's
+    discontinuities (Hirschmueller 2008); a matcher that follows steeper slopes has a higher `step_px`. Slopes below that stay as
+    they are. Half-occluded cells within r get the foreground's
     disparity too, since both images' outlines grow alike and pass the left-right check. r is used in whole cells, rounded down.
     """
 
@@ -29,8 +31,15 @@ class EdgeFattening(RasterEffect):
     order = 10
     radius_px: float = parameter("reach beyond the outline", unit="px", source="Hirschmueller 2008", typical=8.0, ge=0, le=1000)
 
+    step_px: float = Field(
+        1.0,
+        gt=0,
+        le=1000,
+        description="neighbours that differ by more are a depth step, at least a pixel of the match [px]",
+    )
+
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
-        return fattened(disparity, int(self.radius_px / cell_px + 1e-9), jump_px)
+        return fattened(disparity, int(self.radius_px / cell_px + 1e-9), max(self.step_px, jump_px))
 
 
 def fattened(disparity: FloatArray, radius: int, step_px: float) -> FloatArray:

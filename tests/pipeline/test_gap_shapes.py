@@ -11,20 +11,24 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
+from benchmarks.gap_challenge import stereo_effects
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import Measurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import naming as steps
+from pipeline.gap.naming.entries import with_effects
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.other.mixed_pixels import find_footprint
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.other.stereo_shapes import find_shapes
 from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.registration import registered, settled
+from pipeline.gap.residuals.disparity_raster import DisparityRaster
+from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import Residuals
 from scene.keyed_random import KeyedRandom
 from sensors.effects.beam_divergence import BeamDivergence
+from sensors.effects.edge_fattening import EdgeFattening
 from sensors.model import StereoModel
 
 Made = tuple[Measurement, Residuals, dict[str, Any]]
@@ -60,6 +64,38 @@ def test_outlines_that_grow_are_found_with_their_reach(tmp_path: Path) -> None:
     case = made(tmp_path, "stereo", ("edge_fattening",), 1)
     found = shapes_of(case)["edge_fattening"]
     assert found.effect.radius_px == pytest.approx(case[2]["radius_px"], abs=2 * np.sqrt(3) * found.std["radius_px"])
+
+
+def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A matcher that follows slopes as others break at them: what it takes for a step is in no measurement."""
+    monkeypatch.setattr(stereo_effects, "_STEP_PX", 4.0)
+    there, residuals, truth = case = made(tmp_path, "stereo", ("edge_fattening",), 4)
+    raster = DisparityRaster.of(there, residuals.geometry)
+    assert raster is not None
+    assert raster.jump_px < 2
+    found = shapes_of(case)["edge_fattening"]
+    assert isinstance(found.effect, EdgeFattening)
+    assert 2 < found.effect.step_px < 8
+    assert found.effect.radius_px == pytest.approx(truth["radius_px"], abs=2 * np.sqrt(3) * found.std["radius_px"])
+
+
+def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> None:
+    """Against moving the cameras and low-passing the reference anew, on a wall with ledges and relief; by mm and tens of
+    microradians, where the change is straight. Points beside what no pixel sees are left out: the low-pass does not know it."""
+    make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    read = read_measurement(tmp_path / "case")
+    there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
+    plain, found = residuals_of(read), residuals_of(there)
+    step = np.array([2e-3, 0, 1e-3, 0, 2e-5, 0])
+    moved = residuals_of(there.moved(step))
+    inner = ~DisparityRaster.of(read, plain.geometry).beside_border(60.0)[np.searchsorted(plain.index, found.index)]
+    both, ours, theirs = np.intersect1d(found.index[found.smooth & inner], moved.index, return_indices=True)
+    rows = np.flatnonzero(found.smooth & inner)[ours]
+    assert len(both) > 3000
+    change = found.value[rows] - moved.value[theirs]
+    low_passed, raw = (float(np.std(change - each.pose[rows] @ step)) for each in (found, plain))
+    assert low_passed < 0.1 * np.std(change)
+    assert low_passed < 0.3 * raw
 
 
 def test_strips_that_are_filled_are_found(tmp_path: Path) -> None:

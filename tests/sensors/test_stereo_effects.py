@@ -26,7 +26,7 @@ from scene.raycast import RayCaster
 from sensors.camera import Camera, CameraPair
 from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS
 from sensors.effects.base import Effect
-from sensors.effects.edge_fattening import fattened
+from sensors.effects.edge_fattening import EdgeFattening, fattened
 from sensors.effects.smoothing import smoothed
 from sensors.effects.texture_noise import LARGEST_SIGMA_PX, WINDOW, TextureNoise, texture
 from sensors.matches import Matches, bridged
@@ -387,6 +387,16 @@ def test_niche_rims_shrink_by_the_radius_and_slopes_stay() -> None:
     np.testing.assert_array_equal(fattened(wall, 5, 4.0), expected)
     slope = np.add.outer(0.9 * 4.0 * np.arange(50), -0.9 * 4.0 * np.arange(25))
     np.testing.assert_array_equal(fattened(slope, 5, 4.0), slope)
+
+
+def test_outlines_grow_at_steps_that_are_high_enough() -> None:
+    wall = np.full((40, 90), 30.0)
+    wall[:, 30:60], wall[:, 60:] = 33.0, 40.0
+    grown = EdgeFattening(radius_px=5, step_px=4.0).filtered(wall, 1.0, 1.0)
+    expected = wall.copy()
+    expected[:, 55:60] = 40.0
+    np.testing.assert_array_equal(grown, expected)
+    np.testing.assert_array_equal(EdgeFattening(radius_px=5).filtered(wall, 1.0, 4.0), expected)
 
 
 def test_the_foreground_of_a_step_grows_by_the_radius_over_the_half_occluded_strip() -> None:

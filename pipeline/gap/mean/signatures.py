@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid, Wave, amplitude_and_phase, frequencies, variants
+from pipeline.gap.residuals.disparity_raster import through
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
 from pipeline.gap.residuals.residuals import Geometry, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -107,7 +108,9 @@ def _of_cameras(
     ]
     changed = (real_pair(nominal, (effect(camera=side, **{key: step}),), measurement) for effect, side, key, step in varied)
     base, *seen = seen_disparities(nominal, [nominal.pair, *changed], geometry)
-    columns = {(effect, side, key): (each - base) / step for (effect, side, key, step), each in zip(varied, seen, strict=True)}
+    changes = np.stack([(each - base) / step for (*_, step), each in zip(varied, seen, strict=True)], axis=1)
+    passed = through(measurement.model.effects, geometry, changes)
+    columns = {(effect, side, key): column for (effect, side, key, _), column in zip(varied, passed.T, strict=True)}
     return [
         Candidate(
             effect.tag(),

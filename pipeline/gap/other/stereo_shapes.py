@@ -29,8 +29,9 @@ from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import Smoothing
 
 _RADII = (1, 2, 3, 4, 5, 6, 8)
+_STEPS = (1.0, 2.0, 4.0)
 _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
-"""Cells that outlines grow by, and standard deviations of the low-pass in cells."""
+"""Cells that outlines grow by, at steps so many times the least that is one; standard deviations of the low-pass in cells."""
 _FINER = (1.1, 1.03)
 _FILLED, _STRAY_FILLED = 0.9, 0.02
 """Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
@@ -140,30 +141,40 @@ def find_shapes(
 
 
 def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
-    """Radii are whole cells: any between one and the next does the same. Outlines that do not grow alike make it unsure."""
-    step, raster = witnesses.raster.step, witnesses.raster
+    """Radii are whole cells: any between one and the next does the same. Outlines that do not grow alike make it unsure.
+
+    What a matcher takes for a depth step, rather than for a slope that it follows, is in no measurement: several are tried.
+    """
+    raster = witnesses.raster
 
     def gains(radius: float) -> FloatArray:
-        return there.gains(beside, _grown(int(radius), step)) if radius else np.zeros(len(witnesses.rough))
+        return there.gains(beside, _grown(int(radius), height, raster)) if radius else np.zeros(len(witnesses.rough))
+
+    def gain_of(outline: tuple[int, float]) -> float:
+        return float(witnesses.gains(beside, _grown(*outline, raster)).sum())
 
     there = witnesses
-    radius = max(_RADII, key=lambda each: float(gains(each).sum()))
+    outlines = [(radius, height) for height in _STEPS for radius in _RADII]
+    radius, height = max(zip(side_by_side(gain_of, outlines), outlines, strict=True))[1]
     if witnesses.times_predicted > decided().shapes.wide:
         # outlines that grow far spoil the registration and the spread by which points would bear witness of them
-        settled = [(each, witnesses.registered_with([*beside, _grown(each, step)])) for each in _RADII]
+        settled = [(each, witnesses.registered_with([*beside, _grown(*each, raster)])) for each in outlines]
         far, best = min(settled, key=lambda each: each[1].times_predicted)
         if best.times_predicted < witnesses.times_predicted / decided().shapes.wide:
-            radius, there = far, best
+            (radius, height), there = far, best
     gain = witnesses.blocks.tested(gains(radius))
     if gain is None:
         return None
-    touched = raster.moved([_grown(radius + _NEAR_STEPS, step)], witnesses.disparity) != 0
+    touched = raster.moved([_grown(radius + _NEAR_STEPS, height, raster)], witnesses.disparity) != 0
     uneven = min(there.blocks.std(gains, radius, 1.0), float(radius))
-    return ShapeFound(_grown(radius, step), {"radius_px": step * float(np.hypot(np.sqrt(1 / 12), uneven))}, gain, touched)
+    std = {"radius_px": raster.step * float(np.hypot(np.sqrt(1 / 12), uneven))}
+    return ShapeFound(_grown(radius, height, raster), std, gain, touched)
 
 
-def _grown(radius: int, step: float) -> EdgeFattening:
-    return EdgeFattening(radius_px=(radius + 0.5) * step)
+def _grown(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening:
+    """radius: cells; height: of a depth step, in the least that is one."""
+    reach = (radius + 0.5) * raster.step
+    return EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.jump_px)
 
 
 def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
@@ -183,7 +194,7 @@ def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
     if gain is None:
         return None
     std = float(np.hypot(witnesses.blocks.std(gains, sigma), _FILTERED * sigma))
-    return ShapeFound(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain, np.zeros(len(witnesses.rough), dtype=bool))
+    return ShapeFound(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain, witnesses.raster.beside_border(sigma))
 
 
 def _filling(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:

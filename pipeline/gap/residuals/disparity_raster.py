@@ -13,10 +13,14 @@ from pipeline.formats.measurement import StereoMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, project, rays, real_pair
 from pipeline.gap.residuals.residuals import BoolArray
 from scene.mesh import FloatArray
+from sensors.camera import Camera
 from sensors.effects.base import Effect
 from sensors.effects.raster_effect import RasterEffect
 
 _MOST_CELLS = 1_000_000
+_MARGIN = 32
+"""Cells beside the outermost points: three standard deviations of the widest low-pass that is looked for."""
+_BEYOND = 0.01
 _STEPS, _ON_RASTER = range(2, 33), 0.5
 _STEEP = 0.3
 """Disparity per pixel along the image beyond which neighbouring cells lie on both sides of a depth step."""
@@ -40,19 +44,19 @@ class DisparityRaster:
         if step is None:
             return None
         nominal = NominalPair.of(measurement)
-        low = geometry.u.min(), geometry.v.min()
-        column, row = (np.rint((x - x0) / step).astype(np.int64) for x, x0 in zip((geometry.u, geometry.v), low, strict=True))
-        shape = int(row.max()) + 1, int(column.max()) + 1
-        if np.prod(shape) > _MOST_CELLS:
-            return None
-        rows, columns = np.indices(shape)
-        u, v = low[0] + step * columns.ravel(), low[1] + step * rows.ravel()
         real = real_pair(nominal, measurement.model.effects, measurement)
         left, right = real.left, real.right
+        (columns, column), (rows, row) = (
+            _axis(x, step, size) for x, size in ((geometry.u, left.width), (geometry.v, left.height))
+        )
+        if len(rows) * len(columns) > _MOST_CELLS:
+            return None
+        u, v = (x.ravel() for x in np.meshgrid(columns, rows))
+        shape = len(rows), len(columns)
         ray = rays(left, u, v)
         point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
         seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
-        matched = seen & ~hidden
+        matched = seen & ~hidden & _pictured(right, point)
         if not matched.any():  # the cameras look past the reference
             return None
         disparity = np.full(len(u), np.nan)
@@ -68,6 +72,13 @@ class DisparityRaster:
         """(n,) what a raster holds at the points."""
         return np.asarray(raster[self.row, self.column])
 
+    def beside_border(self, sigma_px: float) -> BoolArray:
+        """(n,) points for which a low-pass sees beyond what both cameras see of the reference, by more than a hundredth."""
+        from scipy.ndimage import gaussian_filter
+
+        inside = (~np.isnan(self.disparity) | self.hidden).astype(np.float64)
+        return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
+
     def after(self, effects: Iterable[Effect]) -> FloatArray:
         """(rows, columns) disparities after those of the effects that look at neighbours, px, NaN where there is no match."""
         found = self.disparity
@@ -80,6 +91,52 @@ class DisparityRaster:
         """(n,) what the effects add to the disparities (n,) that the reference has at the points, px; 0 where they say none."""
         plain = self.at_points(self.disparity)
         return np.nan_to_num(self.at_points(self.after(effects)) - np.where(np.isnan(plain), disparity, plain))
+
+
+def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
+    """(n, k) what small changes of the disparities (n, k) at the points are after the effects that look at neighbours.
+
+    A low-pass takes the rock's relief off them, by which a move of the cameras changes each disparity.
+    """
+    filters, step = [effect for effect in effects if isinstance(effect, RasterEffect)], spacing(geometry.u)
+    if not filters or step is None:
+        return columns
+    row, column = _cells(geometry, step)
+    raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
+    if raster.size > _MOST_CELLS:
+        return columns
+    found = np.empty_like(columns)
+    for number, values in enumerate(columns.T):
+        raster[row, column] = values
+        passed = raster
+        for effect in sorted(filters, key=lambda effect: (effect.stage, effect.order)):
+            passed = effect.of_changes(passed, step)
+        found[:, number] = passed[row, column]
+    return found
+
+
+def _pictured(camera: Camera, point: FloatArray) -> BoolArray:
+    """(n,) whether points (n, 3) lie within a camera's picture: nothing else can be matched."""
+    u, v = project(camera, point)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height))
+
+
+def _axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Pixels of the rows or columns of the matcher's raster, and of each point (n,) which it is of. size: of the image, px.
+
+    Beyond the outermost points as far as the image goes and a low-pass sees: clouds are cut, and matched before.
+    """
+    low, high = float(x.min()), float(x.max())
+    before, after = (int(np.clip(room // step, 0, _MARGIN)) for room in (low, size - high))
+    cell = np.rint((x - low) / step).astype(np.int64) + before
+    return np.asarray(low + step * np.arange(-before, int(np.rint((high - low) / step)) + 1 + after), dtype=np.float64), cell
+
+
+def _cells(geometry: PixelGeometry, step: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(n,) row and column of the cell of each point, `step` px each."""
+    row, column = (np.rint((x - x.min()) / step).astype(np.int64) for x in (geometry.v, geometry.u))
+    return row, column
 
 
 def spacing(u: FloatArray) -> float | None:

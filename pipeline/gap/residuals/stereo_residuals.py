@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurement import StereoMeasurement
-from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing
+from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing, through
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
     PixelGeometry,
@@ -110,7 +110,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         unit_m=1 / slope,
         smooth=even & measurement.stable,
         even=even,
-        pose=_pose(nominal, geometry),
+        pose=through(model.effects, geometry, _pose(nominal, geometry)),
         at=geometry.point[:, :2],
         covariates=covariates,
         index=np.arange(len(u)),
