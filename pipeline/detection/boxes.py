@@ -75,6 +75,11 @@ def decode(code: Tensor, reference: Tensor) -> Tensor:
     return ops.concatenate([centre - half, centre + half], axis=-1)
 
 
+def widened(boxes: Tensor, margin: float) -> Tensor:
+    """Boxes (..., 4) with all edges `margin` further out, px."""
+    return boxes + margin * np.array([-1, -1, 1, 1], np.float32)
+
+
 def clip(boxes: Tensor, height: int, width: int) -> Tensor:
     """The part of boxes (..., 4) inside the image."""
     return ops.clip(boxes, 0.0, np.array([height, width, height, width], np.float32))

@@ -65,6 +65,13 @@ class HeadConfig(Config):
     hidden_units: int = Field(256, ge=1, le=8192, description="units of the two dense layers of the box head")
     detections: int = Field(150, ge=1, le=5000, description="most blocks found in one image")
     suppression_iou: float = Field(0.4, gt=0, le=1, description="of two detections that overlap more the better one stays")
+    mask_margin_px: float = Field(
+        1.0,
+        ge=0,
+        le=64,
+        description="a detection's mask is drawn in its box with so many px of the image around, so that a box that is a little "
+        "too small does not cut it; in detection alone, training has boxes of its own that are off",
+    )
     score_shift: float = Field(
         0.0,
         ge=-100,

@@ -211,6 +211,58 @@ def test_masks_have_the_size_of_the_config(size):
     assert answer["boxes"].shape == (1, 5, 4)
 
 
+class _SeesADisc(MaskRCNN):
+    """Its one box is smaller than the disc that it sees, as a small block's box is when it is off by a part of a pixel."""
+
+    centre, radius, box = (40.3, 60.8), 6.0, (35.0, 56.0, 45.0, 66.0)
+
+    def __init__(self, margin: float) -> None:
+        super().__init__(
+            SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"mask_margin_px": margin, "detections": 1})})
+        )
+
+    def _proposals(self, logits, codes):
+        return np.array([[self.box]], np.float32)
+
+    def _on_boxes(self, levels, boxes, training):
+        return np.array([[[0, 5]]], np.float32), np.zeros((1, 1, 4), np.float32)
+
+    def _masks(self, levels, boxes, training):
+        y0, x0, y1, x1 = np.asarray(boxes)[0, 0]
+        parts = (np.arange(28) + 0.5) / 28
+        return self.inside(y0 + parts * (y1 - y0), x0 + parts * (x1 - x0))[None, None].astype(np.float32)
+
+    def inside(self, y, x):
+        """(len(y), len(x)) how far inside the disc the points are, px."""
+        return self.radius - np.hypot(y[:, None] - self.centre[0], x - self.centre[1])
+
+
+@pytest.mark.parametrize("margin", [0, 2])
+def test_a_mask_is_cut_at_the_margin_around_its_box(margin, eager):
+    """A disc in closed form that reaches beyond its box by up to 1.3 px: whole with a margin of 2 px, without what the box holds.
+
+    Pixels whose centres lie within a tenth of a pixel of the disc's edge may be either.
+    """
+    model = _SeesADisc(margin)
+    (found,) = detect(model, np.random.default_rng(1).normal(0, 0.01, (SIDE, SIDE)).astype(np.float32))
+    mask = np.zeros((SIDE, SIDE), bool)
+    top, bottom, left, right = found.bounds
+    mask[top:bottom, left:right] = found.mask
+    at = np.arange(SIDE) + 0.5
+    inside, held = model.inside(at, at), np.zeros_like(mask)
+    held[35 - margin : 45 + margin, 56 - margin : 66 + margin] = True
+    sure = np.abs(inside) > 0.1
+    assert_array_equal(mask[sure], ((inside > 0) & held)[sure])
+    assert mask[inside > 0.1].all() == (margin > 0)
+
+
+def test_boxes_stay_as_found_where_masks_have_a_margin(eager):
+    model = _SeesADisc(1.5)
+    answer = model.predict_on_batch({"image": np.zeros((1, SIDE, SIDE, 2), np.float32)})
+    assert_allclose(answer["boxes"][0, 0], model.box, rtol=1e-5)
+    assert_allclose(answer["mask_boxes"][0, 0], (33.5, 54.5, 46.5, 67.5), rtol=1e-5)
+
+
 @pytest.mark.parametrize(("name", "millions"), [("resnet50", 23.5), ("resnet101", 42.5)])
 def test_the_backbones_are_the_papers(name, millions):
     """Parameters of the convolutions of He et al. without the classifier; the first takes one channel in place of three."""
