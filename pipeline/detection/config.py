@@ -78,6 +78,13 @@ class HeadConfig(Config):
         le=100,
         description="added to the log odds of a block; `scarpsim train` sets it so that a score of 0.95 finds blocks best",
     )
+    score_per_doubling: float = Field(
+        0.0,
+        ge=-100,
+        le=100,
+        description="added to the log odds for each doubling of a box's side above 16 px, taken off for each halving; "
+        "`scarpsim train` sets it together with score_shift",
+    )
 
 
 class DetectorConfig(Config):

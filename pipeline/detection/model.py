@@ -14,7 +14,7 @@ import numpy as np
 from keras import ops
 
 from pipeline.detection.backbone import feature_pyramid
-from pipeline.detection.boxes import Tensor, anchors, clip, decode, suppressed, widened
+from pipeline.detection.boxes import Tensor, anchors, clip, decode, doublings, suppressed, widened
 from pipeline.detection.config import DetectorConfig, Loss
 from pipeline.detection.heads import MASK_POOLED_PX, POOLED_PX, box_head, mask_head, proposal_head
 from pipeline.detection.losses import binary_cross_entropy, cross_entropy, smooth_l1
@@ -118,9 +118,9 @@ class MaskRCNN(keras.Model):
         config = self.config.head
         classes, codes = self._on_boxes(levels, proposals, False)
         real = proposals[..., 2] > proposals[..., 0]
-        odds = classes[..., 1] - classes[..., 0] + config.score_shift
-        scores, order = ops.top_k(ops.where(real, ops.sigmoid(odds), -1.0), proposals.shape[1])
         boxes = clip(decode(codes, proposals), self.size, self.size)
+        odds = classes[..., 1] - classes[..., 0] + config.score_shift + config.score_per_doubling * doublings(boxes)
+        scores, order = ops.top_k(ops.where(real, ops.sigmoid(odds), -1.0), proposals.shape[1])
         boxes = ops.take_along_axis(ops.where(real[..., None], boxes, 0.0), order[..., None], axis=1)
         boxes, scores = suppressed(boxes, scores, config.suppression_iou, config.detections)
         around = widened(boxes, config.mask_margin_px)

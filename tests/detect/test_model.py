@@ -19,7 +19,7 @@ from pipeline.detection.data import CocoFolder, network_input, window
 from pipeline.detection.evaluate import evaluate
 from pipeline.detection.inference import detect
 from pipeline.detection.model import LOSSES, MaskRCNN
-from pipeline.detection.operating_point import CONFIDENCE, set_operating_point
+from pipeline.detection.operating_point import CONFIDENCE, best_shifts, set_operating_point
 from pipeline.detection.run import detect as run_detect
 from pipeline.detection.training import train
 from pipeline.formats.geotiff import write_geotiff
@@ -254,6 +254,37 @@ def test_a_mask_is_cut_at_the_margin_around_its_box(margin, eager):
     sure = np.abs(inside) > 0.1
     assert_array_equal(mask[sure], ((inside > 0) & held)[sure])
     assert mask[inside > 0.1].all() == (margin > 0)
+
+
+def test_scores_are_shifted_by_the_size_of_the_box(eager):
+    """Log odds of 5, and 0.5 taken off for each doubling, of a box of 10 px."""
+    model = _SeesADisc(1.0)
+    model.config = model.config.model_copy(update={"head": model.config.head.model_copy(update={"score_per_doubling": -0.5})})
+    answer = model.predict_on_batch({"image": np.zeros((1, SIDE, SIDE, 2), np.float32)})
+    assert answer["scores"][0, 0] == pytest.approx(1 / (1 + np.exp(-5 + 0.5 * np.log2(10 / 16))), rel=1e-6)
+
+
+def test_the_shifts_are_those_with_which_blocks_are_found_best():
+    """Small blocks are right from a score of 0.6 on, large ones from 0.9 on: one score for both misses or adds some, and with the
+    shifts a score of 0.95 parts all. Where no detection is wrong, size needs no shift."""
+    right = [_square(number, 4, score) for number, score in enumerate((0.6, 0.7, 0.8))]
+    right += [_square(number, 32, score) for number, score in enumerate((0.9, 0.97), start=3)]
+    wrong = [_square(5, 4, 0.4), _square(6, 32, 0.8), _square(7, 32, 0.85)]
+    truth = {"images": [{"id": 1}], "annotations": right}
+    shift, slope = best_shifts(truth, [*right, *wrong])
+    odds = [np.log(each["score"] / (1 - each["score"])) + shift + slope * np.log2(each["bbox"][2] / 16) for each in right + wrong]
+    assert [value >= np.log(19) for value in odds] == [True] * len(right) + [False] * len(wrong)
+    assert slope < 0
+    assert best_shifts(truth, right)[1] == 0
+    assert best_shifts(truth, []) is None
+
+
+def _square(number: int, side: int, score: float) -> dict:
+    mask = np.ones((side, side), bool)
+    return {
+        "id": number + 1, "image_id": 1, "category_id": 1, "iscrowd": 0, "area": side**2, "score": score,
+        "bbox": [0, 40 * number, side, side], "segmentation": run_length_encoding(mask, 40 * number, 0, (400, 400)),
+    }  # fmt: skip
 
 
 def test_boxes_stay_as_found_where_masks_have_a_margin(eager):
