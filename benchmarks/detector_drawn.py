@@ -3,8 +3,9 @@
     python benchmarks/detector_drawn.py --set sets/mixed [--split val] [--model default] [--write]
 
 Of the blocks found (masks overlap by 0.25, score 0.95), the share with a mask that overlaps by 0.75: masks as they are, drawn in
-other boxes or from another probability on, and the true masks cut or sampled as the network's are. Each block counts that the
-network finds as it is, whatever is drawn then. Tiles of the detector's own size. --write puts the table into docs/detector.md.
+other boxes, with another margin or from another probability on, and the true masks cut or sampled as the masks found are. Each
+block counts that the network finds as it is, whatever is drawn then. Tiles of the detector's own size. --write puts the table
+into docs/detector.md.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
 from pipeline.detection import weights
+from pipeline.detection.boxes import widened
 from pipeline.detection.data import CocoFolder
 from pipeline.detection.evaluate import matches
 from pipeline.detection.inference import paste
@@ -33,6 +36,7 @@ CONFIDENCE, FOUND, DRAWN = 0.95, 0.25, 0.75
 SIZES = ("small", "medium", "large")
 ENOUGH = 20
 """Of fewer blocks no share is given."""
+MARGINS = (0.0, 0.5, 2.0)
 RATIOS = ((4, 8), (8, 16), (16, 32), (32, np.inf))
 Boxes = NDArray[np.float32]
 Masks = NDArray[np.bool_]
@@ -43,12 +47,14 @@ Drawing = Callable[["Tile"], Masks]
 class Tile:
     """A tile with the blocks found in it, one row each.
 
-    boxes: (n, 4), masks: (n, m, m) probabilities in them; true_masks: (n, size, size), true_boxes: (n, 4), of the blocks found;
-    draw: the mask head in other boxes of the tile.
+    boxes: (n, 4); masks: (n, m, m) probabilities in mask_boxes (n, 4), the boxes with a margin (px) around; true_masks:
+    (n, size, size), true_boxes: (n, 4), of the blocks found; draw: the mask head in other boxes of the tile.
     """
 
     size: int
     boxes: Boxes
+    margin: float
+    mask_boxes: Boxes
     masks: NDArray[np.float32]
     true_masks: Masks
     true_boxes: Boxes
@@ -74,7 +80,7 @@ def pasted(masks: NDArray[np.float32], boxes: Boxes, size: int) -> Masks:
     return result
 
 
-def widened(boxes: Boxes, factor: float) -> Boxes:
+def scaled(boxes: Boxes, factor: float) -> Boxes:
     """The same centres, sides times the factor."""
     middle, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
     return np.concatenate([middle - factor * half, middle + factor * half], axis=1)
@@ -98,23 +104,29 @@ def sampled(masks: Masks, boxes: Boxes, cells: int) -> NDArray[np.float32]:
     return masks[np.arange(len(masks))[:, None, None], rows[:, :, None], columns[:, None, :]].astype(np.float32)
 
 
-AS_THEY_ARE, IN_TRUE_BOXES = "masks as they are", "masks drawn in the true boxes"
-DRAWINGS: dict[str, Drawing] = {
-    AS_THEY_ARE: lambda tile: pasted(tile.masks, tile.boxes, tile.size),
-    "masks from a probability of 0.45 on": lambda tile: pasted(tile.masks + 0.05, tile.boxes, tile.size),
-    "masks from 0.4 on": lambda tile: pasted(tile.masks + 0.1, tile.boxes, tile.size),
-    "masks drawn in boxes of 1.2 times the side": lambda tile: redrawn(tile, widened(tile.boxes, 1.2)),
-    IN_TRUE_BOXES: lambda tile: redrawn(tile, tile.true_boxes),
-    "true masks, cut by the boxes found": lambda tile: cut(tile.true_masks, tile.boxes),
-    "true masks, on the mask's grid in the boxes found": lambda tile: pasted(
-        sampled(tile.true_masks, tile.boxes, tile.masks.shape[1]), tile.boxes, tile.size
-    ),
-}
-
-
 def redrawn(tile: Tile, boxes: Boxes) -> Masks:
     """What the mask head sees in other boxes."""
     return pasted(tile.draw(boxes), boxes, tile.size)
+
+
+def with_margin(tile: Tile, margin: float) -> Masks:
+    """What it sees in the boxes found with another margin around."""
+    return redrawn(tile, widened(tile.boxes, margin))
+
+
+AS_THEY_ARE, IN_TRUE_BOXES = "masks as they are", "masks drawn in the true boxes"
+DRAWINGS: dict[str, Drawing] = {
+    AS_THEY_ARE: lambda tile: pasted(tile.masks, tile.mask_boxes, tile.size),
+    "masks from a probability of 0.45 on": lambda tile: pasted(tile.masks + 0.05, tile.mask_boxes, tile.size),
+    "masks from 0.4 on": lambda tile: pasted(tile.masks + 0.1, tile.mask_boxes, tile.size),
+    **{f"masks drawn with a margin of {margin:g} px": partial(with_margin, margin=margin) for margin in MARGINS},
+    "masks drawn in boxes of 1.2 times the side": lambda tile: redrawn(tile, scaled(tile.boxes, 1.2)),
+    IN_TRUE_BOXES: lambda tile: redrawn(tile, widened(tile.true_boxes, tile.margin)),
+    "true masks, cut as the masks are": lambda tile: cut(tile.true_masks, tile.mask_boxes),
+    "true masks, on the masks' grid": lambda tile: pasted(
+        sampled(tile.true_masks, tile.mask_boxes, tile.masks.shape[1]), tile.mask_boxes, tile.size
+    ),
+}
 
 
 def overlaps(one: Masks, other: Masks) -> NDArray[np.float64]:
@@ -135,19 +147,21 @@ def blocks(model: Any, folder: CocoFolder) -> Iterator[Block]:
         sure = answer["scores"] >= CONFIDENCE
         if not wanted or not sure.any():
             continue
-        boxes, masks = answer["boxes"][sure], answer["masks"][sure]
+        boxes, mask_boxes, masks = (answer[name][sure] for name in ("boxes", "mask_boxes", "masks"))
         true_masks = np.stack([coco_mask.decode(each["segmentation"]) > 0 for each in wanted])
-        matched = matches(overlaps(pasted(masks, boxes, model.size), true_masks), FOUND)
+        matched = matches(overlaps(pasted(masks, mask_boxes, model.size), true_masks), FOUND)
         hits, of = np.flatnonzero(matched >= 0), matched[matched >= 0]
         if not len(hits):
             continue
         true_boxes = np.array([box_of(wanted[number]) for number in of], np.float32)
 
-        def draw(others: Boxes, pixels: Any = pixels) -> NDArray[np.float32]:
-            levels = model.pyramid(pixels, training=False)[:4]
+        levels = model.pyramid(pixels, training=False)[:4]
+
+        def draw(others: Boxes, levels: Any = levels) -> NDArray[np.float32]:
             return np.asarray(ops.sigmoid(model._masks(levels, ops.convert_to_tensor(others[None]), False)))[0]
 
-        tile = Tile(model.size, boxes[hits], masks[hits], true_masks[of], true_boxes, draw)
+        margin = model.config.head.mask_margin_px
+        tile = Tile(model.size, boxes[hits], margin, mask_boxes[hits], masks[hits], true_masks[of], true_boxes, draw)
         drawn = {
             name: [overlaps(one[None], true[None])[0, 0] for one, true in zip(way(tile), tile.true_masks, strict=True)]
             for name, way in DRAWINGS.items()

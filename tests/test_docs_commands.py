@@ -96,8 +96,12 @@ RESOLVED = (
     "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 3 --set training.start=further/best "
     "--set training.learning_rate=0.001 --set training.epochs=20 --set training.keep_epochs=10 "
     "--set training.precision=bfloat16 --out more",
-    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 4 --set training.start=default "
-    "--set training.learning_rate=0.001 --set training.precision=bfloat16 --out more",
+    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 4 --set training.start=more/best "
+    "--set training.learning_rate=0.001 --set training.epochs=27 --set training.precision=bfloat16 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out still_more',
+    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 5 --set training.start=default "
+    "--set training.learning_rate=0.001 --set training.precision=bfloat16 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out further_still',
 )
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 

@@ -75,6 +75,16 @@ def decode(code: Tensor, reference: Tensor) -> Tensor:
     return ops.concatenate([centre - half, centre + half], axis=-1)
 
 
+def widened(boxes: Tensor, margin: float) -> Tensor:
+    """Boxes (..., 4) with all edges `margin` further out, px."""
+    return boxes + margin * np.array([-1, -1, 1, 1], np.float32)
+
+
+def doublings(boxes: Tensor) -> Tensor:
+    """(...) by how many doublings the sides of boxes (..., 4), the roots of their areas, 1 px at least, lie above 16 px."""
+    return 0.5 * ops.log2(ops.maximum(_area(boxes), 1.0)) - 4.0
+
+
 def clip(boxes: Tensor, height: int, width: int) -> Tensor:
     """The part of boxes (..., 4) inside the image."""
     return ops.clip(boxes, 0.0, np.array([height, width, height, width], np.float32))

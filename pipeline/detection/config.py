@@ -65,11 +65,25 @@ class HeadConfig(Config):
     hidden_units: int = Field(256, ge=1, le=8192, description="units of the two dense layers of the box head")
     detections: int = Field(150, ge=1, le=5000, description="most blocks found in one image")
     suppression_iou: float = Field(0.4, gt=0, le=1, description="of two detections that overlap more the better one stays")
+    mask_margin_px: float = Field(
+        1.0,
+        ge=0,
+        le=64,
+        description="a detection's mask is drawn in its box with so many px of the image around, so that a box that is a little "
+        "too small does not cut it; in detection alone, training has boxes of its own that are off",
+    )
     score_shift: float = Field(
         0.0,
         ge=-100,
         le=100,
         description="added to the log odds of a block; `scarpsim train` sets it so that a score of 0.95 finds blocks best",
+    )
+    score_per_doubling: float = Field(
+        0.0,
+        ge=-100,
+        le=100,
+        description="added to the log odds for each doubling of a box's side above 16 px, taken off for each halving; "
+        "`scarpsim train` sets it together with score_shift",
     )
 
 

@@ -51,7 +51,8 @@ def tile_places(shape: tuple[int, ...], size: int) -> Iterator[tuple[int, int]]:
 def paste(probability: NDArray[np.float32], box: NDArray[np.float32], size: int) -> tuple[int, int, NDArray[np.bool_]]:
     """Row, column and mask of the pixels of an image of side `size` whose centres have a probability above a half.
 
-    probability: (m, m) over the box (y0, x0, y1, x1), px; it is interpolated bilinearly between the centres of its cells.
+    probability: (m, m) over the box (y0, x0, y1, x1), px, which may reach beyond the image. It is interpolated bilinearly between
+    the centres of its cells; pixels that the box does not touch have none.
     """
     y0, x0, y1, x1 = (float(value) for value in box)
     top, left = max(int(np.floor(y0)), 0), max(int(np.floor(x0)), 0)
@@ -83,7 +84,7 @@ def _pixels(difference: NDArray[np.float32], tile: MapTile) -> NDArray[np.float3
 def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, tile: MapTile) -> Iterator[Detection]:
     """What the network found in the tile, in the map's frame."""
     top, bottom, left, right = tile.bounds
-    for box, score, mask in zip(answer["boxes"], answer["scores"], answer["masks"], strict=True):
+    for box, score, mask in zip(answer["mask_boxes"], answer["scores"], answer["masks"], strict=True):
         if score < minimum_score:
             return
         row, column, pixels = paste(mask, box, tile.size)

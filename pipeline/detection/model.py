@@ -14,7 +14,7 @@ import numpy as np
 from keras import ops
 
 from pipeline.detection.backbone import feature_pyramid
-from pipeline.detection.boxes import Tensor, anchors, clip, decode, suppressed
+from pipeline.detection.boxes import Tensor, anchors, clip, decode, doublings, suppressed, widened
 from pipeline.detection.config import DetectorConfig, Loss
 from pipeline.detection.heads import MASK_POOLED_PX, POOLED_PX, box_head, mask_head, proposal_head
 from pipeline.detection.losses import binary_cross_entropy, cross_entropy, smooth_l1
@@ -57,7 +57,7 @@ class MaskRCNN(keras.Model):
         self.built = True  # all layers are functional models with their shapes given
 
     def call(self, inputs: dict[str, Tensor], training: bool = False) -> dict[str, Tensor]:
-        """Losses by name where the inputs hold the blocks, else `boxes`, `scores` and `masks` as `detections` gives them."""
+        """Losses by name where the inputs hold the blocks, else boxes, scores and masks as `_detections` gives them."""
         levels = self.pyramid(inputs["image"], training=training)
         found = [self.proposal_head(level, training=training) for level in levels]
         logits = ops.concatenate([logit for logit, _ in found], axis=1)[..., 0]
@@ -111,16 +111,21 @@ class MaskRCNN(keras.Model):
         }
 
     def _detections(self, levels: list[Tensor], proposals: Tensor) -> dict[str, Tensor]:
-        """boxes (b, n, 4) px, scores (b, n), -1 where there are fewer, best first, masks (b, n, m, m) probabilities."""
+        """boxes (b, n, 4) px, scores (b, n), -1 where there are fewer, best first, masks (b, n, m, m) probabilities.
+
+        mask_boxes (b, n, 4): where the masks lie, the boxes with `mask_margin_px` around, and so beyond the image too.
+        """
         config = self.config.head
         classes, codes = self._on_boxes(levels, proposals, False)
         real = proposals[..., 2] > proposals[..., 0]
-        odds = classes[..., 1] - classes[..., 0] + config.score_shift
-        scores, order = ops.top_k(ops.where(real, ops.sigmoid(odds), -1.0), proposals.shape[1])
         boxes = clip(decode(codes, proposals), self.size, self.size)
+        odds = classes[..., 1] - classes[..., 0] + config.score_shift + config.score_per_doubling * doublings(boxes)
+        scores, order = ops.top_k(ops.where(real, ops.sigmoid(odds), -1.0), proposals.shape[1])
         boxes = ops.take_along_axis(ops.where(real[..., None], boxes, 0.0), order[..., None], axis=1)
         boxes, scores = suppressed(boxes, scores, config.suppression_iou, config.detections)
-        return {"boxes": boxes, "scores": scores, "masks": ops.sigmoid(self._masks(levels, boxes, False))}
+        around = widened(boxes, config.mask_margin_px)
+        masks = ops.sigmoid(self._masks(levels, around, False))
+        return {"boxes": boxes, "scores": scores, "mask_boxes": around, "masks": masks}
 
     def _on_boxes(self, levels: list[Tensor], boxes: Tensor, training: bool) -> tuple[Tensor, Tensor]:
         """Class logits (b, n, classes) and codes (b, n, 4)."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detection.boxes import anchors, clip, decode, encode, intersection_over_union, suppressed
+from pipeline.detection.boxes import anchors, clip, decode, doublings, encode, intersection_over_union, suppressed, widened
 from pipeline.detection.roi_align import roi_align
 
 STRIDES = (4, 8, 16, 32, 64)
@@ -52,6 +52,15 @@ def test_the_codec_gives_a_box_back():
 
 def test_boxes_are_cut_at_the_image():
     assert_allclose(clip(np.array([[-3, 5, 70, 90]], np.float32), 64, 80), [[0, 5, 64, 80]])
+
+
+def test_doublings_of_a_side_of_sixteen_pixels():
+    boxes = np.array([[0, 0, 16, 16], [0, 0, 64, 16], [2, 2, 6, 6], [5, 5, 5, 5]], np.float32)
+    assert_allclose(doublings(boxes), [0, 1, -2, -4], atol=1e-6)
+
+
+def test_a_widened_box_reaches_further_by_the_margin_on_every_side():
+    assert_allclose(widened(np.array([[3, 5, 7, 90]], np.float32), 1.5), [[1.5, 3.5, 8.5, 91.5]])
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -249,7 +249,7 @@ class _EverythingIsABlock:
     def predict_on_batch(self, inputs):
         count = len(inputs["image"])
         box = np.array([[0, 0, 64, 64]], np.float32)
-        answer = {"boxes": box, "scores": np.ones(1, np.float32), "masks": np.ones((1, 28, 28), np.float32)}
+        answer = {"mask_boxes": box, "scores": np.ones(1, np.float32), "masks": np.ones((1, 28, 28), np.float32)}
         return {name: np.repeat(values[None], count, axis=0) for name, values in answer.items()}
 
 

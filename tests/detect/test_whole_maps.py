@@ -45,7 +45,7 @@ class MarkFinder:
         for number, answer in enumerate(answers):
             for place, (score, box, mask) in enumerate(sorted(answer, key=lambda each: -each[0])):
                 boxes[number, place], scores[number, place], masks[number, place] = box, score, mask
-        return {"boxes": boxes, "scores": scores, "masks": masks}
+        return {"mask_boxes": boxes, "scores": scores, "masks": masks}
 
     def _of(self, image):
         self.calls += 1
