@@ -155,11 +155,12 @@ def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
 
     there = witnesses
     outlines = [(radius, height) for height in _STEPS for radius in _RADII]
-    radius, height = max(zip(side_by_side(gain_of, outlines), outlines, strict=True))[1]
+    found = dict(zip(outlines, side_by_side(gain_of, outlines), strict=True))
+    radius, height = max(outlines, key=lambda each: found[each])
     if witnesses.times_predicted > decided().shapes.wide:
         # outlines that grow far spoil the registration and the spread by which points would bear witness of them
-        settled = [(each, witnesses.registered_with([*beside, _grown(*each, raster)])) for each in outlines]
-        far, best = min(settled, key=lambda each: each[1].times_predicted)
+        settled = side_by_side(lambda each: witnesses.registered_with([*beside, _grown(*each, raster)]), outlines)
+        far, best = min(zip(outlines, settled, strict=True), key=lambda each: each[1].times_predicted)
         if best.times_predicted < witnesses.times_predicted / decided().shapes.wide:
             (radius, height), there = far, best
     gain = witnesses.blocks.tested(gains(radius))
