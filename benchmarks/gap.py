@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -72,11 +72,11 @@ def made(sensor: str, points: int, folder: Path) -> Path:
     return case
 
 
-def timed(case: Path, caches: Sequence[str]) -> list[dict[str, Any]]:
+def timed(case: Path) -> list[dict[str, Any]]:
     """What `report` returns with an empty kernel cache and with what that left, each by a process of its own."""
     rows, answer = [], case.with_name("times.json")
     with empty_kernel_cache() as environment:
-        for cache in caches:
+        for cache in ("an empty", "a filled"):
             print(f"with {cache} kernel cache", flush=True)
             command = [sys.executable, __file__, "--measurement", str(case), "--to", str(answer)]
             subprocess.run(command, check=True, env=environment)
@@ -118,7 +118,7 @@ def main() -> None:
         for points in arguments.points:
             with tempfile.TemporaryDirectory() as folder:
                 print(f"{sensor}, about {points:,} points", flush=True)
-                found.setdefault(sensor, []).append(timed(made(sensor, points, Path(folder)), ("an empty", "a filled")))
+                found.setdefault(sensor, []).append(timed(made(sensor, points, Path(folder))))
     print(table(found))
     if arguments.write:
         write_between(_ROOT / "docs/gap/README.md", _TABLE, table(found))

@@ -21,7 +21,9 @@ from pipeline.detection.evaluate import evaluate
 CONFIDENCE, OVERLAP = 0.95, 0.5
 """The score that is to be best, and the overlap of masks from which on a block counts as found."""
 _HIGHEST = 1 - 1e-6
+"""Of a score, whose log odds are finite then."""
 _TRIED_PER_DOUBLING = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75, -1.0, 1.0)
+"""Nothing first, which stays where others are no better. The slope that was found best is inside, not at an end."""
 _TRIED = tuple(float(score) for score in 1 / (1 + np.exp(-np.linspace(-3, 5, 33))))
 
 

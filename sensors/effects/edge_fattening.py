@@ -21,8 +21,8 @@ class EdgeFattening(RasterEffect):
 
     A depth step is where neighbouring cells differ by more than one pixel of the image that is matched: semi-global matching's
     discontinuities (Hirschmueller 2008); a matcher that follows steeper slopes has a higher `step_px`. Slopes below that stay as
-    they are. Half-occluded cells within r get the foreground's
-    disparity too, since both images' outlines grow alike and pass the left-right check. r is used in whole cells, rounded down.
+    they are. Half-occluded cells within r get the foreground's disparity too, since both images' outlines grow alike and pass the
+    left-right check. r is used in whole cells, rounded down.
     """
 
     name: Literal["edge_fattening"] = "edge_fattening"

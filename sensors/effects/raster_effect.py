@@ -25,13 +25,6 @@ class RasterEffect(Effect):
         disparity: before, px; cell_px: px of the frame per cell; jump_px: neighbours that differ by more are a depth step.
         """
 
-    def of_changes(self, changes: FloatArray, cell_px: float) -> FloatArray:
-        """(rows, columns) what small changes of the disparities become; changes, and NaN where there is no match, px.
-
-        What only moves outlines leaves them.
-        """
-        return changes
-
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         step = float(state.reduction)
         return state.with_raster(self.filtered(state.raster(), step, step))

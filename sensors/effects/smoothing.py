@@ -32,9 +32,6 @@ class Smoothing(RasterEffect):
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
         return smoothed(disparity, self.sigma_px / cell_px)
 
-    def of_changes(self, changes: FloatArray, cell_px: float) -> FloatArray:
-        return smoothed(changes, self.sigma_px / cell_px)
-
 
 def smoothed(disparity: FloatArray, sigma: float) -> FloatArray:
     """(rows, columns) disparities, px, NaN where unmatched, low-passed with `sigma` cells over the matched ones."""

@@ -22,8 +22,10 @@ from pipeline.gap.other.mixed_pixels import find_footprint
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.other.stereo_shapes import find_shapes
+from pipeline.gap.residuals import stereo_residuals
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
+from pipeline.gap.residuals.nominal_pair import NominalPair, project
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import Residuals
 from scene.keyed_random import KeyedRandom
@@ -96,6 +98,56 @@ def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> 
     low_passed, raw = (float(np.std(change - each.pose[rows] @ step)) for each in (found, plain))
     assert low_passed < 0.1 * np.std(change)
     assert low_passed < 0.3 * raw
+
+
+def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> None:
+    """Clouds are cut, and matched before: beside the cut a low-pass sees what was cut off."""
+    make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    read = read_measurement(tmp_path / "case")
+    there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 30.0}]))
+    whole = residuals_of(there)
+    u = whole.geometry.u
+    kept = whole.index[(u > np.quantile(u, 0.3)) & (u < np.quantile(u, 0.7))]
+    part = residuals_of(there.part(kept))
+    both, ours, theirs = np.intersect1d(kept[part.index], whole.index, return_indices=True)
+    assert len(both) > 4000
+    np.testing.assert_allclose(part.geometry.shaped[ours], whole.geometry.shaped[theirs], atol=1e-3)
+    assert np.std(whole.geometry.shaped[theirs]) > 0.05, "px that the low-pass does"
+
+
+def test_nothing_is_matched_outside_of_the_right_picture(tmp_path: Path) -> None:
+    make(Case(0, (5, 1), "none", "stereo", (), 8_000, 8_000), tmp_path / "case", tmp_path / "truth.json")
+    there = read_measurement(tmp_path / "case")
+    geometry = residuals_of(there).geometry
+    right = there.cameras.right
+    column = right.width // 2
+    narrow = there.changed(cameras=replace(there.cameras, right=replace(right, width=column, cx_px=right.cx_px + column / 2)))
+    raster, cut = DisparityRaster.of(there, geometry), DisparityRaster.of(narrow, geometry)
+    assert raster is not None
+    assert cut is not None
+    seen_at = project(NominalPair.of(there).pair.right, geometry.point)[0]
+    held = ~np.isnan(cut.at_points(cut.disparity))
+    sure, matched = np.abs(seen_at - column) > 2, ~np.isnan(raster.at_points(raster.disparity))
+    np.testing.assert_array_equal(held[sure & matched], (seen_at < column)[sure & matched])
+    assert 0.1 < held.mean() < 0.9
+
+
+@pytest.mark.parametrize("sigma_px", [4.0, 10.0])
+def test_a_low_pass_sees_over_a_straight_border_from_so_many_sigmas(sigma_px: float) -> None:
+    """More than a hundredth of a Gaussian lies beyond 2.326 standard deviations; cells' middles are half a cell inside."""
+    row, column = (np.ravel(each) for each in np.indices((120, 120)))
+    raster = DisparityRaster(1.0, np.full((120, 120), 30.0), np.zeros((120, 120), dtype=bool), row, column)
+    away, found = np.minimum(column, 119 - column) + 0.5, raster.beside_border(sigma_px)
+    middle = np.abs(row - 59.5) < 20
+    np.testing.assert_array_equal(found[middle], away[middle] < 2.326 * sigma_px)
+
+
+def test_a_raster_too_large_for_shapes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stereo_residuals, "MOST_CELLS", 1000)
+    there, residuals, _ = made(tmp_path, "stereo", (), 1)
+    assert any("more than 1,000 cells" in note for note in residuals.notes)
+    monkeypatch.undo()
+    assert not any("cells" in note for note in residuals_of(there).notes)
 
 
 def test_strips_that_are_filled_are_found(tmp_path: Path) -> None:

@@ -16,11 +16,13 @@ from scene.mesh import FloatArray
 from sensors.camera import Camera
 from sensors.effects.base import Effect
 from sensors.effects.raster_effect import RasterEffect
+from sensors.effects.smoothing import Smoothing, smoothed
 
-_MOST_CELLS = 1_000_000
+MOST_CELLS = 1_000_000
 _MARGIN = 32
 """Cells beside the outermost points: three standard deviations of the widest low-pass that is looked for."""
 _BEYOND = 0.01
+"""Share of a low-pass that may lie beyond what both cameras see: reached 2.3 standard deviations from a straight border."""
 _STEPS, _ON_RASTER = range(2, 33), 0.5
 _STEEP = 0.3
 """Disparity per pixel along the image beyond which neighbouring cells lie on both sides of a depth step."""
@@ -41,7 +43,7 @@ class DisparityRaster:
     def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
         """None where the pixels are on no raster, or on one of more than a million cells."""
         step = spacing(geometry.u)
-        if step is None:
+        if step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
             return None
         nominal = NominalPair.of(measurement)
         real = real_pair(nominal, measurement.model.effects, measurement)
@@ -49,8 +51,6 @@ class DisparityRaster:
         (columns, column), (rows, row) = (
             _axis(x, step, size) for x, size in ((geometry.u, left.width), (geometry.v, left.height))
         )
-        if len(rows) * len(columns) > _MOST_CELLS:
-            return None
         u, v = (x.ravel() for x in np.meshgrid(columns, rows))
         shape = len(rows), len(columns)
         ray = rays(left, u, v)
@@ -94,25 +94,28 @@ class DisparityRaster:
 
 
 def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
-    """(n, k) what small changes of the disparities (n, k) at the points are after the effects that look at neighbours.
+    """(n, k) what small changes of the disparities (n, k) at the points are after the low-passes among the effects.
 
-    A low-pass takes the rock's relief off them, by which a move of the cameras changes each disparity.
+    They take the rock's relief off them, by which a move of the cameras changes each disparity. What moves outlines leaves them.
+    Of thinned points the low-pass is that over their own cells.
     """
-    filters, step = [effect for effect in effects if isinstance(effect, RasterEffect)], spacing(geometry.u)
-    if not filters or step is None:
+    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], spacing(geometry.u)
+    if not filters or step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
-    row, column = _cells(geometry, step)
-    raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
-    if raster.size > _MOST_CELLS:
-        return columns
+    row, column = _cell(geometry.v, step), _cell(geometry.u, step)
     found = np.empty_like(columns)
     for number, values in enumerate(columns.T):
+        raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
         raster[row, column] = values
-        passed = raster
-        for effect in sorted(filters, key=lambda effect: (effect.stage, effect.order)):
-            passed = effect.of_changes(passed, step)
-        found[:, number] = passed[row, column]
+        for effect in filters:
+            raster = smoothed(raster, effect.sigma_px / step)
+        found[:, number] = raster[row, column]
     return found
+
+
+def cells_over(u: FloatArray, v: FloatArray, step: float) -> int:
+    """Of a raster of `step` px, from the first to the last row and column of pixels (n,)."""
+    return int(np.prod([np.rint(np.ptp(x) / step) + 1 for x in (u, v)]))
 
 
 def _pictured(camera: Camera, point: FloatArray) -> BoolArray:
@@ -127,16 +130,14 @@ def _axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDArray[np
 
     Beyond the outermost points as far as the image goes and a low-pass sees: clouds are cut, and matched before.
     """
-    low, high = float(x.min()), float(x.max())
-    before, after = (int(np.clip(room // step, 0, _MARGIN)) for room in (low, size - high))
-    cell = np.rint((x - low) / step).astype(np.int64) + before
-    return np.asarray(low + step * np.arange(-before, int(np.rint((high - low) / step)) + 1 + after), dtype=np.float64), cell
+    before, after = (int(np.clip(room // step, 0, _MARGIN)) for room in (x.min(), size - x.max()))
+    cell = _cell(x, step)
+    return np.asarray(x.min() + step * np.arange(-before, int(cell.max()) + 1 + after), dtype=np.float64), cell + before
 
 
-def _cells(geometry: PixelGeometry, step: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(n,) row and column of the cell of each point, `step` px each."""
-    row, column = (np.rint((x - x.min()) / step).astype(np.int64) for x in (geometry.v, geometry.u))
-    return row, column
+def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
+    """(n,) number of the row or column of each point, `step` px each, from the first."""
+    return np.rint((x - x.min()) / step).astype(np.int64)
 
 
 def spacing(u: FloatArray) -> float | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurement import StereoMeasurement
-from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing, through
+from pipeline.gap.residuals.disparity_raster import MOST_CELLS, DisparityRaster, cells_over, spacing, through
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
     PixelGeometry,
@@ -116,16 +116,19 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         index=np.arange(len(u)),
         geometry=geometry,
         shared_noise=SharedNoise.of(model, np.stack([u, v], axis=1)),
-        notes=(*measurement.notes, *_notes(given, u)),
+        notes=(*measurement.notes, *_notes(given, u, v)),
     )
     return whole.part(hit)
 
 
-def _notes(given: bool, u: FloatArray) -> tuple[str, ...]:
+def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
     """What cannot be looked into for want of a field. given: whether the pixels are recorded."""
+    step = spacing(u)
+    large = step is not None and cells_over(u, v, step) > MOST_CELLS
     absent = {
         "no pixel_x, pixel_y: pixels were found by projecting the points": not given,
-        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tried": spacing(u) is None,
+        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tried": step is None,
+        f"a raster of more than {MOST_CELLS:,} cells: edge_fattening, smoothing and occlusion_fill were not tried": large,
         "no images: texture_noise was not tried": True,
     }
     return tuple(note for note, true in absent.items() if true)
