@@ -18,6 +18,8 @@ _QUIET_S = 2.0
 _INTERVAL_S = 5.0
 _GUESS_LIMIT = 0.95
 """A stage that does not say how far it is counts as at most this much done."""
+_OVERDUE = 2.0
+"""A stage that takes so many times what the stages before it let one expect: the time left is anyone's guess."""
 
 
 class Progress:
@@ -89,19 +91,30 @@ class Progress:
 
     @property
     def time(self) -> str:
-        """The time left, for people; without a plan the time so far."""
-        return f"about {duration(self.left_s)} left" if self._weights else f"{duration(self.elapsed_s)} so far"
+        """The time left, for people; the time so far without a plan, or where a stage takes longer than one could have told."""
+        overdue = bool(self._finished) and self._guess() > _OVERDUE
+        if self._weights and not overdue:
+            return f"about {duration(self.left_s)} left"
+        return f"{duration(self.elapsed_s)} so far" + (", longer than usual" if overdue else "")
 
     def _done(self) -> float:
         """Weight done of the plan; a stage that has not said how far it is goes by the pace of the stages before it."""
         finished = sum(self._weights.get(name, 0.0) for name in self._finished)
-        weight = 0.0 if self.current in self._finished else self._weights.get(self.current, 0.0)
-        if not weight:
-            return finished
-        so_far = self._weight_before + finished
+        return finished + self._weight() * (self._fraction or min(self._guess(), _GUESS_LIMIT))
+
+    def _weight(self) -> float:
+        """Of the current stage; nothing where it came before."""
+        return 0.0 if self.current in self._finished else self._weights.get(self.current, 0.0)
+
+    def _guess(self) -> float:
+        """Share of the current stage that is done at the pace of the stages before it, above 1 where it takes longer; what the
+        stage says where it says so."""
+        weight = self._weight()
+        if not weight or self._fraction:
+            return self._fraction
+        so_far = self._weight_before + sum(self._weights.get(name, 0.0) for name in self._finished)
         pace = (self._stage_began - self._began) / so_far if so_far else 1.0
-        guess = (self._clock() - self._stage_began) / max(pace * weight, 1e-9)
-        return finished + weight * (self._fraction or min(guess, _GUESS_LIMIT))
+        return (self._clock() - self._stage_began) / max(pace * weight, 1e-9)
 
 
 class LineProgress(Progress):

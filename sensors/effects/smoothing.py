@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scene.mesh import FloatArray
 from sensors.effects.base import parameter
@@ -33,11 +35,30 @@ class Smoothing(RasterEffect):
         return smoothed(disparity, self.sigma_px / cell_px)
 
 
+@dataclass(frozen=True)
+class LowPass:
+    """Of rasters with a match in the same cells. matched: (rows, columns) those; weight: their own low-pass; sigma: cells."""
+
+    matched: NDArray[np.bool_]
+    weight: FloatArray
+    sigma: float
+
+    @classmethod
+    def over(cls, matched: NDArray[np.bool_], sigma: float) -> LowPass:
+        return cls(matched, _gaussian(matched.astype(np.float64), sigma), sigma)
+
+    def of(self, disparity: FloatArray) -> FloatArray:
+        """(rows, columns) low-passed values, NaN where there is no match."""
+        total = _gaussian(np.where(self.matched, disparity, 0.0), self.sigma)
+        return np.divide(total, self.weight, out=np.full_like(total, np.nan), where=self.matched)
+
+
 def smoothed(disparity: FloatArray, sigma: float) -> FloatArray:
     """(rows, columns) disparities, px, NaN where unmatched, low-passed with `sigma` cells over the matched ones."""
+    return LowPass.over(~np.isnan(disparity), sigma).of(disparity)
+
+
+def _gaussian(values: FloatArray, sigma: float) -> FloatArray:
     from scipy.ndimage import gaussian_filter
 
-    matched = ~np.isnan(disparity)
-    total = gaussian_filter(np.where(matched, disparity, 0.0), sigma, mode="constant")
-    weight = gaussian_filter(matched.astype(np.float64), sigma, mode="constant")
-    return np.divide(total, weight, out=np.full_like(total, np.nan), where=matched)
+    return np.asarray(gaussian_filter(values, sigma, mode="constant"))

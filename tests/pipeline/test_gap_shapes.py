@@ -22,7 +22,7 @@ from pipeline.gap.other.mixed_pixels import find_footprint
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.other.stereo_shapes import find_shapes
-from pipeline.gap.residuals import stereo_residuals
+from pipeline.gap.residuals import disparity_raster, stereo_residuals
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
@@ -31,6 +31,8 @@ from pipeline.gap.residuals.residuals import Residuals
 from scene.keyed_random import KeyedRandom
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.edge_fattening import EdgeFattening
+from sensors.effects.occlusion_fill import OcclusionFill
+from sensors.effects.smoothing import Smoothing
 from sensors.model import StereoModel
 
 Made = tuple[Measurement, Residuals, dict[str, Any]]
@@ -148,6 +150,52 @@ def test_a_raster_too_large_for_shapes_is_told(tmp_path: Path, monkeypatch: pyte
     assert any("more than 1,000 cells" in note for note in residuals.notes)
     monkeypatch.undo()
     assert not any("cells" in note for note in residuals_of(there).notes)
+
+
+def banded(monkeypatch: pytest.MonkeyPatch, cells: int, rows: int) -> None:
+    """Searches look among so many cells, in bands of at least so many rows."""
+    monkeypatch.setattr(disparity_raster, "_SEARCHED", cells)
+    monkeypatch.setattr(disparity_raster, "_LEAST_ROWS", rows)
+
+
+@pytest.mark.parametrize("shape", [(700, 300), (120, 400), (40, 3000)])
+def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bands far apart, that meet, and that are all of the picture; effects that reach 32 cells at the most."""
+    banded(monkeypatch, 20_000, 20)
+    random, (row, column) = np.random.default_rng(5), np.indices(shape)
+    disparity = 40 + row / 50 + 6.0 * (np.sin(row / 17) * np.cos(column / 23) > 0.3)
+    hidden = random.random(shape) < 0.1
+    disparity[hidden] = np.nan
+    points = np.flatnonzero(random.random(shape).ravel() < 0.5)
+    raster = DisparityRaster(1.0, disparity, hidden, row.ravel()[points], column.ravel()[points])
+    part, rows = raster.searched()
+    assert len(np.unique(rows)) == len(rows)
+    assert len(rows) < len(points) or shape[0] < 80
+    assert len(np.unique(part.row)) == len(np.unique(raster.row[rows]))
+    np.testing.assert_array_equal(part.at_points(part.disparity), raster.at_points(raster.disparity)[rows])
+    np.testing.assert_array_equal(part.filled([]), raster.filled([])[rows])
+    believed = raster.at_points(raster.disparity)
+    for effect in (EdgeFattening(radius_px=6.5), Smoothing(sigma_px=8.0), OcclusionFill(reach_px=30.0)):
+        np.testing.assert_allclose(part.moved([effect], believed[rows]), raster.moved([effect], believed)[rows], atol=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("smoothing", 1), ("edge_fattening", 1), ("occlusion_fill", 6)])
+def test_shapes_are_found_in_bands_of_a_large_raster(
+    tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in the whole, and with the points that they touch in all of it."""
+    case = made(tmp_path, "stereo", (kind,), seed)
+    whole = shapes_of(case)[kind]
+    banded(monkeypatch, 8_000, 16)
+    there, residuals, _ = case
+    raster = DisparityRaster.of(there, residuals.geometry)
+    assert raster is not None
+    assert len(raster.searched()[1]) < 0.6 * len(residuals)
+    found = shapes_of(case)[kind]
+    (name,) = whole.std
+    least = np.hypot(found.std[name], whole.std[name])
+    assert getattr(found.effect, name) == pytest.approx(getattr(whole.effect, name), abs=3 * least)
+    assert np.count_nonzero(found.touched & whole.touched) > 0.8 * np.count_nonzero(whole.touched)
 
 
 def test_strips_that_are_filled_are_found(tmp_path: Path) -> None:

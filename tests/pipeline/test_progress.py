@@ -55,6 +55,23 @@ def test_a_silent_stage_goes_by_the_pace_and_never_ends_early() -> None:
         assert progress.share < 1.0
 
 
+def test_a_stage_that_takes_far_longer_than_planned_promises_no_end() -> None:
+    clock = Clock()
+    progress = Progress(clock)
+    progress.plan({"read": 1.0, "search": 4.0, "write": 1.0})
+    with progress.stage("read"):
+        clock.now += 10.0  # the first says how fast all is
+        assert progress.time.endswith("left")
+    with progress.stage("search"):
+        clock.now += 70.0
+        assert progress.time.endswith("left")
+        clock.now += 20.0
+        assert progress.time == "1 min 40 s so far, longer than usual"
+        progress.advance(0.9)
+        assert progress.time.endswith("left"), "a stage that says how far it is can be believed"
+    assert progress.time.endswith("left")
+
+
 def test_a_plan_made_under_way_divides_what_is_left() -> None:
     """A half is done when as much again turns out to be needed beside the other half: a third of the rest for each second."""
     clock = Clock()

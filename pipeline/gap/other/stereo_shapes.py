@@ -63,6 +63,10 @@ class _Witnesses:
         more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
         return np.where((moved == without) | self.held_out, 0.0, more)
 
+    def found(self, effect: Effect, beside: list[Effect], std: dict[str, float], gain: float) -> ShapeFound:
+        """An effect that the points ask for beside others."""
+        return ShapeFound(effect, std, gain, _touched(effect, beside, self.raster, self.disparity))
+
     @property
     def times_predicted(self) -> float:
         """How many predicted sigmas the residuals spread."""
@@ -101,21 +105,24 @@ def find_shapes(
         return []
     scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
     believed = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
-    had = raster.moved(believed, residuals.geometry.disparity)
+    at = residuals.geometry.disparity
+    had = raster.moved(believed, at)
+    searched, points = raster.searched()
+    part = residuals.part(points)
     witnesses = _Witnesses(
-        replace(residuals, value=residuals.value + had),
-        raster,
-        residuals.geometry.disparity,
-        rough + had,
-        scale * residuals.sigma,
-        WallBlocks.over(residuals.at),
-        held_out,
+        replace(part, value=part.value + had[points]),
+        searched,
+        part.geometry.disparity,
+        (rough + had)[points],
+        scale * part.sigma,
+        WallBlocks.over(part.at),
+        held_out[points],
     )
     found: list[ShapeFound] = []
 
     def smoothing(untouched: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
-        touched = np.any([np.zeros(len(rough), dtype=bool), *(each.touched for each in found)], axis=0)
-        return _smoothing(replace(untouched, held_out=held_out | touched), beside)
+        touched = np.any([np.zeros(len(points), dtype=bool), *(each.touched for each in found)], axis=0)
+        return _smoothing(replace(untouched, held_out=untouched.held_out | touched), beside)
 
     def asked(trial: _Trial) -> ShapeFound | None:
         return trial(witnesses, [*believed, *(each.effect for each in found)])
@@ -137,7 +144,22 @@ def find_shapes(
         likely = [witnesses.likelier(beside, feigned)] if feigned else []
         found.append(max([*likely, *tried.values()], key=lambda each: each.gain))
         del trials[found[-1].name]
-    return found
+    if len(points) == len(rough):
+        return found
+    effects = [*believed, *(each.effect for each in found)]
+    before = (effects[: len(believed) + count] for count in range(len(found)))
+    return [replace(each, touched=_touched(each.effect, others, raster, at)) for each, others in zip(found, before, strict=True)]
+
+
+def _touched(effect: Effect, beside: list[Effect], raster: DisparityRaster, disparity: FloatArray) -> BoolArray:
+    """(n,) points where an effect beside others cannot be predicted to the noise. disparity: (n,) the reference's at them, px."""
+    match effect:
+        case EdgeFattening():
+            wider = effect.model_copy(update={"radius_px": effect.radius_px + _NEAR_STEPS * raster.step})
+            return np.asarray(raster.moved([wider], disparity) != 0)
+        case Smoothing():
+            return raster.beside_border(effect.sigma_px)
+    return raster.filled(beside)
 
 
 def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
@@ -166,10 +188,9 @@ def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
     gain = witnesses.blocks.tested(gains(radius))
     if gain is None:
         return None
-    touched = raster.moved([_grown(radius + _NEAR_STEPS, height, raster)], witnesses.disparity) != 0
     uneven = min(there.blocks.std(gains, radius, 1.0), float(radius))
     std = {"radius_px": raster.step * float(np.hypot(np.sqrt(1 / 12), uneven))}
-    return ShapeFound(_grown(radius, height, raster), std, gain, touched)
+    return witnesses.found(_grown(radius, height, raster), beside, std, gain)
 
 
 def _grown(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening:
@@ -195,7 +216,7 @@ def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
     if gain is None:
         return None
     std = float(np.hypot(witnesses.blocks.std(gains, sigma), _FILTERED * sigma))
-    return ShapeFound(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain, witnesses.raster.beside_border(sigma))
+    return witnesses.found(Smoothing(sigma_px=sigma), beside, {"sigma_px": std}, gain)
 
 
 def _filling(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
@@ -204,17 +225,16 @@ def _filling(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
     Without it hardly any of those cells holds a point (up to a fifth, by edges that are not quite where the reference has them).
     """
     raster = witnesses.raster
-    before = raster.after(beside)
-    points = np.isnan(raster.at_points(before)) & raster.at_points(raster.hidden)
+    points = raster.filled(beside)
     gain = float(witnesses.gains(beside, OcclusionFill(reach_px=1e5))[points].sum())
     if points.sum() < decided().shapes.fewest_filled or gain < decided().shapes.least_filled_gain:
         return None
-    widths, held = _strips(before, raster)
+    widths, held = _strips(raster.after(beside), raster)
     reach, std = _reach(widths, held, raster.step)
     narrow = held[widths <= reach / raster.step]
     if narrow.mean() < decided().shapes.least_held:
         return None
-    return ShapeFound(OcclusionFill(reach_px=reach), {"reach_px": std}, gain, points)
+    return witnesses.found(OcclusionFill(reach_px=reach), beside, {"reach_px": std}, gain)
 
 
 def _strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArray[np.int64], BoolArray]:

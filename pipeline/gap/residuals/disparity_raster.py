@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,16 @@ from pipeline.formats.measurement import StereoMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, project, rays, real_pair
 from pipeline.gap.residuals.residuals import BoolArray
 from scene.mesh import FloatArray
+from scene.threads import side_by_side
 from sensors.camera import Camera
 from sensors.effects.base import Effect
 from sensors.effects.raster_effect import RasterEffect
-from sensors.effects.smoothing import Smoothing, smoothed
+from sensors.effects.smoothing import LowPass, Smoothing
 
-MOST_CELLS = 1_000_000
+MOST_CELLS, _AT_ONCE = 40_000_000, 2_000_000
+"""Of a raster: the largest cameras' pixels; and of those that are cast at once."""
+_SEARCHED, _BANDS, _LEAST_ROWS = 1_000_000, 4, 64
+"""Cells among which a search looks, in so many bands of rows, each of so many rows at the least."""
 _MARGIN = 32
 """Cells beside the outermost points: three standard deviations of the widest low-pass that is looked for."""
 _BEYOND = 0.01
@@ -41,7 +45,7 @@ class DisparityRaster:
 
     @classmethod
     def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
-        """None where the pixels are on no raster, or on one of more than a million cells."""
+        """None where the pixels are on no raster, or on one of more than 40 million cells."""
         step = spacing(geometry.u)
         if step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
             return None
@@ -51,22 +55,46 @@ class DisparityRaster:
         (columns, column), (rows, row) = (
             _axis(x, step, size) for x, size in ((geometry.u, left.width), (geometry.v, left.height))
         )
-        u, v = (x.ravel() for x in np.meshgrid(columns, rows))
-        shape = len(rows), len(columns)
-        ray = rays(left, u, v)
-        point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
-        seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
-        matched = seen & ~hidden & _pictured(right, point)
-        if not matched.any():  # the cameras look past the reference
+        disparity = np.full((len(rows), len(columns)), np.nan)
+        only_left = np.zeros(disparity.shape, dtype=bool)
+        for part in np.array_split(np.arange(len(rows)), -(-disparity.size // _AT_ONCE)):
+            u, v = (x.ravel() for x in np.meshgrid(columns, rows[part]))
+            ray = rays(left, u, v)
+            point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
+            seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
+            matched = seen & ~hidden & _pictured(right, point)
+            found = np.full(len(u), np.nan)
+            found[matched] = nominal.disparity((u[matched], v[matched]), project(right, point[matched]))
+            disparity[part], only_left[part] = (x.reshape(len(part), -1) for x in (found, seen & hidden))
+        if np.isnan(disparity).all():  # the cameras look past the reference
             return None
-        disparity = np.full(len(u), np.nan)
-        disparity[matched] = nominal.disparity((u[matched], v[matched]), project(right, point[matched]))
-        return cls(step, disparity.reshape(shape), (seen & hidden).reshape(shape), row, column)
+        return cls(step, disparity, only_left, row, column)
 
     @property
     def jump_px(self) -> float:
         """Difference of neighbouring cells beyond which they lie on both sides of a depth step."""
         return max(_STEEP * self.step, 1.0)
+
+    def searched(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
+        """The part among which a search looks, and the points in it: all, or of a large raster some bands of rows over all of it.
+
+        Bands lie apart by as many empty rows as they reach beyond their points; `hidden` holds for the rows of points alone.
+        """
+        from scipy.ndimage import maximum_filter1d
+
+        rows, columns = self.disparity.shape
+        if rows * columns <= _SEARCHED:
+            return self, np.arange(len(self.row))
+        height = max(_SEARCHED // (_BANDS * columns), _LEAST_ROWS)
+        first = np.linspace(0, max(rows - height, 0), _BANDS).astype(int)
+        inner = np.any([(np.arange(rows) >= each) & (np.arange(rows) < each + height) for each in first], axis=0)
+        kept = maximum_filter1d(inner, 2 * _MARGIN + 1, mode="constant")
+        place = np.cumsum(kept) - 1 + _MARGIN * (np.cumsum(np.diff(kept, prepend=False) & kept) - 1)
+        disparity = np.full((int(place[kept].max()) + 1, columns), np.nan)
+        hidden = np.zeros(disparity.shape, dtype=bool)
+        disparity[place[kept]], hidden[place[inner]] = self.disparity[kept], self.hidden[inner]
+        points = np.flatnonzero(inner[self.row])
+        return replace(self, disparity=disparity, hidden=hidden, row=place[self.row[points]], column=self.column[points]), points
 
     def at_points(self, raster: NDArray[Any]) -> NDArray[Any]:
         """(n,) what a raster holds at the points."""
@@ -78,6 +106,10 @@ class DisparityRaster:
 
         inside = (~np.isnan(self.disparity) | self.hidden).astype(np.float64)
         return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
+
+    def filled(self, effects: Iterable[Effect]) -> BoolArray:
+        """(n,) points in cells that the left camera alone sees, where no effect that looks at neighbours gives any."""
+        return np.asarray(np.isnan(self.at_points(self.after(effects))) & self.at_points(self.hidden))
 
     def after(self, effects: Iterable[Effect]) -> FloatArray:
         """(rows, columns) disparities after those of the effects that look at neighbours, px, NaN where there is no match."""
@@ -103,14 +135,18 @@ def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatAr
     if not filters or step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
     row, column = _cell(geometry.v, step), _cell(geometry.u, step)
-    found = np.empty_like(columns)
-    for number, values in enumerate(columns.T):
-        raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
+    matched = np.zeros((int(row.max()) + 1, int(column.max()) + 1), dtype=bool)
+    matched[row, column] = np.isfinite(columns).all(axis=1)
+    low_passes = [LowPass.over(matched, effect.sigma_px / step) for effect in filters]
+
+    def passed(values: FloatArray) -> FloatArray:
+        raster = np.full(matched.shape, np.nan)
         raster[row, column] = values
-        for effect in filters:
-            raster = smoothed(raster, effect.sigma_px / step)
-        found[:, number] = raster[row, column]
-    return found
+        for low_pass in low_passes:
+            raster = low_pass.of(raster)
+        return raster[row, column]
+
+    return np.stack(side_by_side(passed, columns.T), axis=1)
 
 
 def cells_over(u: FloatArray, v: FloatArray, step: float) -> int:
