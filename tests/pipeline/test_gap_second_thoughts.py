@@ -13,16 +13,19 @@ from gap_cases import write_scan
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.naming import workflow
-from pipeline.gap.naming.attempts import Starts, State
+from pipeline.gap.naming.attempts import Attempt, Starts, State, attempt
 from pipeline.gap.naming.entries import Named, with_effects
 from pipeline.gap.naming.held_out import Scored
 from pipeline.gap.naming.naming import FREE_FORMS
 from pipeline.gap.naming.relinearised import at_points
 from pipeline.gap.naming.verify import simulated
+from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.registration import residuals_of, settled
 from scene.keyed_random import KeyedRandom
+from sensors.effects.edge_fattening import EdgeFattening
+from sensors.effects.smoothing import Smoothing
 from sensors.model import StereoNoise
 
 
@@ -60,7 +63,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     write_scan(tmp_path, 10, step_rad=0.007)
     there, plain, _ = settled(read_measurement(tmp_path))
     nowhere = np.zeros(len(there.cloud.points), dtype=bool)
-    state = State.of(there, plain, nowhere, [], nowhere)
+    state = State.of(there, plain, nowhere, [])
     seen: list[bool] = []
 
     def named(*given: Any) -> Any:
@@ -101,13 +104,27 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
     np.testing.assert_allclose(seen[known], 0, atol=2e-4)
 
 
+def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen only beside what was named, it does not count; what was seen with it does."""
+    nowhere = np.zeros(1, dtype=bool)
+    seen = [ShapeFound(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
+
+    def named(_: Any, state: list[ShapeFound], *_given: Any) -> Any:
+        naming = SimpleNamespace(spreads=1.0)
+        return SimpleNamespace(named=["noise"], shapes={each.name for each in state}, complexity=(0, len(state)), naming=naming)
+
+    monkeypatch.setattr(Attempt, "of", classmethod(named))
+    starts: Any = SimpleNamespace(first=[], seen_beside=lambda _: seen, beside=lambda shapes: shapes)
+    assert attempt(starts, KeyedRandom(1), frozenset()).shapes == {"edge_fattening"}
+
+
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
     """A search has it of the whole raster, points that miss the reference included, and a trial in it takes that over."""
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
     plain, nowhere = residuals_of(there), np.zeros(len(there.cloud.points), dtype=bool)
-    state = State.of(there, plain, nowhere, [], nowhere)
+    state = State.of(there, plain, nowhere, [])
     part, residuals = state.part
     found = residuals_of(part).value
     assert len(found) > 1000

@@ -60,11 +60,10 @@ class State:
         plain: Residuals,
         held_points: BoolArray,
         shapes: list[ShapeFound],
-        touched_points: BoolArray,
         resettled: bool = True,
     ) -> State:
-        """held_points, touched_points: of the measurement; resettled: the sensor goes where it stood with the shapes."""
-        touched = touched_points[plain.index]
+        """held_points: of the measurement, as what shapes touch; resettled: the sensor goes where it stood with the shapes."""
+        touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in shapes)], axis=0)
         trusted = plain.index[~(touched | held_points[plain.index])] if resettled else None
         shaped, residuals = _shaped(there, plain, shapes, touched, trusted)
         rough, _, scale = registered(residuals)
@@ -134,32 +133,32 @@ class Starts:
     held_points: BoolArray
 
     @cached_property
-    def _shapes(self) -> tuple[list[ShapeFound], BoolArray]:
+    def _shapes(self) -> list[ShapeFound]:
         return _shapes(self.there, self.plain, self.held_points)
 
     @cached_property
     def first(self) -> State:
         """Beside the effects where the surface is not smooth."""
-        return self.beside(*self._shapes)
+        return self.beside(self._shapes)
 
     @cached_property
     def staying(self) -> State:
         """The same, with the sensor where it stood without them."""
-        return State.of(self.there, self.plain, self.held_points, *self._shapes, resettled=False)
+        return State.of(self.there, self.plain, self.held_points, self._shapes, resettled=False)
 
     @cached_property
     def smooth(self) -> State:
         """Without such effects."""
-        return self.beside([], np.zeros(len(self.held_points), dtype=bool))
+        return self.beside([])
 
-    def seen_beside(self, named: list[Named]) -> tuple[list[ShapeFound], BoolArray]:
-        """The effects where the surface is not smooth that show with some others in the model, and (n,) the points they touch."""
+    def seen_beside(self, named: list[Named]) -> list[ShapeFound]:
+        """The effects where the surface is not smooth that show with some others in the model."""
         seen = settled_with(self.there, named, self.plain.index[~self.held_points[self.plain.index]])
         return _shapes(seen.measurement, seen.residuals, self.held_points)
 
-    def beside(self, shapes: list[ShapeFound], touched: BoolArray) -> State:
-        """Beside some of those, and the (n,) points that they touch."""
-        return State.of(self.there, self.plain, self.held_points, shapes, touched)
+    def beside(self, shapes: list[ShapeFound]) -> State:
+        """Beside some of those."""
+        return State.of(self.there, self.plain, self.held_points, shapes)
 
 
 def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> Attempt:
@@ -174,11 +173,12 @@ def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, 
     def beside(found: Attempt) -> Attempt:
         if not found.named:
             return found
-        shapes, touched = starts.seen_beside(found.named)
-        names = {each.name for each in shapes}
         # rays that are not quite where they are thought to be look like a low-pass
-        feigned = Smoothing.tag() in names - found.shapes
-        return found if names == found.shapes or feigned else Attempt.of(starts.beside(shapes, touched), random, left_out)
+        feigned = {Smoothing.tag()} - found.shapes
+        shapes = [each for each in starts.seen_beside(found.named) if each.name not in feigned]
+        if {each.name for each in shapes} == found.shapes:
+            return found
+        return Attempt.of(starts.beside(shapes), random, left_out)
 
     first = Attempt.of(starts.first, random, left_out)
     found = [beside(first)]
@@ -196,8 +196,8 @@ def thinned_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
     return rows[:: max(len(rows) // _MOST_POINTS, 1)]
 
 
-def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> tuple[list[ShapeFound], BoolArray]:
-    """Effects where the surface is not smooth that the model does not hold, and which of the measurement's points they touch.
+def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> list[ShapeFound]:
+    """Effects where the surface is not smooth that the model does not hold, with the measurement's points that they touch.
 
     held_points: of the measurement's points those that have no say.
     """
@@ -209,10 +209,10 @@ def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArr
             found = find_shapes(measurement, residuals, rough, held_out)
         case TlsMeasurement(), TlsResiduals() if not believes(measurement, BeamDivergence.tag()):
             found = find_footprint(measurement, residuals, rough, scale, held_out)
-    touched = np.zeros(len(measurement.cloud.points), dtype=bool)
-    for each in found:
-        touched[residuals.index] |= each.touched
-    return found, touched
+    touched = np.zeros((len(found), len(measurement.cloud.points)), dtype=bool)
+    for row, each in zip(touched, found, strict=True):
+        row[residuals.index] = each.touched
+    return [replace(each, touched=row) for each, row in zip(found, touched, strict=True)]
 
 
 def _shaped(
