@@ -26,7 +26,8 @@ HARMONICS, FOLDED, SURFACE = "harmonics", "folded", "surface"
 REPEATED = "every"
 """Of forms that repeat after `fixed["lines"]` scan lines, columns or rows."""
 _DEGREE = 4
-_OVERTONES = range(2, 6)
+OVERTONES = 5, 11
+"""Up to which there may be some beside a sine: what a smooth error has, and what an error that jumps has."""
 _REPEATED = range(2, 9)
 _DIRECTIONS = (30, 60, 120, 150)
 """Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
@@ -267,9 +268,9 @@ def precision_of(candidate: Candidate, width: int) -> FloatArray:
     return np.zeros(width) if candidate.precision is None else candidate.precision
 
 
-def harmonics(covariate: str, sine: Candidate) -> Candidate:
-    """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the fifth."""
-    columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in _OVERTONES], axis=1)
+def harmonics(covariate: str, sine: Candidate, last: int = OVERTONES[0]) -> Candidate:
+    """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the last of them."""
+    columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in range(2, last + 1)], axis=1)
     return replace(_free(covariate, HARMONICS, columns), period=sine.period, angle=sine.angle)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import FOLDED, PLACE, REPEATED, Candidate, Explanation, SineGrid, harmonics
+from pipeline.gap.mean.candidates import FOLDED, OVERTONES, PLACE, REPEATED, Candidate, Explanation, SineGrid, harmonics
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
@@ -18,6 +18,8 @@ from scene.mesh import FloatArray
 
 _MOST_LEADING = 8
 """Effects that are taken exactly."""
+_ALIKE = 100.0
+"""Condition of a form's columns beyond which one of them is others: an overtone that the points' raster shows as a lower one."""
 
 
 class MeanSearch:
@@ -145,15 +147,20 @@ class MeanSearch:
 
     def _with_overtones(self, members: Members, form: Tried) -> Tried:
         (sine, *others), fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
-        overtones = harmonics(form.name, sine)
         unit = float(self.design.residuals.covariates[form.name].std()) or 1.0
-        columns = np.concatenate([sine.columns, overtones.columns], axis=1)
-        both = replace(overtones, matrix=columns, form=FOLDED, period=unit * sine.period)
-        gain = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
-        score = gain - overtones.columns.shape[1]
-        if score < decided().mean.free_margin:
-            return form
-        return replace(form, candidate=both, gain=form.gain + gain, score=form.score + score)
+
+        def with_overtones(last: int) -> Tried:
+            overtones = harmonics(form.name, sine, last)
+            columns = np.concatenate([sine.columns, overtones.columns], axis=1)
+            if np.linalg.cond(columns.T @ columns) > _ALIKE:
+                return form
+            both = replace(overtones, matrix=columns, form=FOLDED, period=unit * sine.period)
+            gain = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
+            score = gain - overtones.columns.shape[1]
+            return replace(form, candidate=both, gain=form.gain + gain, score=form.score + score)
+
+        best = max(map(with_overtones, OVERTONES), key=lambda each: each.score)
+        return best if best.score >= form.score + decided().mean.free_margin else form
 
     def may_be_the_reference(self, members: Members, form: Tried) -> bool:
         """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave.

@@ -41,9 +41,9 @@ def advice(named: Named) -> Advice:
         return Advice(
             "Something that the catalogue does not hold: the term describes its pattern and says nothing of its cause. From one "
             "station a reference that is itself wrong in strips, or by a bend, along the same direction looks the same.",
-            "Look at where it shows below, think of what the instrument does there, and measure so that it would move, as errors of "
-            "the reference do not: another station, another time, the second face. Simulations with model_after.yaml have the "
-            "pattern meanwhile.",
+            "Look at where it shows below, think of what the instrument does there, and measure so that it would move, as the "
+            "reference's errors do not: another station, another time, the second face. Simulations with model_after.yaml have "
+            "the pattern meanwhile.",
         )
     effect = named.effect
     first = " ".join((effect.__doc__ or "").strip().partition("\n\n")[0].split())
