@@ -118,6 +118,8 @@ def _stereo(case: Case, rng: Rng, many: int, moved: int, where: Path) -> dict[st
     strength = stereo.Strength(site, noise, stride)
     effects, clear = _sized(case, stereo, stereo_effects.EFFECTS, strength, strength.match, rng)
     cloud = stereo.reconstruct(site, noise, effects, losses, stride, int(rng.integers(1 << 30)))
+    if "occlusion_fill" in effects:
+        clear["occlusion_fill"]["ratio"] = float(np.sqrt(stereo.OUTLIER_Z2 * cloud.filled))
     _write_stereo(case, rng, site, noise, cloud, where)
     truth = _truth(site, effects, clear, len(cloud.points))
     return {**truth, "losses": losses, "noise": vars(noise), "stride_px": stride, "base_m": site.pair.base}

@@ -39,7 +39,7 @@ class Result:
     @property
     def clarity(self) -> float:
         """The least clear effect's signal-to-noise ratio, after its nearest neighbour where there is one; inf without effects."""
-        ratios = [each.get("apart", each["ratio"]) or np.inf for each in self.truth["clear"].values()]
+        ratios = [each.get("apart", each["ratio"]) for each in self.truth["clear"].values()]
         return min(ratios, default=np.inf)
 
 

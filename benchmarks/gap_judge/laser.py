@@ -18,6 +18,7 @@ GAP_BETWEEN_ECHOES_M = 0.15
 SHARE_FROM_DROPS = 0.1
 REFERENCE_POWER_RANGE_M = 100.0
 DARKEST = 1e-9
+RINGS = ((0.349, 6), (0.854, 12))  # radius over the beam's (1/e^2), rays: each of 1/19 of the power, second moment kept
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class Strength:
     def apart(self, name: str, parameters: Parameters, rng: Rng) -> tuple[float, str]:
         """Ratio left after the nearest other effect of the catalogue that acts on the mean took its share, and its name."""
         wanted, found = self._shift(EFFECTS[name], parameters), {}
-        for other in set(CATALOGUE) - {name} - SHAPED:
+        for other in sorted(set(CATALOGUE) - {name} - SHAPED):
             if CATALOGUE[other].stage in ("range", "aim"):
                 every = alternatives(CATALOGUE[other], rng, self.shot)
                 shifts = [self._shift(CATALOGUE[other], p) for p in every]
@@ -200,20 +201,19 @@ def _emitted(
 
 
 def _footprint(site: Site, rays: Array, divergence_rad: float, mode: str, centre: Array, met: Mask) -> tuple[Array, Mask]:
-    """Range and return of a Gaussian beam (full angle at 1/e^2): 18 rays round the middle one, their echoes merged."""
+    """Range and return of a Gaussian beam (full angle at 1/e^2): 18 rays round the middle one, of equal power, merged."""
     side = np.cross(rays, [0.0, 0.0, 1.0])
     side = side / np.linalg.norm(side, axis=1, keepdims=True)
     up = np.cross(side, rays)
-    ranges, weights = [np.where(met, centre, np.inf)], [0.35**2]
-    for radius, count in ((0.55, 6), (1.05, 12)):
+    ranges = [np.where(met, centre, np.inf)]
+    for radius, count in RINGS:
         for turn_rad in 2 * np.pi * np.arange(count) / count:
             angle = radius * divergence_rad / 2
             off = rays + np.tan(angle) * (np.cos(turn_rad) * side + np.sin(turn_rad) * up)
             hits, _, _ = cast(site.truth, site, off / np.linalg.norm(off, axis=1, keepdims=True))
             ranges.append(hits.distance)
-            weights.append(np.exp(-2 * radius**2) * (0.5 * radius + 0.1) * 6 / count)
     echoes = np.stack(ranges, axis=1)
-    return _merged(echoes, np.broadcast_to(weights, echoes.shape), mode, centre)
+    return _merged(echoes, np.ones(echoes.shape), mode, centre)
 
 
 def _merged(ranges: Array, weights: Array, mode: str, centre: Array) -> tuple[Array, Mask]:

@@ -45,11 +45,12 @@ class Noise:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Reconstructed points (n, 3), world frame, m, their left pixels (n, 2) and the disparities (n,) px."""
+    """Reconstructed points (n, 3), world frame, m, their left pixels (n, 2), disparities (n,) px; how many were filled in."""
 
     points: Array
     pixels: Array
     disparity: Array
+    filled: int
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ class Strength:
     def apart(self, name: str, parameters: Parameters, rng: Rng) -> tuple[float, str]:
         """Ratio left after the nearest other effect of the catalogue that acts on the mean took its share, and its name."""
         wanted, found = self._shift(EFFECTS[name], parameters), {}
-        for other in set(CATALOGUE) - {name} - SHAPED:
+        for other in sorted(set(CATALOGUE) - {name} - SHAPED):
             if CATALOGUE[other].stage == "camera":
                 drawn = alternatives(CATALOGUE[other], rng, self.match)
                 shifts = [self._shift(CATALOGUE[other], {**p, "camera": side}) for p in drawn for side in ("left", "right")]
@@ -182,8 +183,7 @@ def reconstruct(
     rng = np.random.default_rng([seed, 2])
     pixels, shape = raster(site.pair, stride)
     seen = view(site.truth, site.standing, site.pair, real_pair(site.pair, effects), pixels)
-    kept = seen.met & ~seen.hidden
-    disparity = np.where(kept, seen.disparity, np.nan)
+    disparity = np.where(seen.met & ~seen.hidden, seen.disparity, np.nan)
     chosen = {stage: [(EFFECTS[n], p) for n, p in effects.items() if EFFECTS[n].stage == stage] for stage in _STAGES}
     for effect, p in chosen["map"]:
         disparity = effect.act(p, disparity.reshape(shape), stride).ravel()
@@ -194,7 +194,8 @@ def reconstruct(
     recorded = recorded + _drawn(rng, noise, chosen, known)
     kept = np.isfinite(recorded) & (rng.random(len(pixels)) > losses["share"])
     kept &= ~walls.vegetation(site.reference, seen.place[:, 0], seen.place[:, 2], rng, losses["bushes"])
-    return Cloud(site.pair.points(pixels[kept], recorded[kept]), pixels[kept], recorded[kept])
+    points = site.pair.points(pixels[kept], recorded[kept])
+    return Cloud(points, pixels[kept], recorded[kept], int(np.sum(kept & seen.hidden)))
 
 
 _STAGES = ("map", "fill", "disparity", "spread", "field")

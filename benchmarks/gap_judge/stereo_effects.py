@@ -21,6 +21,7 @@ from .surface import Array
 
 Rng = np.random.Generator
 STEP_PX = 1.5
+CUBIC_AGAINST_LINEAR = 0.763  # spread of white values interpolated linearly over that by cubic splines
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,16 @@ class Match:
 
 
 def grid_noise(rng: Rng, shape: tuple[int, int], stride: float, step_px: float, order: int = 1) -> Array:
-    """(rows, columns) unit Gaussian values on a grid of `step_px`, interpolated (order 1: linearly) to every `stride` px."""
+    """(rows, columns) unit Gaussian values on a grid of `step_px`, interpolated to every `stride` px.
+
+    order 1: linearly; 3: by cubic splines, brought to the spread that the linear field has (two thirds on average).
+    """
     count = [int(np.ceil(n * stride / step_px)) + 3 for n in shape]
     begin = rng.uniform(0, 1, 2)
     rows, columns = (begin[axis] + np.arange(n) * stride / step_px for axis, n in enumerate(shape))
     place = np.stack(np.meshgrid(rows, columns, indexing="ij"))
-    return np.asarray(ndimage.map_coordinates(rng.standard_normal(count), place, order=order, mode="mirror"))
+    field = ndimage.map_coordinates(rng.standard_normal(count), place, order=order, mode="mirror")
+    return np.asarray(field * (1.0 if order == 1 else CUBIC_AGAINST_LINEAR))
 
 
 def _whose(p: Parameters, camera: str) -> bool:

@@ -96,6 +96,9 @@ def make(kind: str, rng: Rng, width: float, height: float, spacing: float) -> Su
     return Surface(x, z, WALLS[kind](*np.meshgrid(x, z, indexing="ij"), rng))
 
 
+BEND = 0.15  # a bend as large as the other errors could not be told from a lens or a scale
+
+
 @dataclass(frozen=True)
 class ReferenceError:
     """True minus reference: `field` (a, b) m along y, of spread `sigma` m, alike over about `patch` m."""
@@ -120,9 +123,9 @@ def reference_error(surface: Surface, rng: Rng, sigma: float) -> ReferenceError:
         patch = rng.uniform(3, 8)
         field = rng.standard_normal((100, 100))[((x - x.min()) / patch).astype(int), ((z - z.min()) / patch).astype(int)]
     elif kind == "fractal":
-        patch, field = width / 8, fractal(x.shape, rng, rng.uniform(1.8, 2.6))
+        patch, field = width / 12, fractal(x.shape, rng, rng.uniform(1.5, 2.3), 0.25)
     else:
-        patch = width / 3
+        patch, sigma = width / 3, sigma * BEND
         a, b, c = rng.standard_normal(3)
         field = a * (2 * x / width) ** 2 + b * (2 * z / tall - 1) ** 2 + c * np.sin(np.pi * x / width) * (2 * z / tall - 1)
     field = field - field.mean()
