@@ -23,7 +23,8 @@ class Effect:
     """One way to depart from the model.
 
     `stage` says how `act(parameters, shot)` is used (see the sensors' modules); `sizes` are the parameters that carry the size,
-    at a typical value; they are scaled together until the strength is the one drawn, at most to `most` times the typical value.
+    at a typical value; they are scaled together until the strength is the one drawn, at most to `most` times the typical value
+    (a few times the largest size of EFFECTS.md: beyond, no instrument would leave the factory).
     `others` draws the rest. `judged` are the parameters whose interval is judged.
     """
 
@@ -47,13 +48,12 @@ class Effect:
 
 
 SIGNED = ("aim", "range", "camera")
-MOST = {"aim": 20.0, "camera": 12.0}  # times the typical size: beyond, no instrument would leave the factory
 UNSIGNED = ("amplitude_m", "amplitude_rad", "amplitude_px")
 
 
 def solve_size(effect: Effect, parameters: Parameters, strength: Callable[[Parameters], float], wanted: float) -> Parameters:
     """Scales the sizes until `strength` is `wanted`, within the effect's bounds (bisection of the factor's logarithm)."""
-    low, high = np.log(effect.least), np.log(min(effect.most, MOST.get(effect.stage, np.inf)))
+    low, high = np.log(effect.least), np.log(effect.most)
     for _ in range(14):
         middle = 0.5 * (low + high)
         if strength(effect.scaled(parameters, float(np.exp(middle)))) < wanted:

@@ -178,5 +178,5 @@ def _clear(truth: dict[str, Any]) -> str:
 
 def _said(effect: dict[str, Any]) -> str:
     besides = [_short(each) for each in effect["cannot_be_told_from"]]
-    given = {key: each["value"] for key, each in effect["parameters"].items() if each["value"] is not None}
+    given = {key: each["value"] for key, each in effect["parameters"].items() if isinstance(each["value"], float | str)}
     return f"{_short(effect['name'])} {_numbers(given)}" + (f" (or {', '.join(besides)})" if besides else "")

@@ -97,10 +97,11 @@ def look(site: Site, pattern: Pattern, rho_seed: int) -> tuple[Shot, Array, Arra
 
 
 class Strength:
-    """Signal-to-noise ratios of effects on one site and pattern, from tangent planes (no casting)."""
+    """Signal-to-noise ratios of effects on one site and pattern, from tangent planes (only footprints are cast)."""
 
     def __init__(self, site: Site, pattern: Pattern, noise: Noise, rho_seed: int, losses: float) -> None:
         shot, places, normal = look(site, pattern, rho_seed)
+        self.site = replace(site, truth=site.reference)
         met = (shot.seen > 0) & (shot.cosine > 0.1)
         self.shot, self.losses = Shot(*(getattr(shot, name)[met] for name in Shot.__dataclass_fields__)), losses
         here = site.standing.within(site.wall)
@@ -117,9 +118,11 @@ class Strength:
         self.whitening = Whitening(self.variance, patch, patch_variance, pose)
 
     def of(self, effect: Effect, parameters: Parameters) -> float:
-        """The ratio; 0 where the stage has none that can be told without casting."""
+        """The ratio."""
         if effect.stage in ("range", "aim"):
             return self.whitening.strength(self._shift(effect, parameters))
+        if effect.stage == "footprint":
+            return self._mixed(parameters)
         if effect.stage == "loss":
             return loss_strength(effect.act(parameters, self.shot), self.losses)
         return spread_strength(self._added(effect, parameters), self.variance)
@@ -143,14 +146,18 @@ class Strength:
         ratio = np.sum(self.normal * self.ray, axis=1) / np.sum(self.normal * true, axis=1)
         return np.clip(self.shot.range_m * (ratio - 1), -0.5, 0.5)
 
+    def _mixed(self, parameters: Parameters) -> float:
+        """By how much the ranges of footprints differ from those of rays; a pulse counts 9 at most."""
+        far = self.shot.range_m
+        mixed, met = _footprint(self.site, self.ray, parameters["divergence_rad"], parameters["mode"], far, far > 0)
+        return float(np.sqrt(np.sum(np.where(met, np.minimum((mixed - far) ** 2 / self.variance, 9.0), 0.0))))
+
     def _added(self, effect: Effect, parameters: Parameters) -> Array:
         acted = effect.act(parameters, self.shot)
         if effect.stage == "step":
             return np.full(len(self.variance), acted**2 / 12)
         if effect.stage == "spread":
             return np.asarray(acted) ** 2
-        if effect.stage == "footprint":
-            return (acted / 4 * self.shot.range_m * self.tangent / 2) ** 2
         side = np.stack([-np.sin(self.shot.azimuth), np.cos(self.shot.azimuth), np.zeros(len(self.variance))], axis=1)
         slopes = [np.sum(self.normal * each, axis=1) / self.shot.cosine for each in (side, np.cross(side, self.ray))]
         across = acted[0] * np.sin(self.shot.zenith) * slopes[0]

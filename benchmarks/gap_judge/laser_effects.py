@@ -58,7 +58,8 @@ def _wobble(rng: Rng, shot: Shot) -> Parameters:
 
 
 def _beam(rng: Rng, shot: Shot) -> Parameters:
-    return {"mode": str(rng.choice(["mean", "mean", "first", "strongest"]))}
+    mode, width = rng.choice(["mean", "mean", "first", "strongest"]), rng.uniform(np.log(2e-4), np.log(8e-4))
+    return {"mode": str(mode), "divergence_rad": float(np.exp(width))}
 
 
 def _tilted(p: Parameters, shot: Shot) -> Array:
@@ -70,22 +71,31 @@ def _tilted(p: Parameters, shot: Shot) -> Array:
 
 
 CATALOGUE: dict[str, Effect] = {
-    "range_offset": Effect("range", lambda p, s: np.full(len(s.line), p["offset_m"]), {"offset_m": 2e-3}, judged=("offset_m",)),
-    "range_scale": Effect("range", lambda p, s: p["scale_ppm"] * 1e-6 * s.range_m, {"scale_ppm": 50.0}, judged=("scale_ppm",)),
+    "range_offset": Effect(
+        "range", lambda p, s: np.full(len(s.line), p["offset_m"]), {"offset_m": 2e-3}, most=8.0, judged=("offset_m",)
+    ),
+    "range_scale": Effect(
+        "range", lambda p, s: p["scale_ppm"] * 1e-6 * s.range_m, {"scale_ppm": 50.0}, most=3.0, judged=("scale_ppm",)
+    ),
     "range_cyclic": Effect(
         "range",
         lambda p, s: p["amplitude_m"] * np.sin(2 * np.pi * s.range_m / p["period_m"] + p["phase_rad"]),
         {"amplitude_m": 1e-3},
         _cyclic,
+        most=6.0,
         judged=("amplitude_m", "period_m"),
     ),
     "range_intensity_bias": Effect(
-        "range", lambda p, s: p["coefficient_m"] * np.log(s.relative_power), {"coefficient_m": 2e-3}, judged=("coefficient_m",)
+        "range",
+        lambda p, s: p["coefficient_m"] * np.log(s.relative_power),
+        {"coefficient_m": 2e-3},
+        most=10.0,
+        judged=("coefficient_m",),
     ),
     "range_incidence_bias": Effect(
-        "range", lambda p, s: p["coefficient_m"] * s.obliquity, {"coefficient_m": 2e-3}, judged=("coefficient_m",)
+        "range", lambda p, s: p["coefficient_m"] * s.obliquity, {"coefficient_m": 2e-3}, most=5.0, judged=("coefficient_m",)
     ),
-    "range_quantization": Effect("step", lambda p, s: p["step_m"], {"step_m": 5e-3}, judged=("step_m",)),
+    "range_quantization": Effect("step", lambda p, s: p["step_m"], {"step_m": 5e-3}, most=2.0, judged=("step_m",)),
     "range_noise": Effect("spread", lambda p, s: np.full(len(s.line), p["sigma_m"]), {"sigma_m": 2e-3}, judged=("sigma_m",)),
     "range_noise_proportional": Effect("spread", lambda p, s: p["ppm"] * 1e-6 * s.range_m, {"ppm": 50.0}, judged=("ppm",)),
     "range_noise_incidence": Effect("spread", lambda p, s: p["sigma_m"] * s.obliquity, {"sigma_m": 2e-3}, judged=("sigma_m",)),
@@ -102,18 +112,29 @@ CATALOGUE: dict[str, Effect] = {
         {"azimuth_sigma_rad": 6e-5, "zenith_sigma_rad": 6e-5},
         judged=("azimuth_sigma_rad", "zenith_sigma_rad"),
     ),
-    "vertical_index": Effect("aim", lambda p, s: _aim(s, zenith=p["offset_rad"]), {"offset_rad": 1e-4}, judged=("offset_rad",)),
+    "vertical_index": Effect(
+        "aim", lambda p, s: _aim(s, zenith=p["offset_rad"]), {"offset_rad": 1e-4}, most=10.0, judged=("offset_rad",)
+    ),
     "collimation": Effect(
-        "aim", lambda p, s: _aim(s, azimuth=p["angle_rad"] / np.sin(s.zenith)), {"angle_rad": 1e-4}, judged=("angle_rad",)
+        "aim",
+        lambda p, s: _aim(s, azimuth=p["angle_rad"] / np.sin(s.zenith)),
+        {"angle_rad": 1e-4},
+        most=10.0,
+        judged=("angle_rad",),
     ),
     "trunnion_tilt": Effect(
-        "aim", lambda p, s: _aim(s, azimuth=p["angle_rad"] / np.tan(s.zenith)), {"angle_rad": 1e-4}, judged=("angle_rad",)
+        "aim",
+        lambda p, s: _aim(s, azimuth=p["angle_rad"] / np.tan(s.zenith)),
+        {"angle_rad": 1e-4},
+        most=10.0,
+        judged=("angle_rad",),
     ),
     "horizontal_eccentricity": Effect(
         "aim",
         lambda p, s: _aim(s, azimuth=p["amplitude_rad"] * np.sin(s.azimuth + p["phase_rad"])),
         {"amplitude_rad": 1e-4},
         _phase,
+        most=10.0,
         judged=("amplitude_rad",),
     ),
     "vertical_eccentricity": Effect(
@@ -121,6 +142,7 @@ CATALOGUE: dict[str, Effect] = {
         lambda p, s: _aim(s, zenith=p["amplitude_rad"] * np.sin(s.zenith + p["phase_rad"])),
         {"amplitude_rad": 1e-4},
         _phase,
+        most=10.0,
         judged=("amplitude_rad",),
     ),
     "wobble": Effect(
@@ -128,18 +150,11 @@ CATALOGUE: dict[str, Effect] = {
         lambda p, s: _aim(s, zenith=p["amplitude_rad"] * np.sin(2 * np.pi * s.line / p["lines_per_cycle"] + p["phase_rad"])),
         {"amplitude_rad": 5e-5},
         _wobble,
+        most=6.0,
         judged=("amplitude_rad", "lines_per_cycle"),
     ),
-    "tilt_drift": Effect("aim", _tilted, {"rate_x_rad": 1e-4, "rate_y_rad": 1e-4}, judged=("rate_x_rad", "rate_y_rad")),
-    "beam_divergence": Effect(
-        "footprint",
-        lambda p, s: p["divergence_rad"],
-        {"divergence_rad": 4e-4},
-        _beam,
-        most=4.0,
-        least=0.5,
-        judged=("divergence_rad",),
-    ),
+    "tilt_drift": Effect("aim", _tilted, {"rate_x_rad": 1e-4, "rate_y_rad": 1e-4}, most=8.0, judged=("rate_x_rad", "rate_y_rad")),
+    "beam_divergence": Effect("footprint", lambda p, s: p["divergence_rad"], {}, _beam, judged=("divergence_rad",)),
     "detection_limit": Effect(
         "loss",
         lambda p, s: (s.power < p["minimum_power"]) * 1.0,
