@@ -16,6 +16,7 @@ from .surface import Array, Hits, Mask, Surface
 Rng = np.random.Generator
 GAP_BETWEEN_ECHOES_M = 0.15
 SHARE_FROM_DROPS = 0.1
+SHARE_OF_DOUBLES = 0.15  # of the pulses beside an edge: the footprint is so much narrower than the steps
 REFERENCE_POWER_RANGE_M = 100.0
 DARKEST = 1e-9
 RINGS = ((0.349, 6), (0.854, 12))  # radius over the beam's (1/e^2), rays: each of 1/19 of the power, second moment kept
@@ -252,7 +253,7 @@ def lost(site: Site, pattern: Pattern, shot: Shot, places: Array, losses: dict[s
         jump = np.zeros(seen.shape, bool)
         jump[:, 1:] |= np.abs(np.diff(seen, axis=1)) > 0.8
         jump[1:] |= np.abs(np.diff(seen, axis=0)) > 0.8
-        gone |= jump.ravel()
+        gone |= jump.ravel() & (rng.random(len(gone)) < SHARE_OF_DOUBLES)
     return gone
 
 
