@@ -1,0 +1,182 @@
+"""Judges answers against truths, and writes the table: one per sensor, binomial 95 % intervals, every case that is not right."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta, norm
+
+from . import laser_effects, stereo_effects
+
+OUTCOMES = ("alone", "class", "more", "part", "wrong name", "unknown", "no_gap", "insufficient_data", "error")
+RIGHT = {"none": ("no_gap",), "change": ("no_gap",), "off": ("unknown",), "one": ("alone", "class"), "two": ("alone", "class")}
+CLEAR = 12.0
+LEVEL_90 = float(norm.ppf(0.95))
+EITHER_SIGN = {"tilt_drift"}  # EFFECTS.md does not say which way the tilt turns
+
+
+@dataclass(frozen=True)
+class Result:
+    """One case: its truth, what was answered, how that is judged; (inside, all) of the 90 % intervals that could be judged."""
+
+    truth: dict[str, Any]
+    answer: dict[str, Any]
+    outcome: str
+    inside: int
+    intervals: int
+    outside: tuple[str, ...]
+
+    @property
+    def right(self) -> bool:
+        """Whether the answer is the one to give."""
+        return self.outcome in RIGHT[self.truth["kind"]]
+
+    @property
+    def clarity(self) -> float:
+        """The least clear effect's signal-to-noise ratio, after its nearest neighbour where there is one; inf without effects."""
+        ratios = [each.get("apart", each["ratio"]) for each in self.truth["clear"].values()]
+        return min(ratios, default=np.inf)
+
+
+def judged(out: Path, name: str) -> Result:
+    """The case `name` of the folder `out`."""
+    truth = json.loads((out / "truth" / f"{name}.json").read_text())
+    said = json.loads((out / "answers" / name / "said.json").read_text())
+    written = out / "answers" / name / "gap.json"
+    answer: dict[str, Any] = {"verdict": "error", "effects": []}
+    if said["status"] == 0 and written.exists():
+        answer = json.loads(written.read_text())
+    checks = [each for effect in answer["effects"] for each in intervals(truth, effect)]
+    outside = tuple(text for text, inside in checks if not inside)
+    return Result(truth, {**answer, "said": said}, outcome(truth, answer), len(checks) - len(outside), len(checks), outside)
+
+
+def outcome(truth: dict[str, Any], answer: dict[str, Any]) -> str:
+    """One of OUTCOMES. `class`: each true effect is in the class of an answer; `more`: that, and others besides; `part`: some of
+    the true effects and nothing wrong."""
+    if answer["verdict"] in ("error", "insufficient_data", "no_gap", "unknown"):
+        return str(answer["verdict"])
+    true = set(truth["effects"]) if truth["kind"] in ("one", "two") else set()
+    classes = [{_short(each) for each in (effect["name"], *effect["cannot_be_told_from"])} for effect in answer["effects"]]
+    idle = [each for each in classes if not each & true]
+    found = true & set().union(*classes)
+    if not found:
+        return "wrong name"
+    if idle:
+        return "more"
+    if found != true:
+        return "part"
+    return "alone" if all(len(each) == 1 for each in classes) else "class"
+
+
+def _short(name: str) -> str:
+    return name.split(".")[-1]
+
+
+def intervals(truth: dict[str, Any], effect: dict[str, Any]) -> list[tuple[str, bool]]:
+    """For each parameter of a named effect that may be judged: what it says, and whether the 90 % interval holds the truth."""
+    name = _short(effect["name"])
+    known = {**laser_effects.CATALOGUE, **stereo_effects.CATALOGUE}.get(name)
+    true, said = truth["effects"].get(name), effect["parameters"]
+    if known is None or true is None or said.get("camera", {}).get("value") != true.get("camera"):
+        return []
+    return [_interval(name, key, true, said[key]) for key in known.judged if key in said and said[key].get("std")]
+
+
+def _interval(name: str, key: str, true: dict[str, Any], said: dict[str, float]) -> tuple[str, bool]:
+    signs = (1, -1) if name in EITHER_SIGN else (1,)
+    inside = any(abs(said["value"] - sign * true[key]) <= LEVEL_90 * said["std"] for sign in signs)
+    return f"{name}.{key} {true[key]:.4g}, said {said['value']:.4g} ± {said['std']:.2g}", inside
+
+
+def share(count: int, total: int) -> str:
+    """`count / total (percentage; 95 % Clopper-Pearson interval)`."""
+    if not total:
+        return "-"
+    low = beta.ppf(0.025, count, total - count + 1) if count else 0.0
+    high = beta.ppf(0.975, count + 1, total - count) if count < total else 1.0
+    return f"{count}/{total} ({100 * count / total:.0f} %; {100 * low:.0f}-{100 * high:.0f})"
+
+
+def table(results: list[Result]) -> str:
+    """Markdown: for each sensor the outcomes by kind, the rates, and the cases that are not right."""
+    text = "# What a second judge found\n\nWritten by `benchmarks/gap_judge/run.py`; intervals are binomial, 95 %.\n"
+    for sensor in ("tls", "stereo"):
+        mine = [each for each in results if each.truth["sensor"] == sensor]
+        if mine:
+            text += f"\n## {sensor}\n\n{_outcomes(mine)}\n{_rates(mine)}\n### Not right\n\n{_not_right(mine)}"
+    return text
+
+
+def _outcomes(results: list[Result]) -> str:
+    rows = ["| kind | " + " | ".join(OUTCOMES) + " | right |", "|" + "---|" * (len(OUTCOMES) + 2)]
+    for kind in RIGHT:
+        mine = [each for each in results if each.truth["kind"] == kind]
+        counts = [str(sum(each.outcome == one for each in mine)) for one in OUTCOMES]
+        rows.append(f"| {kind} | " + " | ".join(counts) + f" | {share(sum(each.right for each in mine), len(mine))} |")
+    return "\n".join(rows) + "\n"
+
+
+def _rates(results: list[Result]) -> str:
+    """The figures of GAP.md that this judge can give."""
+    clear = [each for each in results if each.truth["kind"] in ("one", "two") and each.clarity >= CLEAR]
+    quiet = [each for each in results if each.truth["kind"] == "none"]
+    moved = [each for each in results if each.truth["kind"] == "change"]
+    spoke = [each for each in results if each.outcome in ("alone", "class", "more", "part", "wrong name")]
+    p = [each.answer["remaining"]["p_value"] for each in quiet if each.answer.get("remaining", {}).get("p_value") is not None]
+    inside, judgeable = sum(each.inside for each in results), sum(each.intervals for each in results)
+    rows = {
+        f"right, of effects of a ratio of {CLEAR:.0f} or more, the nearest other apart": _count(clear, lambda each: each.right),
+        "false alarms, no effect": _count(quiet, lambda each: each.outcome not in ("no_gap", "insufficient_data")),
+        "false alarms, change only": _count(moved, lambda each: each.outcome not in ("no_gap", "insufficient_data")),
+        "wrong names among answers that name": _count(spoke, lambda each: each.outcome in ("wrong name", "more")),
+        "90 % intervals that hold the truth": share(inside, judgeable),
+        "p-value of the rest below 0.01, no effect": share(sum(each < 0.01 for each in p), len(p)),
+        "median seconds": f"{np.median([each.answer['said']['seconds'] for each in results]):.0f}",
+    }
+    return "| | |\n|---|---|\n" + "".join(f"| {key} | {value} |\n" for key, value in rows.items())
+
+
+def _count(results: list[Result], wanted: Callable[[Result], bool]) -> str:
+    return share(sum(wanted(each) for each in results), len(results))
+
+
+def _not_right(results: list[Result]) -> str:
+    rows = ["| case | truth | ratio (apart from) | judged | answer | p of the rest |", "|---|---|---|---|---|---|"]
+    for each in results:
+        if not each.right or each.outside:
+            named = "; ".join(_said(effect) for effect in each.answer["effects"]) or each.answer["verdict"]
+            outside = f" outside: {'; '.join(each.outside)}" if each.outside else ""
+            p = each.answer.get("remaining", {}).get("p_value")
+            case = f"{each.truth['number']:04d} {each.truth['kind']}"
+            cells = [case, _true(each.truth), _clear(each.truth), each.outcome + outside]
+            rows.append("| " + " | ".join([*cells, f"{each.answer['verdict']}: {named}", str(p)]) + " |")
+    return "\n".join(rows) + "\n"
+
+
+def _true(truth: dict[str, Any]) -> str:
+    effects = [f"{name} {_numbers(given)}" for name, given in truth["effects"].items()]
+    return "; ".join(effects) or f"{len(truth['changes'])} changes"
+
+
+def _numbers(given: dict[str, Any]) -> str:
+    return ", ".join(f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in given.items())
+
+
+def _clear(truth: dict[str, Any]) -> str:
+    texts = [
+        f"{each['ratio']:.0f}" + (f" ({each['apart']:.0f} from {each['nearest']})" if "apart" in each else "")
+        for each in truth["clear"].values()
+    ]
+    return "; ".join(texts)
+
+
+def _said(effect: dict[str, Any]) -> str:
+    besides = [_short(each) for each in effect["cannot_be_told_from"]]
+    given = {key: each["value"] for key, each in effect["parameters"].items() if isinstance(each["value"], float | str)}
+    return f"{_short(effect['name'])} {_numbers(given)}" + (f" (or {', '.join(besides)})" if besides else "")

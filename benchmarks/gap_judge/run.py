@@ -1,0 +1,68 @@
+"""Makes cases, asks `scarpsim gap` about each, judges the answers.
+
+    python benchmarks/gap_judge/run.py --cases 40 --seed 77 --out /tmp/judge [--sensor tls|stereo] [--table docs/gap_judge.md]
+
+In DIR: `cases/0007` the measurement folder, `truth/0007.json` what is in it, `answers/0007` what the command wrote. Cases that
+were built or answered are not built or answered again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+if __package__ in (None, ""):
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from gap_judge import cases, judge
+
+LONGEST_S = 900
+
+
+def make(case: cases.Case, seed: int, out: Path) -> Path:
+    """The case's folder; its truth goes beside the folders, and is written last."""
+    where, truth = out / "cases" / f"{case.number:04d}", out / "truth" / f"{case.number:04d}.json"
+    if not truth.exists():
+        cases.save_truth(cases.build(case, seed, where), truth)
+    return where
+
+
+def ask(folder: Path, answer: Path) -> None:
+    """Runs the command; what it said goes to answer/said.json: exit status, seconds, last words."""
+    if (answer / "said.json").exists():
+        return
+    answer.mkdir(parents=True, exist_ok=True)
+    command = [str(Path(sys.executable).parent / "scarpsim"), "gap", str(folder), "--out", str(answer), "--quiet"]
+    begin = time.monotonic()
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+        said = {"status": done.returncode, "words": (done.stdout + done.stderr)[-1500:]}
+    except subprocess.TimeoutExpired:
+        said = {"status": None, "words": f"no answer after {LONGEST_S} s"}
+    (answer / "said.json").write_text(json.dumps({**said, "seconds": round(time.monotonic() - begin, 1)}))
+
+
+def main() -> None:
+    """Builds all, asks all, judges all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", type=int, default=40, help="how many")
+    parser.add_argument("--seed", type=int, default=77)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--sensor", choices=cases.SENSORS, help="only one of them (default: both in turn)")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="where the Markdown goes (default: DIR/table.md)")
+    given = parser.parse_args()
+    planned = cases.schedule(given.seed, given.cases, given.sensor)
+    folders = [make(case, given.seed, given.out) for case in planned]
+    for folder in folders:
+        ask(folder, given.out / "answers" / folder.name)
+        print(folder.name, flush=True)
+    results = [judge.judged(given.out, folder.name) for folder in folders]
+    (given.table or given.out / "table.md").write_text(judge.table(results))
+
+
+if __name__ == "__main__":
+    main()
