@@ -1,5 +1,6 @@
 """The second judge of `gap`: its caster, what it makes without effects and noise, that it repeats itself, how it judges."""
 
+import ast
 import json
 import sys
 from dataclasses import replace
@@ -14,6 +15,15 @@ from gap_judge import cases, judge, laser, laser_effects, stereo, stereo_effects
 from gap_judge.surface import Surface
 
 QUIET = {"share": 0.0, "bushes": 0, "gaps": 0, "double_removed": False}
+
+
+def imports(file):
+    """Top-level names of the packages that a file imports."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (each.name.partition(".")[0] for each in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield str(node.module).partition(".")[0]
 
 
 def farthest(surface, points):
@@ -79,6 +89,12 @@ def test_every_effect_of_a_catalogue_comes_up_once_in_a_round():
         names = [name for case in cases.schedule(2, 60, sensor) if case.kind in ("one", "two") for name in case.names]
         counts = [names.count(each) for each in effects.CATALOGUE]
         assert max(counts) - min(counts) <= 1
+
+
+def test_it_shares_no_code_with_what_it_judges():
+    folder = Path(__file__).resolve().parents[1] / "benchmarks/gap_judge"
+    imported = {name for file in folder.glob("*.py") for name in imports(file)}
+    assert imported <= {*sys.stdlib_module_names, "__future__", "gap_judge", "numpy", "scipy", "yaml"}
 
 
 def test_answers_are_told_apart():

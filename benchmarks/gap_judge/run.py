@@ -61,7 +61,9 @@ def main() -> None:
         ask(folder, given.out / "answers" / folder.name)
         print(folder.name, flush=True)
     results = [judge.judged(given.out, folder.name) for folder in folders]
-    (given.table or given.out / "table.md").write_text(judge.table(results))
+    sensor = f" --sensor {given.sensor}" if given.sensor else ""
+    command = f"python benchmarks/gap_judge/run.py --cases {given.cases} --seed {given.seed}{sensor} --out DIR --table FILE"
+    (given.table or given.out / "table.md").write_text(judge.table(results, command))
 
 
 if __name__ == "__main__":
