@@ -74,6 +74,19 @@ def test_an_effect_that_does_little_harm_is_taken_out_too(
     assert len(shown.named) == kept
 
 
+def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
+    """A fifth of what rain takes comes back from drops, anywhere before the wall: a range on the wall says nothing of that."""
+    true = _named("range_incidence_bias", "coefficient_m", 0.01)
+    rain = {"name": "precipitation", "rate_per_m": 2e-3, "early_share": 0.2}
+    drops = replace(_named("precipitation", "rate_per_m", 2e-3), entry=rain)
+    showing = _showing(tmp_path, _biased(0.01))
+    alone, _ = showing.show([true])
+    shown, words = showing.show([true, drops])
+    assert (shown.named, words) == ([true, drops], [])
+    assert shown.gap == alone.gap
+    assert [effect.name for effect in shown.model.effects] == ["range_incidence_bias", "precipitation"]
+
+
 def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An effect brings points near that were too far off to count: 7 mm without it on all of these, 3 with it. That the
     others score 1 mm alone, and that a few held-out edges score worse, is nothing against it."""

@@ -91,7 +91,7 @@ class Showing:
         if self.lower and shown.is_worse:
             return replace(self, lower={}).show(named)
         while shown.is_worse:
-            doubtful = [item for item in shown.named if shown.is_clearly_worse or _may_be_harmful(item)]
+            doubtful = [item for item in _scored(shown.named) if shown.is_clearly_worse or _may_be_harmful(item)]
             harms = [self._harm(shown, item) for item in doubtful]
             if max(harms, default=0.0) <= 0:
                 break
@@ -104,18 +104,17 @@ class Showing:
         """By how much more than its uncertainty the model predicts the points that may be looked at worse with an effect than
         without; the same points, since an effect that moves some far may bring others near."""
         others = [each for each in shown.named if each is not item]
-        without = Version(self._model(others), self._registered(others)[1])
-        gap = self._gap(shown.named, (without, Version(shown.model, shown.pose)), self.learned)
+        without = Version(self._model(_scored(others)), self._registered(others)[1])
+        gap = self._gap(shown.named, (without, Version(self._model(_scored(shown.named)), shown.pose)), self.learned)
         return 0.0 if gap is None else gap.after - gap.before - decided().verdict.gap_sigmas * gap.error
 
     def _model(self, named: list[Named]) -> TlsModel | StereoModel:
         return with_effects(self.measurement.model, [item.entry for item in named], self.lower)
 
     def _of(self, named: list[Named], rows: BoolArray) -> Shown:
-        model = self._model(named)
         value, pose = self._registered(named)
-        versions = Version(self.measurement.model, self.pose), Version(model, pose)
-        return Shown(named, self.lower, model, value, pose, self._gap(named, versions, rows))
+        versions = Version(self.measurement.model, self.pose), Version(self._model(_scored(named)), pose)
+        return Shown(named, self.lower, self._model(named), value, pose, self._gap(named, versions, rows))
 
     def _registered(self, named: list[Named]) -> tuple[FloatArray, FloatArray]:
         """(n,) residuals of the same points with some effects, NaN where their rays miss the reference; the pose (6,)."""
@@ -138,6 +137,11 @@ class Showing:
         part = self.residuals.part(places[thinned(len(places))])
         random = self.random.child("verify")
         return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.largest, random)
+
+
+def _scored(named: list[Named]) -> list[Named]:
+    """Those that ranges are scored with: drops return early, which no range on the wall is like."""
+    return [item for item in named if item.effect.shows_in != ShowsIn.RETURNS]
 
 
 def _may_be_harmful(item: Named) -> bool:
