@@ -105,8 +105,8 @@ def find_shapes(
         return []
     scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
     believed = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
-    at = residuals.geometry.disparity
-    had = raster.moved(believed, at)
+    disparity = residuals.geometry.disparity
+    had = raster.moved(believed, disparity)
     searched, points = raster.searched()
     part = residuals.part(points)
     witnesses = _Witnesses(
@@ -148,7 +148,10 @@ def find_shapes(
         return found
     effects = [*believed, *(each.effect for each in found)]
     before = (effects[: len(believed) + count] for count in range(len(found)))
-    return [replace(each, touched=_touched(each.effect, others, raster, at)) for each, others in zip(found, before, strict=True)]
+    return [
+        replace(each, touched=_touched(each.effect, others, raster, disparity))
+        for each, others in zip(found, before, strict=True)
+    ]
 
 
 def _touched(effect: Effect, beside: list[Effect], raster: DisparityRaster, disparity: FloatArray) -> BoolArray:
