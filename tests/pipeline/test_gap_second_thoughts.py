@@ -21,12 +21,14 @@ from pipeline.gap.naming.relinearised import at_points
 from pipeline.gap.naming.verify import simulated
 from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.registration import residuals_of, settled
 from scene.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.smoothing import Smoothing
 from sensors.model import StereoNoise
+from sensors.stereo import REDUCTION
 
 
 def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path: Path) -> None:
@@ -102,6 +104,24 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
     known = residuals.smooth & np.isfinite(seen)
     assert known.sum() > 5000
     np.testing.assert_allclose(seen[known], 0, atol=2e-4)
+
+
+def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(tmp_path: Path) -> None:
+    """On a depth map of finer cells the same radius reaches another width, from other steps."""
+    make(Case(0, (4, 1), "one", "stereo", ("edge_fattening",), 6_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    read = read_measurement(tmp_path / "case")
+    plain = residuals_of(read)
+    raster = DisparityRaster.of(read, plain.geometry)
+    assert raster is not None
+    assert raster.step not in REDUCTION.values()
+    grown = {"name": "edge_fattening", "radius_px": 2.5 * raster.step}
+    model = with_effects(read.model, [grown])
+    quiet = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
+    (seen,) = simulated(read, model.model_copy(update={"noise": quiet}), plain, [KeyedRandom(1)])
+    expected = raster.moved([EdgeFattening(radius_px=2.5 * raster.step)], plain.geometry.disparity)
+    known = np.isfinite(seen)
+    assert np.count_nonzero(expected[known]) > 50
+    assert np.mean(np.abs(seen - expected)[known] < 1e-3) > 0.99
 
 
 def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,7 +64,8 @@ class DisparityRaster:
             seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
             matched = seen & ~hidden & _pictured(right, point)
             found = np.full(len(u), np.nan)
-            found[matched] = nominal.disparity((u[matched], v[matched]), project(right, point[matched]))
+            if matched.any():
+                found[matched] = nominal.disparity((u[matched], v[matched]), project(right, point[matched]))
             disparity[part], only_left[part] = (x.reshape(len(part), -1) for x in (found, seen & hidden))
         if np.isnan(disparity).all():  # the cameras look past the reference
             return None
