@@ -30,6 +30,9 @@ STILL_OPEN = (
 STILL_WIDE = (
     "Effects were named, but with them too the residuals spread far more than the model predicts, and nothing explains that."
 )
+STILL_REJECTED = (
+    "Effects were named, but the model is rejected with them too, and the gap is too small to show that they close any of it."
+)
 NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
 MUCH_MOVED = "Much of the wall is not where the reference has it: of what is left nothing can be said of the sensor."
 TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
@@ -84,6 +87,11 @@ class Evidence:
         return gap is not None and gap.closed is not None and gap.left_open and self.closes_little
 
     @property
+    def stays_rejected(self) -> bool:
+        """Whether more remains beside the named effects than chance would leave, and no gap tells what they are worth."""
+        return self.rejects and self.gap is not None and self.gap.closed is None
+
+    @property
     def closes_little(self) -> bool:
         """Whether the gap with the named effects is most of what it was, by more than its uncertainty, or not known at all."""
         gap = self.gap
@@ -106,7 +114,8 @@ def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
         if evidence.gap is None and not evidence.rejects:
             return "insufficient_data"
         return "no_gap" if evidence.agrees else "unknown"
-    if evidence.stays_open or evidence.too_wide or any(item.kind == "empirical" for item in named):
+    unsaid = evidence.stays_open or evidence.stays_rejected or evidence.too_wide
+    if unsaid or any(item.kind == "empirical" for item in named):
         return "unknown"
     if len(named) > 1:
         return "several"
@@ -122,7 +131,9 @@ def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> s
     if verdict == "unknown" and not any(item.kind == "empirical" for item in named):
         if not named:
             return NOT_DESCRIBED
-        return STILL_OPEN if evidence.stays_open else STILL_WIDE
+        if evidence.stays_open:
+            return STILL_OPEN
+        return STILL_REJECTED if evidence.stays_rejected else STILL_WIDE
     return VERDICTS[verdict]
 
 

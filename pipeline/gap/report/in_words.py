@@ -53,9 +53,11 @@ def title(found: GapDiagnosis) -> str:
         case "unknown" if not found.effects:
             return "Measurement and model disagree, and nothing that was tried says why"
         case "unknown" if not any(effect.kind == "empirical" for effect in found.effects):
-            if not found.evidence.stays_open:
-                return f"{listed(names)}, and something that makes the residuals spread"
-            return f"{listed(names)} closes little of the gap: something else is missing"
+            if found.evidence.stays_open:
+                return f"{listed(names)} closes little of the gap: something else is missing"
+            if found.evidence.stays_rejected:
+                return f"{listed(names)} leaves more than chance would: something else is missing"
+            return f"{listed(names)}, and something that makes the residuals spread"
         case "unknown" if isinstance(found.residuals, SurfaceResiduals):
             return "The cloud departs from the reference by more than its noise"
         case "unknown":
