@@ -100,7 +100,10 @@ class MeanDecisions(_Group):
     )
     most_effects: PositiveInt = _by(3, "effects", "Named at the most for the mean.", _JUDGEMENT)
     undone_size: PositiveFloat = _by(
-        10.0, "typical sizes", "From which on an effect that the registration undoes nearly is not committed to.", _JUDGEMENT
+        10.0,
+        "typical sizes",
+        "From which on an effect that the registration undoes nearly is not committed to where more is left than chance gives.",
+        _JUDGEMENT,
     )
     undone_share: PositiveFloat = _by(
         0.1,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.gap.mean.selection import Chosen
+from pipeline.gap.naming import naming
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.naming import with_doubtful
 from pipeline.gap.naming.relinearised import undone
@@ -70,6 +71,18 @@ def test_an_effect_that_registration_undoes_is_not_believed_at_38_times_its_size
 ) -> None:
     found = undone([_estimate(monkeypatch, amplitude)], Any, {"horizontal_eccentricity": left})  # type: ignore[arg-type]
     assert found == (frozenset({("horizontal_eccentricity", False)}) if out else frozenset())
+
+
+@pytest.mark.parametrize(
+    ("p_value", "empirical", "all_of_it"), [(0.4, False, True), (0.01, False, False), (None, False, False), (0.4, True, False)]
+)
+def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
+    p_value: float | None, empirical: bool, all_of_it: bool
+) -> None:
+    """Whatever only looks like it leaves something: its signature is another one."""
+    estimate = SimpleNamespace(candidate=SimpleNamespace(empirical=empirical))
+    found: Any = SimpleNamespace(search=SimpleNamespace(p_of_rest=lambda _: p_value), tried=(), estimates=[estimate])
+    assert naming._explains_all(found) is all_of_it
 
 
 def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:

@@ -126,7 +126,9 @@ def name_effects(
     physical = any(not each.empirical for each in families)
     names, cosines, survival = first.design.identifiability() if physical else ([], np.zeros((0, 0)), np.zeros(0))
     wrong = beyond(measurement, found.estimates, found.at)
-    wrong |= undone(found.estimates, found.at, dict(zip(names, survival, strict=True)))
+    doubtful = undone(found.estimates, found.at, dict(zip(names, survival, strict=True)))
+    if doubtful and not _explains_all(found):
+        wrong |= doubtful
     design = found.search.design
     left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
@@ -164,6 +166,13 @@ def name_effects(
     if angles and not believes(measurement, AngleEmpirical.tag()):
         return _with_angles(measurement, whole, angles, naming, random, left_out)
     return named, naming
+
+
+def _explains_all(found: Explained) -> bool:
+    """Whether effects of the catalogue alone were found, and no more than chance is left beside them."""
+    p_value = found.search.p_of_rest(found.tried)
+    physical = not any(each.candidate.empirical for each in found.estimates)
+    return physical and p_value is not None and p_value > decided().verdict.least_p
 
 
 def with_doubtful(
@@ -246,6 +255,7 @@ def _too_wide(measurement: Measurement, spread: list[SpreadFound]) -> frozenset[
 def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
     said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out - {FREE_FORMS}))
     why = (
-        "the best value is beyond what a config may hold, or many times the usual where the registration undoes nearly all of it"
+        "the best value is beyond what a config may hold, or many times the usual where the registration undoes nearly all of it "
+        "and more is left than chance gives"
     )
     return [f"{what} left out: {why}" for what in said]
