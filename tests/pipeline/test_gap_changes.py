@@ -136,15 +136,13 @@ def test_nine_small_rockfalls_of_a_whole_scan(tmp_path: Path) -> None:
         assert changes[int(np.argmax(inside))]["volume_m3"] == pytest.approx(depth * STEP**2, rel=0.35)
 
 
-@pytest.mark.xfail(
-    strict=False, reason="on a processor without AVX-512 rounding lets two effects be named, which close some of the gap; open"
-)
-def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seed", [9, 13])
+def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Path, seed: int) -> None:
     """Every third node of the wall fell by 0.1 to 0.4 m, in clumps: the answer asks for stable areas."""
     rng = np.random.default_rng(12)
     clumps = smooth_noise((121, 86), 4.0, rng)
     fallen = [(int(i), int(j), 0.15 + 0.2 * rng.uniform()) for i, j in np.argwhere(clumps > 0.35)]
-    write_scan(tmp_path, 9, blocks=fallen, step_rad=0.009)
+    write_scan(tmp_path, seed, blocks=fallen, step_rad=0.009)
     found = diagnose(read_measurement(tmp_path))
     assert found.verdict == "insufficient_data"
     assert found.evidence.moved > 0.3
@@ -166,3 +164,11 @@ def test_volumes_are_known_as_well_as_is_said(half: Any, depth: Any, reference: 
             off.append((change.volume_m3 - owner[0].volume) / change.volume_std_m3)
     assert len(off) > 40
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.25
+
+
+def test_a_large_noise_is_no_wall_that_moved(tmp_path: Path) -> None:
+    """8 cm where the model has 3 mm: on half of the wall medians of nine lie off by more than three predicted sigmas and 2 cm."""
+    write_scan(tmp_path, 9, ranges=lambda scan: scan.R + 0.08 * scan.rng.standard_normal(len(scan.R)), step_rad=0.009)
+    found = diagnose(read_measurement(tmp_path))
+    assert "tls.range_noise" in {name for effect in found.effects for name in (effect.name, *effect.alike)}
+    assert not found.evidence.much_moved

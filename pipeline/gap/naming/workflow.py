@@ -182,11 +182,23 @@ def _of_model(share: float, residuals: Residuals) -> float:
 
 
 def _with_moved(evidence: Evidence, there: Measurement, state: State, shown: Shown) -> Evidence:
-    """With the share of the wall that moved, where that may be why nothing was named that closes the gap."""
-    if verdict_of(shown.named, evidence) != "unknown" or (shown.named and not evidence.closes_little):
+    """With the share of the wall that moved, where that may be why nothing was named that closes the gap, or why a noise was.
+
+    A noise closes some of any gap, but takes no neighbours along: with the true one in the model next to nothing moved.
+    """
+    noisy = any(item.spreads for item in shown.named)
+    unexplained_yet = verdict_of(shown.named, evidence) == "unknown" and (not shown.named or evidence.closes_little)
+    if not (noisy or unexplained_yet):
         return evidence
     after = replace(state.residuals, value=shown.value)
-    return replace(evidence, moved=moved_share(after, Sight.of(there, after), state.fit))
+    sight = Sight.of(there, after)
+    moved = moved_share(after, sight, state.fit)
+    if noisy and not unexplained_yet and moved >= decided().changes.moved_share:
+        found = residuals_of(there.changed(model=shown.model))
+        sigma = found.of_points(found.sigma, after.index)
+        beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, state.fit)
+        moved = moved if beside >= decided().changes.moved_beside_noise else 0.0
+    return replace(evidence, moved=moved)
 
 
 def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
