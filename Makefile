@@ -40,6 +40,7 @@ format: setup-all
 	$(BIN)/ruff check --fix-only -q .
 	$(BIN)/ruff format .
 
+# A script with an argument that is required needs a data set of the user's own.
 benchmarks: setup-all
 	@for file in $$(grep -L 'required=True' benchmarks/*.py); do echo "== $$file"; $(BIN)/python $$file || exit 1; done
 

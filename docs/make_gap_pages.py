@@ -320,7 +320,8 @@ def verdicts() -> dict[str, Verdict]:
             "The model is rejected, and a free form of a covariate explains clearly more (a score higher by 5) than any "
             "effect of the catalogue, so the nearest name would be wrong; or nothing that was tried holds on held-out "
             "blocks, and still the gap lies above the floor by more than its uncertainty or what remains has a p-value of"
-            " 0.01 or less: then the report says where and how large.",
+            " 0.01 or less: then the report says where and how large. So it is where effects were named, and they leave most"
+            " of the gap open, or that p-value beside a gap too small to tell what they are worth.",
             "Read along which covariate it goes and in what form; the empirical term in model_after.yaml lets simulations go on."
             " Outside the covariate's range that was measured it says nothing.",
             "Ranges that jump by 4 mm in the middle of the scan, as after a knock.",

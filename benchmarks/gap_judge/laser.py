@@ -14,11 +14,11 @@ from .laser_effects import CATALOGUE, EFFECTS, SHAPED, Shot
 from .surface import Array, Hits, Mask, Surface
 
 Rng = np.random.Generator
-GAP_BETWEEN_ECHOES_M = 0.15
-SHARE_FROM_DROPS = 0.1
+GAP_BETWEEN_ECHOES_M = 0.15  # surfaces nearer to each other make one echo: half a pulse of 1 ns
+SHARE_FROM_DROPS = 0.1  # of the pulses that rain or fog loses, those recorded on a drop of it
 SHARE_OF_DOUBLES = 0.15  # of the pulses beside an edge: the footprint is so much narrower than the steps
 REFERENCE_POWER_RANGE_M = 100.0
-DARKEST = 1e-9
+DARKEST = 1e-9  # power of a ray that grazes, so that decibels stay finite
 RINGS = ((0.349, 6), (0.854, 12))  # radius over the beam's (1/e^2), rays: each of 1/19 of the power, second moment kept
 
 

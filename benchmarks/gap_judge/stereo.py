@@ -15,8 +15,8 @@ from .stereo_effects import CATALOGUE, EFFECTS, SHAPED, Match, grid_noise
 from .surface import Array, Mask, Surface
 
 Rng = np.random.Generator
-HIDDEN_M = 0.02
-OUTLIER_Z2 = 9.0
+HIDDEN_M = 0.02  # the right camera sees something so much nearer: hidden, and no rounding
+OUTLIER_Z2 = 9.0  # no pixel counts for more, as no robust judge lets it
 
 
 @dataclass(frozen=True)

@@ -99,8 +99,11 @@ class Progress:
 
     def _done(self) -> float:
         """Weight done of the plan; a stage that has not said how far it is goes by the pace of the stages before it."""
-        finished = sum(self._weights.get(name, 0.0) for name in self._finished)
-        return finished + self._weight() * (self._fraction or min(self._guess(), _GUESS_LIMIT))
+        return self._weight_finished() + self._weight() * (self._fraction or min(self._guess(), _GUESS_LIMIT))
+
+    def _weight_finished(self) -> float:
+        """Of the plan's stages that are over."""
+        return sum(self._weights.get(name, 0.0) for name in self._finished)
 
     def _weight(self) -> float:
         """Of the current stage; nothing where it came before."""
@@ -112,7 +115,7 @@ class Progress:
         weight = self._weight()
         if not weight or self._fraction:
             return self._fraction
-        so_far = self._weight_before + sum(self._weights.get(name, 0.0) for name in self._finished)
+        so_far = self._weight_before + self._weight_finished()
         pace = (self._stage_began - self._began) / so_far if so_far else 1.0
         return (self._clock() - self._stage_began) / max(pace * weight, 1e-9)
 
