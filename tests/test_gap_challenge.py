@@ -278,9 +278,9 @@ def test_powers_and_slopes_are_part_of_a_ray() -> None:
 
 @pytest.mark.slow
 def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
-    """12 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names)
+    """8 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names)
     each fails in less than 4 % of draws; the seed is fixed."""
-    found = run(12, 20, 1, tmp_path, small=True)
+    found = run(8, 20, 1, tmp_path, small=True)
     rows = found["rows"]
     assert {row["stratum"] for row in rows} == set(cases.STRATA)
     assert {row["sensor"] for row in rows} == {"tls", "stereo"}
@@ -288,7 +288,7 @@ def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> N
     quiet = [row for row in rows if row["stratum"] in ("none", "change")]
     assert sum(row["verdict"] != "no_gap" for row in quiet) <= 1
     committed = [row for row in rows if row["named"]]
-    assert len(committed) >= 3
+    assert len(committed) >= 2
     assert sum(bool(row["wrong_names"]) for row in committed) <= 1
     clear = [row for row in rows if row["stratum"] == "one" and row["true"][0]["snr_sin_angle"] >= 8]
     assert sum(row["hits"][0] for row in clear) >= len(clear) - 1

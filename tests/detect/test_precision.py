@@ -47,6 +47,7 @@ def test_another_backend_is_refused(monkeypatch):
         pass
 
 
+@bfloat16_processor
 @pytest.mark.slow
 def test_a_training_in_bfloat16_has_the_losses_of_one_in_float32(tmp_path):
     """To a hundredth of the losses that they begin with; what is saved is in float32."""

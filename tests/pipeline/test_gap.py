@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,14 @@ from pipeline.gap.naming.workflow import STEPS, GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.in_words import paragraph
 from pipeline.gap.report.report import summary, to_dict
+from scene import threads
 from scene.backend import dr
 
 ROOT = Path(__file__).parents[2]
 
 
-def found_in(folder: Path, seed: int, **case: Any) -> GapDiagnosis:
-    write_scan(folder, seed, **case)
+def found_in(folder: Path, seed: int, step_rad: float = 0.008, **case: Any) -> GapDiagnosis:
+    write_scan(folder, seed, step_rad=step_rad, **case)
     return diagnose(read_measurement(folder))
 
 
@@ -37,7 +39,7 @@ def test_the_generator_shares_no_code_with_what_it_tests() -> None:
 
 
 def test_nothing_is_found_where_there_is_nothing(tmp_path: Path) -> None:
-    write_scan(tmp_path, 1)
+    write_scan(tmp_path, 1, step_rad=0.008)
     told: list[str] = []
     assert diagnose(read_measurement(tmp_path), progress=told.append).verdict == "no_gap"
     assert told == list(STEPS)
@@ -104,7 +106,7 @@ def test_too_few_points_are_no_data(tmp_path: Path) -> None:
 def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: Path) -> None:
     case, out = tmp_path / "case", tmp_path / "out"
     case.mkdir()
-    write_scan(case, 8, ranges=lambda scan: scan.R + 0.004 * (1 / scan.cos_i - 1), intensity=False)
+    write_scan(case, 8, ranges=lambda scan: scan.R + 0.004 * (1 / scan.cos_i - 1), intensity=False, step_rad=0.008)
     assert main(["gap", str(case), "--out", str(out)]) == 0
     result = json.loads((out / "gap.json").read_text())
     assert result["verdict"] == "named"
@@ -116,12 +118,13 @@ def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: P
     assert diagnose(read_measurement(case)).verdict == "no_gap"
 
 
-def test_the_outcome_does_not_depend_on_the_number_of_threads(tmp_path: Path) -> None:
-    write_scan(tmp_path, 3, angles=wobbling, step_rad=0.007)
+def test_the_outcome_does_not_depend_on_the_number_of_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_scan(tmp_path, 3, angles=wobbling, step_rad=0.009)
     measurement, before, told = read_measurement(tmp_path), dr.thread_count(), []
     try:
         for count in (1, 2):
             dr.set_thread_count(count)
+            monkeypatch.setattr(threads, "executor", lambda count=count: ThreadPoolExecutor(count))
             told.append({key: value for key, value in to_dict(diagnose(measurement), measurement).items() if key != "seconds"})
     finally:
         dr.set_thread_count(before)

@@ -15,7 +15,7 @@ from pipeline.gap.residuals.registration import settled
 from scene.keyed_random import KeyedRandom
 
 TRUE = 0.008
-STEPS = (0.012, 0.0045)
+STEPS = (0.013, 0.006)
 BENT = 0.055
 
 
@@ -43,12 +43,12 @@ def _search(folder: Path, step_rad: float, bent: float = BENT) -> tuple[list[str
 
 
 def test_a_denser_scan_keeps_the_name_and_the_value(tmp_path: Path) -> None:
-    """5,000 and 38,000 points of an error that is not quite of the effect's form, by 5.5 % of its size: 1.1 % of the gain."""
+    """4,500 and 21,000 points of an error that is not quite of the effect's form, by 5.5 % of its size: 1.1 % of the gain."""
     (few, coarse, wide, fewer), (many, fine, narrow, more) = (_search(tmp_path / f"at_{step}", step) for step in STEPS)
     assert few == many == ["range_incidence_bias"]
     assert all(abs(value - TRUE) < 3 * std + BENT * TRUE for value, std in ((coarse, wide), (fine, narrow)))
     assert narrow < 0.6 * wide
-    assert more > 5 * fewer
+    assert more > 4 * fewer
 
 
 def test_a_free_form_of_its_own_is_still_asked_for_beside_an_effect(tmp_path: Path) -> None:

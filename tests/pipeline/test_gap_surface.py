@@ -28,7 +28,7 @@ from sensors.effects.surface_empirical import SurfaceEmpirical
 
 KEYS = ("schema", "verdict", "effects", "where", "scene_changes", "sensor", "registration", "identifiability", "gap", "remaining",
         "seconds")  # fmt: skip
-NULLS = 6
+NULLS = 4
 BOWL = 0.02
 
 
