@@ -155,7 +155,7 @@ def blocks(model: Any, folder: CocoFolder) -> Iterator[Block]:
             continue
         true_boxes = np.array([box_of(wanted[number]) for number in of], np.float32)
 
-        levels = model.pyramid(pixels, training=False)[:4]
+        levels = model.first_stage(pixels, training=False).levels
 
         def draw(others: Boxes, levels: Any = levels) -> NDArray[np.float32]:
             return np.asarray(ops.sigmoid(model._masks(levels, ops.convert_to_tensor(others[None]), False)))[0]
