@@ -37,13 +37,13 @@ def set_operating_point(folder: Path, validation: CocoFolder) -> float:
     set_to: dict[str, float] = {}
     for unmirrored in (True, False) if config.head.mirrored != "none" else (True,):
         model = weights.load(folder, unmirrored=unmirrored)
-        set_to |= _best_shifts(model, validation, "" if unmirrored else "mirrored_")
+        set_to |= _set_on(model, validation, "" if unmirrored else "mirrored_")
     model.config = weights.with_head(config, **set_to)
     weights.save(model, folder)  # and without the optimizer's state, which a model in training saves too
     return float(model.config.head.shifts[0])
 
 
-def _best_shifts(model: Any, validation: CocoFolder, prefix: str) -> dict[str, float]:
+def _set_on(model: Any, validation: CocoFolder, prefix: str) -> dict[str, float]:
     """The shifts of `head` with which CONFIDENCE is best for the model, 0 where nothing is found. prefix: of their keys."""
     before = model.config.head.shifts
     found = _found(model, validation, min(_TRIED))

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.cli.main import main
-from pipeline.detection import operating_point, weights
+from pipeline.detection import operating_point, run, weights
 from pipeline.detection.config import DetectorConfig, HeadConfig, ProposalConfig
 from pipeline.detection.mirrored import VIEWS, Mirrored, network
 from pipeline.detection.model import MaskRCNN
@@ -126,3 +126,9 @@ def test_the_threshold_has_no_views_to_leave_out(tmp_path, capsys):
     assert main(words) == 2
     assert "--unmirrored: goes with a network" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_detector_that_comes_along_looks_at_all_views():
+    head = weights.load_config(run.detector_folder("default")).head
+    assert head.mirrored == "both"
+    assert None not in (head.mirrored_score_shift, head.mirrored_score_per_doubling)
