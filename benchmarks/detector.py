@@ -2,8 +2,9 @@
 
     KERAS_BACKEND=tensorflow python benchmarks/detector.py [--config configs/detectors/fine.yaml] [--threads 1]
 
-To reach: half of the bare rate, forward and backward for training, forward for inference. Processor times in turns, so that
-other work on the machine counts little; images are noise with a dozen blocks in each 256 px square.
+To reach: half of the bare rate, forward and backward for training, forward for inference. Inference with a map's mirror images
+too (`head.mirrored: both`) is timed beside it. Processor times in turns, so that other work on the machine counts little; images
+are noise with a dozen blocks in each 256 px square.
 """
 
 from __future__ import annotations
@@ -81,7 +82,9 @@ def main() -> None:
     import tensorflow as tf
 
     from pipeline.detection.config import load_train_config
+    from pipeline.detection.mirrored import network
     from pipeline.detection.model import MaskRCNN
+    from pipeline.detection.weights import with_head
 
     tf.config.threading.set_intra_op_parallelism_threads(arguments.threads)
     tf.config.threading.set_inter_op_parallelism_threads(1)
@@ -103,13 +106,18 @@ def main() -> None:
         f"training at {crop or size} px, {count} a step: {count / whole:.2f} images/s, bare {count / alone:.2f}, "
         f"ratio {alone / whole:.2f}; with training.precision=bfloat16 {count / half:.2f}, {whole / half:.2f} times as many"
     )
-    finder = MaskRCNN(config.detector)
+    finder, looker = MaskRCNN(config.detector), network(with_head(config.detector, mirrored="both"))
     image = examples(4, size, config.detector.most_blocks, channels)["image"]
-    whole, alone = processor_seconds(
-        lambda: finder.predict_on_batch({"image": image}), bare(finder.pyramid, image, backward=False)
+    whole, mirrored, alone = processor_seconds(
+        lambda: finder.predict_on_batch({"image": image}),
+        lambda: looker.predict_on_batch({"image": image}),
+        bare(finder.pyramid, image, backward=False),
     )
     megapixels = 4 * size**2 / 1e6
-    print(f"inference at {size} px: {megapixels / whole:.2f} MP/s, bare {megapixels / alone:.2f}, ratio {alone / whole:.2f}")
+    print(
+        f"inference at {size} px: {megapixels / whole:.2f} MP/s, bare {megapixels / alone:.2f}, ratio {alone / whole:.2f}; "
+        f"with mirror images {megapixels / mirrored:.2f} MP/s, {mirrored / whole:.2f} times the time"
+    )
 
 
 if __name__ == "__main__":

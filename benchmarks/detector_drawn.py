@@ -1,6 +1,6 @@
 """How well a detector draws the blocks that it finds, and what stands in the way: boxes, outlines, the mask's grid, or the noise.
 
-    python benchmarks/detector_drawn.py --set sets/mixed [--split val] [--model default] [--write]
+    python benchmarks/detector_drawn.py --set sets/mixed [--split val] [--model default] [--unmirrored] [--write]
 
 Of the blocks found (masks overlap by 0.25, score 0.95), the share with a mask that overlaps by 0.75: masks as they are, drawn in
 other boxes, with another margin or from another probability on, and the true masks cut or sampled as the masks found are. Each
@@ -155,7 +155,7 @@ def blocks(model: Any, folder: CocoFolder) -> Iterator[Block]:
             continue
         true_boxes = np.array([box_of(wanted[number]) for number in of], np.float32)
 
-        levels = model.pyramid(pixels, training=False)[:4]
+        levels = model.first_stage(pixels, training=False).levels
 
         def draw(others: Boxes, levels: Any = levels) -> NDArray[np.float32]:
             return np.asarray(ops.sigmoid(model._masks(levels, ops.convert_to_tensor(others[None]), False)))[0]
@@ -208,9 +208,10 @@ def main() -> None:
     parser.add_argument("--set", type=Path, required=True, dest="folder", help="a data set")
     parser.add_argument("--split", default="val", help="its folder with the tiles")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
+    parser.add_argument("--unmirrored", action="store_true", help="look at maps as they are, not at their mirror images too")
     parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
     arguments = parser.parse_args()
-    model = weights.load(detector_folder(arguments.model))
+    model = weights.load(detector_folder(arguments.model), unmirrored=arguments.unmirrored)
     text = "\n".join(rows(list(blocks(model, CocoFolder(arguments.folder / arguments.split)))))
     print(text)
     if arguments.write:

@@ -2,9 +2,8 @@
 
     python benchmarks/detector_mirrored.py --set sets/mixed [--split val] [--every 3] [--model default] [--write]
 
-Log odds, codes of boxes and log odds of masks are means over the map as it is, mirrored left-right, up-down and both ways, each
-turned back; a proposal is one box in all of them. F1 of masks by size at a score of 0.95, once the scores of each way of looking
-are set on the same tiles (`operating_point.best_shifts`), so the gain is rather too large than too small. Tiles of the
+The views are those of pipeline/detection/mirrored.py. F1 of masks by size at a score of 0.95, once the scores of each way of
+looking are set on the same tiles (`operating_point.best_shifts`), so the gain is rather too large than too small. Tiles of the
 detector's own size. --write puts the table into docs/detector.md.
 """
 
@@ -19,12 +18,12 @@ from typing import Any
 
 import numpy as np
 from documents import write_between
-from keras import ops
 
 from pipeline.detection import inference, weights
-from pipeline.detection.boxes import Tensor
+from pipeline.detection.config import Mirroring
 from pipeline.detection.data import CocoFolder
 from pipeline.detection.evaluate import evaluate
+from pipeline.detection.mirrored import network
 from pipeline.detection.model import MaskRCNN
 from pipeline.detection.operating_point import best_shifts
 from pipeline.detection.run import detector_folder
@@ -33,75 +32,15 @@ DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- mirrored -->", "<!-- end of mirrored -->"
 CONFIDENCE, LOWEST, OVERLAPS = 0.95, 0.02, (0.25, 0.75)
 SIZES = ("small", "medium", "large")
-Axes = tuple[int, ...]
-VIEWS: dict[str, tuple[Axes, ...]] = {
-    "as it is": ((),),
-    "left-right too": ((), (1,)),
-    "left-right, up-down and both too": ((), (1,), (0,), (0, 1)),
+WAYS: dict[Mirroring, str] = {
+    "none": "as it is",
+    "left_right": "left-right too",
+    "both": "left-right, up-down and both too",
 }
-"""The axes, 0 for rows, that are mirrored in each view."""
+"""The table's rows, by `head.mirrored`."""
 
 
-class Mirrored(MaskRCNN):
-    """A MaskRCNN whose answers are means over mirrored views; `_pyramids` holds each one's features during a call."""
-
-    views: tuple[Axes, ...] = ((),)
-
-    def call(self, inputs: dict[str, Tensor], training: bool = False) -> dict[str, Tensor]:
-        """Boxes, scores and masks as `MaskRCNN` gives them."""
-        self._pyramids: list[list[Tensor]] = []
-        logits, codes = [], []
-        for axes in self.views:
-            levels = self.pyramid(ops.flip(inputs["image"], [axis + 1 for axis in axes]), training=False)
-            found = [self.proposal_head(level, training=False) for level in levels]
-            order = self._turned_back(axes)
-            logits.append(ops.take(ops.concatenate([logit for logit, _ in found], axis=1)[..., 0], order, axis=1))
-            codes.append(ops.take(ops.concatenate([code for _, code in found], axis=1), order, axis=1) * signs(axes))
-            self._pyramids.append(levels[:4])
-        return self._detections([], self._proposals(mean(logits), mean(codes)))
-
-    def _turned_back(self, axes: Axes) -> np.ndarray:
-        """(a,) where the anchors of the map stand in a view."""
-        ratios, start, result = len(self.config.proposal.anchor_ratios), 0, []
-        for stride in self.config.strides:
-            cells = -(-self.size // stride)
-            numbers = start + np.arange(cells**2 * ratios).reshape(cells, cells, ratios)
-            result.append(np.flip(numbers, axes).ravel())
-            start += numbers.size
-        return np.concatenate(result)
-
-    def _on_boxes(self, levels: list[Tensor], boxes: Tensor, training: bool) -> tuple[Tensor, Tensor]:
-        every = [super(Mirrored, self)._on_boxes(own, self._seen(boxes, axes), training) for axes, own in self._looks()]
-        return mean([logits for logits, _ in every]), mean(
-            [each[1] * signs(axes) for each, axes in zip(every, self.views, strict=True)]
-        )
-
-    def _masks(self, levels: list[Tensor], boxes: Tensor, training: bool) -> Tensor:
-        every = [super(Mirrored, self)._masks(own, self._seen(boxes, axes), training) for axes, own in self._looks()]
-        return mean([ops.flip(logits, [axis + 2 for axis in axes]) for logits, axes in zip(every, self.views, strict=True)])
-
-    def _looks(self) -> Iterator[tuple[Axes, list[Tensor]]]:
-        return zip(self.views, self._pyramids, strict=True)
-
-    def _seen(self, boxes: Tensor, axes: Axes) -> Tensor:
-        """Boxes (..., 4) of the map in a view."""
-        edges = [boxes[..., number] for number in range(4)]
-        for axis in axes:
-            edges[axis], edges[axis + 2] = self.size - edges[axis + 2], self.size - edges[axis]
-        return ops.stack(edges, axis=-1)
-
-
-def signs(axes: Axes) -> np.ndarray:
-    """(4,) by which a code changes where axes are mirrored: shifts of the centre turn round, sizes stay."""
-    return np.array([-1 if axis in axes else 1 for axis in range(2)] + [1, 1], np.float32)
-
-
-def mean(values: list[Tensor]) -> Tensor:
-    """Of tensors of one shape."""
-    return sum(values[1:], values[0]) / len(values)
-
-
-def figures(model: Mirrored, folder: CocoFolder) -> tuple[list[float], float]:
+def figures(model: MaskRCNN, folder: CocoFolder) -> tuple[list[float], float]:
     """F1 by size and overlap, %, and processor seconds a tile."""
     truth = {"images": folder.images, "annotations": folder.annotations}
     inference.detect(model, folder.labelled(0).difference, LOWEST)  # compiles
@@ -131,9 +70,8 @@ def rows(folder: CocoFolder, detector: Path) -> Iterator[str]:
     yield f"| map | {' | '.join(f'{size}: 0.25, 0.75' for size in SIZES)} | mean | time |"
     yield "|---" * (3 + len(SIZES)) + "|"
     plain = 0.0
-    for name, views in VIEWS.items():
-        model = Mirrored(weights.load_config(detector))
-        model.views = views
+    for mirrored, name in WAYS.items():
+        model = network(weights.with_head(weights.load_config(detector), mirrored=mirrored))
         weights.take_weights(model, detector)
         found, seconds = figures(model, folder)
         plain = plain or seconds

@@ -98,10 +98,10 @@ RESOLVED = (
     "--set training.precision=bfloat16 --out more",
     "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 4 --set training.start=more/best "
     "--set training.learning_rate=0.001 --set training.epochs=27 --set training.precision=bfloat16 "
-    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out still_more',
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out still_more',
     "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 5 --set training.start=default "
     "--set training.learning_rate=0.001 --set training.precision=bfloat16 "
-    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out further_still',
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out further_still',
 )
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
@@ -116,6 +116,7 @@ PARSED = (
     "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
     "scarpsim detect detector/best runs/bulga",
     "scarpsim detect detector/best runs/bulga --out found",
+    "scarpsim detect default runs/bulga --unmirrored",
     "scarpsim detect baseline runs/bulga --out found_by_threshold",
     "scarpsim evaluate sets/small/test found/detections.json --by noise --confidence 0.5 --confidence 0.95",
     "scarpsim view runs/my_run --detections found",

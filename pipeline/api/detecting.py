@@ -37,6 +37,7 @@ def detect(
     *,
     confidence: float | Sequence[float] = run.CONFIDENCES,
     out: Path | str | None = None,
+    unmirrored: bool = False,
     progress: Show = "auto",
 ) -> Detections:
     """Find the blocks in difference maps; the same as `scarpsim detect`.
@@ -44,6 +45,7 @@ def detect(
     maps: DataArrays (y, x) in m, runs, TIFF files, folders with annotations.json, one or a list; model: "default" (the weights
     that come with scarpsim) or a trained detector's folder, either by TensorFlow in a process of its own, or "baseline", a
     threshold. out: a folder for COCO files, tables, masks and overlays; none: a temporary one, removed when the result goes.
+    unmirrored: the network looks at maps as they are, not at their mirror images too, which is faster and finds less.
     """
     confidences = run.checked_confidences([confidence] if isinstance(confidence, int | float) else confidence)
     kept = tempfile.TemporaryDirectory(prefix="scarpsim_detect_") if out is None else None
@@ -52,10 +54,10 @@ def detect(
         places = [_place(each, Path(written), number) for number, each in enumerate(_several(maps), start=1)]
         if model == run.BASELINE:
             with python_progress(progress) as shown:
-                found = run.detect(str(model), places, folder, confidences, True, shown)
+                found = run.detect(str(model), places, folder, confidences, True, shown, unmirrored=unmirrored)
         else:
             with python_progress(progress) as shown, shown.stage(_WAITING):
-                _in_another_process(str(model), places, folder, confidences)
+                _in_another_process(str(model), places, folder, confidences, unmirrored=unmirrored)
             found = read_events(folder / f"events_{min(confidences):g}.csv")
     return Detections(folder, tuple(found), min(confidences), kept)
 
@@ -127,10 +129,10 @@ def _place(given: Any, folder: Path, number: int) -> Path:
     return path
 
 
-def _in_another_process(model: str, places: Sequence[Path], out: Path, confidences: Sequence[float]) -> None:
+def _in_another_process(model: str, places: Sequence[Path], out: Path, confidences: Sequence[float], *, unmirrored: bool) -> None:
     """`scarpsim detect` as a command: TensorFlow and the ray tracer's compiler do not belong into one process."""
     words = [model, *map(str, places), "--out", str(out), *(f"--confidence={value:g}" for value in confidences), "--quiet"]
-    command = [sys.executable, "-c", _COMMAND, "detect", *words]
+    command = [sys.executable, "-c", _COMMAND, "detect", *words, *["--unmirrored"] * unmirrored]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         message = done.stderr.strip().splitlines()[-1].removeprefix("error: ") if done.stderr.strip() else "ended without a word"

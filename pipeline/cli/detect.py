@@ -36,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="P",
         help="lowest score, may be given several times (default: 0.9 0.95 0.99)",
     )
+    parser.add_argument(
+        "--unmirrored",
+        action="store_true",
+        help="look at maps as they are, not at their mirror images too: 'default' is three to four times as fast, and finds less",
+    )
     parser.add_argument("--no-pictures", action="store_true", help="neither overlays nor rasters of masks")
     add_output_options(parser)
 
@@ -57,7 +62,15 @@ def run(arguments: argparse.Namespace) -> Answer:
         find_inputs(arguments.inputs)
         load_keras(quiet=arguments.quiet)
     with shown_progress(quiet=arguments.quiet) as progress:
-        found = detect(arguments.model, arguments.inputs, out, confidences, not arguments.no_pictures, progress)
+        found = detect(
+            arguments.model,
+            arguments.inputs,
+            out,
+            confidences,
+            not arguments.no_pictures,
+            progress,
+            unmirrored=arguments.unmirrored,
+        )
     volume = sum(item.volume_m3 for item in found)
     told = f"{len(found)} blocks with a score of {min(confidences):g} or more, {volume:.3g} m³"
     document = {

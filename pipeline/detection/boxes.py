@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 Tensor = Any
 """A tensor of the Keras backend in use."""
+Axes = tuple[int, ...]
+"""Along which an image is mirrored: 0 turns it up-down, 1 left-right."""
 _DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)
 """Typical sizes of the four numbers of a code, by which they are divided (He et al. 2017, as everybody's code has it)."""
 _LARGEST_LOG = float(np.log(1000 / 16))
@@ -78,6 +80,19 @@ def decode(code: Tensor, reference: Tensor) -> Tensor:
 def widened(boxes: Tensor, margin: float) -> Tensor:
     """Boxes (..., 4) with all edges `margin` further out, px."""
     return boxes + margin * np.array([-1, -1, 1, 1], np.float32)
+
+
+def mirrored(boxes: Tensor, axes: Axes, side: float) -> Tensor:
+    """Where boxes (..., 4) of an image of that side, px, lie once it is mirrored; its own inverse."""
+    edges = [boxes[..., number] for number in range(4)]
+    for axis in axes:
+        edges[axis], edges[axis + 2] = side - edges[axis + 2], side - edges[axis]
+    return ops.stack(edges, axis=-1)
+
+
+def mirrored_codes(codes: Tensor, axes: Axes) -> Tensor:
+    """What codes (..., 4) become once the image is mirrored: shifts of the centre turn round, sizes stay; its own inverse."""
+    return codes * np.array([-1 if axis in axes else 1 for axis in range(2)] + [1, 1], np.float32)
 
 
 def doublings(boxes: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from scene.config import Config, load_yaml, parse
 
 CHECKPOINT, BEST, STAGE, EVENTS, CURVES = "checkpoint", "best", "stage", "events", "losses.png"
 """What a training writes into its folder."""
+Mirroring = Literal["none", "left_right", "both"]
 Loss = Literal["proposal_class", "proposal_box", "class", "box", "mask"]
 
 
@@ -72,6 +73,11 @@ class HeadConfig(Config):
         description="a detection's mask is drawn in its box with so many px of the image around, so that a box that is a little "
         "too small does not cut it; in detection alone, training has boxes of its own that are off",
     )
+    mirrored: Mirroring = Field(
+        "none",
+        description="mirror images of a map at which detection looks too, taking means: left-right, or left-right, up-down and "
+        "both ways; in detection alone, training has flips of its own",
+    )
     score_shift: float = Field(
         0.0,
         ge=-100,
@@ -85,6 +91,20 @@ class HeadConfig(Config):
         description="added to the log odds for each doubling of a box's side above 16 px, taken off for each halving; "
         "`scarpsim train` sets it together with score_shift",
     )
+    mirrored_score_shift: float | None = Field(
+        None, ge=-100, le=100, description="score_shift where mirror images are looked at too (null: the same); set alike"
+    )
+    mirrored_score_per_doubling: float | None = Field(
+        None, ge=-100, le=100, description="score_per_doubling where mirror images are looked at too (null: the same); set alike"
+    )
+
+    @property
+    def shifts(self) -> tuple[float, float]:
+        """What is added to the log odds of a block of 16 px, and for each doubling of its side, as detection looks at maps."""
+        if self.mirrored == "none":
+            return self.score_shift, self.score_per_doubling
+        shift, slope = self.mirrored_score_shift, self.mirrored_score_per_doubling
+        return self.score_shift if shift is None else shift, self.score_per_doubling if slope is None else slope
 
 
 class DetectorConfig(Config):

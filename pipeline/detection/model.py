@@ -7,6 +7,7 @@ fixed: empty places are marked by weights or scores.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import keras
@@ -27,6 +28,18 @@ LOSSES: tuple[Loss, ...] = get_args(Loss)
 def total_loss(losses: Mapping[str, Any], weights: Mapping[Loss, float]) -> Any:
     """The sum of losses by name, numbers or tensors, with their weights, 1 by default."""
     return sum(weights.get(name, 1.0) * losses[name] for name in LOSSES)
+
+
+@dataclass(frozen=True)
+class FirstStage:
+    """What the network makes of images before it looks at single boxes.
+
+    levels: what boxes take their features from, P2 to P5; logits (b, a) and codes (b, a, 4): of the anchors.
+    """
+
+    levels: list[Tensor]
+    logits: Tensor
+    codes: Tensor
 
 
 class MaskRCNN(keras.Model):
@@ -58,14 +71,18 @@ class MaskRCNN(keras.Model):
 
     def call(self, inputs: dict[str, Tensor], training: bool = False) -> dict[str, Tensor]:
         """Losses by name where the inputs hold the blocks, else boxes, scores and masks as `_detections` gives them."""
-        levels = self.pyramid(inputs["image"], training=training)
+        first = self.first_stage(inputs["image"], training=training)
+        proposals = self._proposals(first.logits, first.codes)
+        if "boxes" in inputs:
+            return self._loss_terms(inputs, first, proposals, training)
+        return self._detections(first.levels, proposals)
+
+    def first_stage(self, image: Tensor, *, training: bool) -> FirstStage:
+        """Of images (b, h, w, c)."""
+        levels = self.pyramid(image, training=training)
         found = [self.proposal_head(level, training=training) for level in levels]
         logits = ops.concatenate([logit for logit, _ in found], axis=1)[..., 0]
-        codes = ops.concatenate([code for _, code in found], axis=1)
-        proposals = self._proposals(logits, codes)
-        if "boxes" in inputs:
-            return self._loss_terms(inputs, levels[:4], logits, codes, proposals, training)
-        return self._detections(levels[:4], proposals)
+        return FirstStage(levels[:4], logits, ops.concatenate([code for _, code in found], axis=1))
 
     def compute_loss(
         self, x: Any = None, y: Any = None, y_pred: Any = None, sample_weight: Any = None, training: bool = True
@@ -84,23 +101,21 @@ class MaskRCNN(keras.Model):
         boxes, scores = suppressed(boxes, ops.sigmoid(best), config.suppression_iou, config.proposals)
         return ops.where(scores[..., None] >= 0, boxes, 0.0)
 
-    def _loss_terms(
-        self, inputs: dict[str, Tensor], levels: list[Tensor], logits: Tensor, codes: Tensor, proposals: Tensor, training: bool
-    ) -> dict[str, Tensor]:
+    def _loss_terms(self, inputs: dict[str, Tensor], first: FirstStage, proposals: Tensor, training: bool) -> dict[str, Tensor]:
         blocks, valid = inputs["boxes"], inputs["valid"]
         anchor = anchor_targets(self.anchors, blocks, valid, self.config.proposal, self.samples)
-        sampled = ops.take_along_axis(logits, ops.concatenate([anchor.positive, anchor.negative], axis=1), axis=1)
+        sampled = ops.take_along_axis(first.logits, ops.concatenate([anchor.positive, anchor.negative], axis=1), axis=1)
         wanted = ops.concatenate([ops.ones_like(anchor.positive_weight), ops.zeros_like(anchor.negative_weight)], axis=1)
         weights = ops.concatenate([anchor.positive_weight, anchor.negative_weight], axis=1)
-        anchor_codes = ops.take_along_axis(codes, anchor.positive[..., None], axis=1)
+        anchor_codes = ops.take_along_axis(first.codes, anchor.positive[..., None], axis=1)
         target = box_targets(proposals, blocks, valid, self.config.head, self.samples)
         positives = target.positives
-        classes, box_codes = self._on_boxes(levels, target.boxes, training)
+        classes, box_codes = self._on_boxes(first.levels, target.boxes, training)
         positive_weight = target.weight[:, :positives]
         is_block = np.arange(target.boxes.shape[1]) < positives
         block_class = ops.cast(ops.zeros_like(target.weight), "int32") + is_block.astype(np.int32)
         boxes = target.boxes[:, :positives]
-        masks = self._masks(levels, boxes, training)
+        masks = self._masks(first.levels, boxes, training)
         mask = mask_targets(inputs["labels"], boxes, target.block, self.config.head.mask_size_px)
         return {
             "proposal_class": binary_cross_entropy(sampled, wanted, weights),
@@ -119,7 +134,8 @@ class MaskRCNN(keras.Model):
         classes, codes = self._on_boxes(levels, proposals, False)
         real = proposals[..., 2] > proposals[..., 0]
         boxes = clip(decode(codes, proposals), self.size, self.size)
-        odds = classes[..., 1] - classes[..., 0] + config.score_shift + config.score_per_doubling * doublings(boxes)
+        shift, per_doubling = config.shifts
+        odds = classes[..., 1] - classes[..., 0] + shift + per_doubling * doublings(boxes)
         scores, order = ops.top_k(ops.where(real, ops.sigmoid(odds), -1.0), proposals.shape[1])
         boxes = ops.take_along_axis(ops.where(real[..., None], boxes, 0.0), order[..., None], axis=1)
         boxes, scores = suppressed(boxes, scores, config.suppression_iou, config.detections)

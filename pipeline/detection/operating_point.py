@@ -28,16 +28,28 @@ _TRIED = tuple(float(score) for score in 1 / (1 + np.exp(-np.linspace(-3, 5, 33)
 
 
 def set_operating_point(folder: Path, validation: CocoFolder) -> float:
-    """Write the best shifts of the scores into the detector in `folder`, 0 where nothing is found; returns that of 16 px."""
-    model = weights.load(folder)
-    before = model.config.head
+    """Write the best shifts of the scores into the detector in `folder`, 0 where nothing is found; returns that of 16 px.
+
+    They are set for maps as they are, and for their mirror images too where the detector looks at those (`head.mirrored`);
+    what is returned is of the way that it looks.
+    """
+    config = weights.load_config(folder)
+    set_to: dict[str, float] = {}
+    for unmirrored in (True, False) if config.head.mirrored != "none" else (True,):
+        model = weights.load(folder, unmirrored=unmirrored)
+        set_to |= _set_on(model, validation, "" if unmirrored else "mirrored_")
+    model.config = weights.with_head(config, **set_to)
+    weights.save(model, folder)  # and without the optimizer's state, which a model in training saves too
+    return float(model.config.head.shifts[0])
+
+
+def _set_on(model: Any, validation: CocoFolder, prefix: str) -> dict[str, float]:
+    """The shifts of `head` with which CONFIDENCE is best for the model, 0 where nothing is found. prefix: of their keys."""
+    before = model.config.head.shifts
     found = _found(model, validation, min(_TRIED))
     best = best_shifts({"images": validation.images, "annotations": validation.annotations}, found)
-    shift, slope = (before.score_shift + best[0], before.score_per_doubling + best[1]) if best else (0.0, 0.0)
-    head = before.model_copy(update={"score_shift": round(shift, 3), "score_per_doubling": slope})
-    model.config = model.config.model_copy(update={"head": head})
-    weights.save(model, folder)  # and without the optimizer's state, which a model in training saves too
-    return shift
+    shift, slope = (before[0] + best[0], before[1] + best[1]) if best else (0.0, 0.0)
+    return {f"{prefix}score_shift": round(shift, 3), f"{prefix}score_per_doubling": slope}
 
 
 def best_shifts(truth: dict[str, Any], found: list[dict[str, Any]]) -> tuple[float, float] | None:

@@ -43,13 +43,15 @@ def detector_folder(model: str) -> Path:
     return configs_folder() / "detectors" / DEFAULT if model == DEFAULT else Path(model)
 
 
-def detector(model: str) -> Detector:
-    """By name: `baseline`, or as `detector_folder` has it."""
+def detector(model: str, *, unmirrored: bool = False) -> Detector:
+    """By name: `baseline`, or as `detector_folder` has it; unmirrored: it does not look at mirror images of maps."""
     if model == BASELINE:
+        if unmirrored:
+            raise InputError(f"goes with a network, not with '{BASELINE}'", where="--unmirrored", remedy="leave it out")
         return baseline.detect
     from pipeline.detection import inference, weights
 
-    network = weights.load(detector_folder(model))
+    network = weights.load(detector_folder(model), unmirrored=unmirrored)
     return lambda difference: inference.detect(network, difference, LOWEST_SCORE)
 
 
@@ -106,8 +108,12 @@ def detect(
     confidences: Sequence[float] = CONFIDENCES,
     pictures: bool = True,
     progress: Progress | None = None,
+    *,
+    unmirrored: bool = False,
 ) -> list[events.Event]:
     """Find the blocks in difference maps (GeoTIFF, m); returns the events at the lowest of the confidences.
+
+    unmirrored: a network looks at maps as they are alone, which takes less time where its `head.mirrored` says otherwise.
 
     Writes to `out`: detections.json, everything above a score of 0.05, for `scarpsim evaluate`; for each confidence c
     detections_c.json and events_c.csv; for the lowest also a raster of masks and an overlay picture per map. Nothing is written
@@ -115,7 +121,7 @@ def detect(
     """
     inputs, progress = find_inputs(places), progress or Progress()
     with progress.stage("network"):
-        find = detector(model)
+        find = detector(model, unmirrored=unmirrored)
     results: list[_Result] = []
     progress.plan({"detection": 1.0, "results": 0.2 if pictures else 0.01})
     with progress.stage("detection"):

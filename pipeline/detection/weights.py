@@ -49,6 +49,11 @@ def load_config(folder: Path) -> DetectorConfig:
     return parse(DetectorConfig, load_yaml(folder / CONFIG), where=str(folder / CONFIG))
 
 
+def with_head(config: DetectorConfig, **values: Any) -> DetectorConfig:
+    """A copy with other values in `head`."""
+    return config.model_copy(update={"head": config.head.model_copy(update=values)})
+
+
 def check_detector(folder: Path) -> None:
     """Raise InputError where a folder holds no detector, as far as it can be told without the network."""
     load_config(folder)
@@ -86,12 +91,18 @@ def _check_contents(path: Path) -> None:
         raise InputError(f"claims {claimed:,} bytes of weights in {size:,} bytes", where=str(path), remedy=_REMEDY)
 
 
-def load(folder: Path, *, image_px: int | None = None) -> Any:
-    """The detector in the folder, a MaskRCNN; raises InputError where the weights are absent, damaged or of another network."""
-    from pipeline.detection.model import MaskRCNN
+def load(folder: Path, *, image_px: int | None = None, unmirrored: bool = False) -> Any:
+    """The detector in the folder, a MaskRCNN; raises InputError where the weights are absent, damaged or of another network.
+
+    unmirrored: it looks at maps as they are alone, whatever `head.mirrored` says.
+    """
+    from pipeline.detection.mirrored import network
 
     check_detector(folder)
-    model = MaskRCNN(load_config(folder), image_px)
+    config = load_config(folder)
+    if unmirrored:
+        config = with_head(config, mirrored="none")
+    model = network(config, image_px)
     take_weights(model, folder)
     return model
 

@@ -208,7 +208,7 @@ def test_detections_of_a_run_and_of_its_map_are_the_same(run: Run, tmp_path: Pat
 def test_a_detector_says_what_it_waits_for(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = Progress()
 
-    def stop(*_: Any) -> None:
+    def stop(*_: Any, **__: Any) -> None:
         raise InputError(shown.current)
 
     monkeypatch.setattr(detecting, "python_progress", lambda show: shown)

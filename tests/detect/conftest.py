@@ -2,7 +2,19 @@
 
 import os
 
+import pytest
+
 from scene.backend import dr, mi
 
 dr.eval(dr.arange(mi.Float, 4) * 2)
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+@pytest.fixture
+def eager():
+    """Step by step: a graph takes 20 s to build, which a few steps are not worth."""
+    import tensorflow as tf
+
+    tf.config.run_functions_eagerly(True)
+    yield
+    tf.config.run_functions_eagerly(False)

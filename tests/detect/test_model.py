@@ -8,7 +8,6 @@ from pathlib import Path
 import keras
 import numpy as np
 import pytest
-import tensorflow as tf
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.change.annotate import run_length_encoding
@@ -85,14 +84,6 @@ def _compiled(seed: int = 1) -> MaskRCNN:
     model = MaskRCNN(SMALL, seed=seed)
     model.compile(optimizer=keras.optimizers.AdamW(2e-3, global_clipnorm=5.0), jit_compile=False)
     return model
-
-
-@pytest.fixture
-def eager():
-    """Step by step: a graph takes 20 s to build, which a few steps are not worth."""
-    tf.config.run_functions_eagerly(True)
-    yield
-    tf.config.run_functions_eagerly(False)
 
 
 @pytest.mark.slow
@@ -359,7 +350,7 @@ def test_a_window_keeps_what_it_shows_at_least_half_of(data_set):
         assert_allclose((rows.min(), columns.min(), rows.max() + 1, columns.max() + 1), (y0, x0, y1, x1), atol=1)
 
 
-def test_the_detector_that_comes_along_finds_clear_blocks(tmp_path):
+def test_the_detector_that_comes_along_finds_clear_blocks(tmp_path, eager):
     """Twelve niches of ten times the noise, 10 to 30 px: it was trained on other shapes and other noise, so ten are enough."""
     make_set(tmp_path / "set", 1, 9, side=512, blocks=12)
     events = run_detect("default", [tmp_path / "set"], tmp_path / "found", confidences=(CONFIDENCE,), pictures=False)

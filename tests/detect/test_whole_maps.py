@@ -176,7 +176,7 @@ def given_as(kind: str, folder: Path, maps: list[np.ndarray]) -> list[Path]:
 
 @pytest.mark.parametrize("kind", ["files", "run", "coco"])
 def test_every_kind_of_input_is_searched_to_its_last_corner(kind, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "detector", lambda model: lambda difference: inference.detect(MarkFinder(), difference, 0.05))
+    monkeypatch.setattr(run, "detector", lambda *_, **__: lambda difference: inference.detect(MarkFinder(), difference, 0.05))
     shapes = [(150, 210), (70, 300)]
     marks = [scattered(shape) for shape in shapes]
     inputs = given_as(kind, tmp_path / "maps", [map_of(*each) for each in zip(shapes, marks, strict=True)])
@@ -198,7 +198,7 @@ def test_every_kind_of_input_is_searched_to_its_last_corner(kind, tmp_path, monk
 
 
 @pytest.mark.slow
-def test_the_detector_that_comes_along_searches_the_whole_map(tmp_path):
+def test_the_detector_that_comes_along_searches_the_whole_map(tmp_path, eager):
     """40 niches of 30 px, twenty times as deep as the noise, on a grid over 600 x 1400 px, 2 x 5 tiles: clear enough for each
     to be found, by a mask of its own that covers most of it."""
     shape = (600, 1400)
