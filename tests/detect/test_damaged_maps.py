@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.testing import assert_array_equal
-from test_model import SIDE, SMALL, eager, make_set
+from test_model import SIDE, SMALL, make_set
 
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
