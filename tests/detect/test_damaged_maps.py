@@ -19,8 +19,6 @@ from pipeline.formats import geotiff
 from pipeline.formats.geotiff import read_geotiff, read_tiff
 from scene.errors import InputError
 
-__all__ = ["eager"]  # a fixture
-
 
 def _claiming(path: Path, height: int, width: int) -> Path:
     """A file of some hundred bytes that says that it holds an image of that size."""
