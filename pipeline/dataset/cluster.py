@@ -234,8 +234,12 @@ def _deaf_loop() -> Iterator[Any]:
 
 
 def _closed(each: LocalCluster | Client) -> None:
-    """Stop it. A worker that does not end in time, on a busy machine, ends with this process; its epochs are made."""
-    with suppress(TimeoutError):
+    """Stop it; the outcome is known, so that nothing that goes wrong here may take its place.
+
+    A worker that does not end in time, on a busy machine, ends with this process. A client that is just giving up a connection
+    fails with a RuntimeError of asyncio's timeouts, that of a scheduler that is gone with an OSError.
+    """
+    with suppress(OSError, RuntimeError):
         each.close(timeout=_CLOSE_S)
 
 

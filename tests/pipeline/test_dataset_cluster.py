@@ -182,6 +182,25 @@ def test_a_cluster_of_the_users_without_workers_ends_the_job(monkeypatch: pytest
         list(cluster.fill_on_cluster(ORDERS, 0, empty.scheduler_address))
 
 
+@pytest.mark.parametrize("error", [TimeoutError("late"), OSError("gone"), RuntimeError("Cannot change state of expiring Timeout")])
+def test_an_error_while_closing_does_not_hide_the_outcome(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    """The last is what a client of a busy machine said that was about to give up its connection to a dead scheduler."""
+    close = distributed.Client.close
+
+    def failing(client: distributed.Client, timeout: float) -> None:
+        close(client, timeout=timeout)
+        raise error
+
+    monkeypatch.setattr(distributed.Client, "close", failing)
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
+    monkeypatch.setattr(cluster, "_EMPTY_S", 0.2)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty,
+        pytest.raises(OutsideError, match="the scheduler has no workers"),
+    ):
+        list(cluster.fill_on_cluster(ORDERS, 0, empty.scheduler_address))
+
+
 def test_a_scheduler_that_dies_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
     monkeypatch.setattr(cluster, "_LOST_S", 2.0)
