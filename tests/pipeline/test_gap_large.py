@@ -43,7 +43,7 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
     """Some milliradians, which move the registered pair by metres: slopes give half the angle and make up for the rest with
     other effects."""
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
-    make(Case(0, (3, 1), "one", "stereo", (kind,), 8_000, 8_000), tmp_path / "case", tmp_path / "truth.json")
+    make(Case(0, (3, 1), "one", "stereo", (kind,), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
     found = diagnose(read_measurement(tmp_path / "case"))
     (effect,) = found.effects
