@@ -182,7 +182,7 @@ def test_a_cluster_of_the_users_without_workers_ends_the_job(monkeypatch: pytest
         list(cluster.fill_on_cluster(ORDERS, 0, empty.scheduler_address))
 
 
-@pytest.mark.parametrize("error", [TimeoutError("late"), OSError("gone"), RuntimeError("Cannot change state of expiring Timeout")])
+@pytest.mark.parametrize("error", [TimeoutError("late"), OSError("gone"), RuntimeError("Cannot change state of Timeout")])
 def test_an_error_while_closing_does_not_hide_the_outcome(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     """The last is what a client of a busy machine said that was about to give up its connection to a dead scheduler."""
     close = distributed.Client.close

@@ -28,6 +28,7 @@ from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
 from scene.keyed_random import KeyedRandom
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.edge_fattening import EdgeFattening
@@ -222,6 +223,19 @@ def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int
     # the generator's beam has other sub-rays: 15 %
     assert found.effect.divergence_rad == pytest.approx(truth["divergence_rad"], rel=0.15)
     assert found.effect.mode == truth["mode"]
+
+
+def test_modes_that_share_their_sub_rays_record_what_each_would_alone(tmp_path: Path) -> None:
+    there, residuals, _ = made(tmp_path, "tls", ("beam_divergence",), 2)
+    random, modes, plain = KeyedRandom(0), ("strongest", "mean", "first"), mean_model(there.model)
+    beams = {
+        mode: plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=2e-3, mode=mode))})
+        for mode in modes
+    }
+    together = simulate_modes(there, beams["mean"], modes, residuals.geometry, random)
+    for mode in modes:
+        np.testing.assert_array_equal(together[mode], simulate_ranges(there, beams[mode], residuals.geometry, random))
+    assert np.nanmax(np.abs(together["first"] - together["mean"])) > 1e-3
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.formats.measurement import TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
 from pipeline.gap.residuals.residuals import BoolArray
-from pipeline.gap.residuals.scan_simulation import mean_model, simulate_ranges
+from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -24,23 +26,26 @@ _MOST_POINTS = 30_000
 _PROFILE = 0.12
 """Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
 
+_RANDOM = KeyedRandom(0, ("gap", "mean"))
+
 
 def find_footprint(
     measurement: TlsMeasurement, residuals: TlsResiduals, rough: FloatArray, scale: float, held_out: BoolArray
 ) -> list[ShapeFound]:
     """The divergence that points at edges ask for, if any. rough: (n,) registered residuals, m; scale: sigmas they spread;
     held_out: (n,) points that have no say."""
-    sigma = scale * residuals.sigma
+    sigma, footprint = scale * residuals.sigma, _Footprint(measurement, residuals)
     thin = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
     some = np.flatnonzero(~held_out)[thin]
-    wide = _moved(measurement, residuals, some, "mean", _DIVERGENCES_RAD[-1])
+    wide = footprint.moved(some, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
     some = some[np.abs(wide) > sigma[some]]
     if len(some) < decided().shapes.footprint_fewest:
         return []
     blocks = WallBlocks(WallBlocks.over(residuals.at).number[some])
+    moved_by = cache(partial(footprint.moved, some, _MODES))
 
     def gains(mode: Mode, divergence_rad: float) -> FloatArray:
-        moved = _moved(measurement, residuals, some, mode, divergence_rad)
+        moved = moved_by(divergence_rad)[mode]
         none = np.zeros_like(moved)
         more = log_density(rough[some], moved, sigma[some]) - log_density(rough[some], none, sigma[some])
         return np.where(moved == 0, 0.0, more)
@@ -52,20 +57,25 @@ def find_footprint(
         return []
     divergence = refined(partial(gains, mode), [tops[mode]], _FINER)
     std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE * divergence))}
-    touched = np.abs(_moved(measurement, residuals, np.arange(len(residuals)), mode, 1.5 * divergence)) > sigma
+    touched = np.abs(footprint.moved(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
     return [ShapeFound(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
 
 
-def _moved(
-    measurement: TlsMeasurement,
-    residuals: TlsResiduals,
-    rows: np.ndarray[tuple[int], np.dtype[np.int64]],
-    mode: Mode,
-    angle: float,
-) -> FloatArray:
-    """(m,) range of a beam of divergence `angle` less that of its axis, m; 0 where either does not come back."""
-    plain = mean_model(measurement.model)
-    beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle, mode=mode))})
-    geometry, random = residuals.geometry.part(rows), KeyedRandom(0, ("gap", "mean"))
-    whole, axis = (simulate_ranges(measurement, each, geometry, random) for each in (beam, plain))
-    return np.asarray(np.nan_to_num(whole - axis))
+@dataclass(frozen=True)
+class _Footprint:
+    """What a beam's divergence does to the ranges of a scan."""
+
+    measurement: TlsMeasurement
+    residuals: TlsResiduals
+
+    @cached_property
+    def _axis(self) -> FloatArray:
+        """(n,) ranges along the beams' axes, m."""
+        return simulate_ranges(self.measurement, mean_model(self.measurement.model), self.residuals.geometry, _RANDOM)
+
+    def moved(self, rows: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
+        """(m,) range of a beam of divergence `angle` less that of its axis, m, for each mode; 0 where either does not return."""
+        plain = mean_model(self.measurement.model)
+        beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle))})
+        whole = simulate_modes(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)
+        return {mode: np.asarray(np.nan_to_num(whole[mode] - self._axis[rows])) for mode in modes}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from scene.upload import on_device
-from sensors.beam import Echo
+from sensors.beam import Echo, Mode, SubRays
 from sensors.effects.base import ShowsIn
 from sensors.model import TlsModel, TlsNoise
 from sensors.pulses import PulseGeometry, Pulses, direction
@@ -56,8 +57,29 @@ class DirectedScanner(LaserScanner):
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
         """(n,) recorded ranges, m; NaN without a return."""
         pulses, beam = self.emitted(self.emit(), random)
-        straight = replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith) if self._planes is not None else pulses
-        pulses = self.measured(pulses, self.echo(scene, straight, beam, beam.received), random)
+        return self._recorded_ranges(pulses, self.echo(scene, self._straight(pulses), beam, beam.received), random)
+
+    def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
+        """(n,) ranges as recorded by the beam in each of the modes, m; its sub-rays are traced once."""
+        pulses, beam = self.emitted(self.emit(), random)
+        parts: dict[Mode, list[Echo]] = {mode: [] for mode in modes}
+
+        def merge(rays: SubRays) -> Echo:
+            for mode in modes:
+                echo = replace(beam, mode=mode).received(rays)
+                dr.eval(echo)
+                parts[mode].append(echo)
+            return echo
+
+        self.echo(scene, self._straight(pulses), beam, merge)
+        return {mode: self._recorded_ranges(pulses, Echo.joined(parts[mode]), random) for mode in modes}
+
+    def _straight(self, pulses: Pulses) -> Pulses:
+        """The pulses as they are traced: towards where they are recorded, if what turns them goes along planes."""
+        return pulses if self._planes is None else replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith)
+
+    def _recorded_ranges(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> FloatArray:
+        pulses = self.measured(pulses, echo, random)
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
@@ -96,6 +118,13 @@ def _scanner(
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry, random: KeyedRandom) -> FloatArray:
     """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
     return _scanner(measurement, model, geometry, geometry).ranges(measurement.scene, random)
+
+
+def simulate_modes(
+    measurement: TlsMeasurement, model: TlsModel, modes: Sequence[Mode], geometry: RayGeometry, random: KeyedRandom
+) -> dict[Mode, FloatArray]:
+    """The same for a model whose beam has a footprint, for each of the modes in which its returns may be recorded."""
+    return _scanner(measurement, model, geometry, geometry).ranges_by_mode(measurement.scene, random, modes)
 
 
 def mean_model(model: TlsModel) -> TlsModel:
