@@ -81,6 +81,21 @@ def test_a_shrub_before_the_wall_is_none() -> None:
     assert found(np.where(np.hypot(x - 8, y - 10) < 1.5, 1.0, 0.01)) is None
 
 
+def test_lines_that_the_scanner_dropped_are_none() -> None:
+    """Nine gaps of some lines and a fifth of their height, as often by chance in one sector; of 20 draws one may be taken for a
+    sector's losses, two with a chance of 2 % where that of each is 1 %."""
+    _, _, covariates = pulses()
+    azimuth, zenith = covariates["azimuth"], covariates["zenith"]
+    wrong = 0
+    for seed in range(200, 220):
+        rng = np.random.default_rng(seed)
+        chance = np.full(COUNT, 0.01)
+        for line, first in zip(rng.choice(azimuth, 9), rng.choice(zenith, 9), strict=True):
+            chance[(np.abs(azimuth - line) < 0.008) & (np.abs(zenith - first) < 0.05)] = 1.0
+        wrong += found(chance, seed=seed) is not None
+    assert wrong <= 1
+
+
 def test_drops_scatter_and_what_stands_before_the_wall_does_not() -> None:
     x, y, _ = pulses()
     at = np.stack([x, y], axis=1)

@@ -13,7 +13,8 @@ from scipy.interpolate import RectBivariateSpline
 
 from benchmarks.gap_challenge import stereo_effects
 from benchmarks.gap_challenge.cases import Case, make
-from pipeline.formats.measurement import Measurement, read_measurement
+from benchmarks.gap_judge.cases import build, schedule
+from pipeline.formats.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import naming as steps
 from pipeline.gap.naming.entries import with_effects
@@ -243,6 +244,20 @@ def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
     there, residuals, _ = made(tmp_path, "tls", (), seed)
     rough, _, scale = registered(residuals)
     assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
+
+
+def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
+    """A pencil whose directions scatter by 55 microradians, on ledges of strata: at edges it records on average what a beam of
+    four times that does (a quiet case of the second judge, who cast no footprint)."""
+    build(schedule(78, 40)[26], 78, tmp_path / "case")
+    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    assert isinstance(there, TlsMeasurement)
+    rough, _, scale = registered(residuals)
+    assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
+    unaware = there.changed(model=there.model.without_noise())
+    (feigned,) = find_footprint(unaware, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
+    assert isinstance(feigned.effect, BeamDivergence)
+    assert feigned.effect.divergence_rad == pytest.approx(4 * there.model.noise.angle_sigma_rad, rel=0.15)
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("parallax_noise", 2), ("regularization_noise", 9)])

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, logit, ndtr
 
@@ -19,7 +20,8 @@ from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.precipitation import Precipitation
 
 LOSSES = tuple(effect.tag() for effect in catalogue("tls") if effect.shows_in == ShowsIn.RETURNS)
-_PULSES_PER_PATCH = 60.0
+_PULSES_PER_PATCH = (60.0, 240.0, 960.0)
+"""From some that a bush hides to what a scanner drops of several lines."""
 _STRIPS = 8
 """Across a sector, that must agree on its losses."""
 _DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
@@ -115,28 +117,38 @@ def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, inte
 def isolated(at: FloatArray, early: BoolArray) -> int:
     """How many returns come early from drops, which fall anywhere; what stands before the wall, or an edge of it, returns many
     pulses side by side, and then it is none."""
-    patch, count = patches(at, _PULSES_PER_PATCH), int(early.sum())
+    patch, count = patches(at, _PULSES_PER_PATCH[0]), int(early.sum())
     number = int(patch.max()) + 1
     anywhere = number * (1 - (1 - 1 / number) ** count)
     return count if len(np.unique(patch[early])) >= decided().losses.scattered * anywhere else 0
 
 
 def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
-    """Variance of the patches' losses over that of independent ones, at least 1."""
-    patch = patches(at, _PULSES_PER_PATCH)
-    left = np.bincount(patch, lost - chance)
-    expected = np.bincount(patch, chance * (1 - chance))
-    return float(max(np.sum(left**2) / np.sum(expected), 1.0))
+    """Variance of the patches' losses over that of independent ones, at least 1; of patches as large as make most of it."""
+
+    def ratio(pulses: float) -> float:
+        patch = patches(at, pulses)
+        left = np.bincount(patch, lost - chance)
+        return float(np.sum(left**2) / np.sum(np.bincount(patch, chance * (1 - chance))))
+
+    return max(1.0, *(ratio(pulses) for pulses in _PULSES_PER_PATCH))
 
 
 def _strips_agree(missing: Missing, known: MissingFound, free: MissingFound, fit: BoolArray) -> bool:
-    """Whether losses by one angle are common to all strips of the other: a shrub before the wall takes the pulses of a few."""
+    """Whether losses by one angle are common to all strips of the other: a shrub before the wall takes the pulses of a few, as do
+    lines that the scanner dropped. Each strip is asked what it gains by the losses of the others."""
     lost, across = missing.lost[fit], missing.covariates[_DIRECTIONS[free.covariate]][fit]
-    p, q = (np.clip(each.chance[fit], 1e-9, 1 - 1e-9) for each in (known, free))
-    gain = np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p))
-    strip = np.searchsorted(np.quantile(across, np.linspace(0, 1, _STRIPS + 1)[1:-1]), across)
-    sums = np.bincount(strip, gain, _STRIPS)
+    strip, group = _equal_parts(across, _STRIPS), _equal_parts(missing.covariates[free.covariate], _BINS)[fit]
+    sent, gone = (np.bincount(strip * _BINS + group, each, _STRIPS * _BINS).reshape(_STRIPS, _BINS) for each in (None, lost))
+    others = (gone.sum(axis=0) - gone + 0.5) / (sent.sum(axis=0) - sent + 1.0)
+    p, q = np.clip(known.chance[fit], 1e-9, 1 - 1e-9), others[strip, group]
+    sums = np.bincount(strip, np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p)), _STRIPS)
     return float(sums.sum()) > decided().losses.agreement * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
+
+
+def _equal_parts(values: FloatArray, count: int) -> NDArray[np.int64]:
+    """(m,) which of `count` parts of as many values each a value is in."""
+    return np.asarray(np.searchsorted(np.quantile(values, np.linspace(0, 1, count + 1)[1:-1]), values))
 
 
 def _is_cut(intensity: FloatArray) -> bool:
@@ -202,8 +214,7 @@ def _free(losses: Losses, covariates: dict[str, FloatArray]) -> MissingFound:
     found, lost, fit = [], losses.lost, losses.fit
     rate = max(-float(np.log1p(-min(float(lost.mean()), 0.999))) / (2 * float(np.mean(covariates["range"]))), 1e-6)
     for name in _DIRECTIONS:
-        values = covariates[name]
-        group = np.searchsorted(np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1]), values)
+        group = _equal_parts(covariates[name], _BINS)
         count = np.maximum(np.bincount(group[fit], minlength=_BINS), 1)
         chance = (np.bincount(group[fit], lost[fit], _BINS) / count)[group]
         gain = _likelihood(lost[fit], chance[fit]) - losses.plain

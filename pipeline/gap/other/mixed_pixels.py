@@ -17,7 +17,9 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.beam import Mode
+from sensors.effects.angle_noise import AngleNoise
 from sensors.effects.beam_divergence import BeamDivergence
+from sensors.model import TlsModel
 
 _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
@@ -32,8 +34,10 @@ _RANDOM = KeyedRandom(0, ("gap", "mean"))
 def find_footprint(
     measurement: TlsMeasurement, residuals: TlsResiduals, rough: FloatArray, scale: float, held_out: BoolArray
 ) -> list[ShapeFound]:
-    """The divergence that points at edges ask for, if any. rough: (n,) registered residuals, m; scale: sigmas they spread;
-    held_out: (n,) points that have no say."""
+    """The divergence that points at edges ask for beyond what the noise of angles does there, if any.
+
+    rough: (n,) registered residuals, m; scale: sigmas they spread; held_out: (n,) points that have no say.
+    """
     sigma, footprint = scale * residuals.sigma, _Footprint(measurement, residuals)
     thin = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
     some = np.flatnonzero(~held_out)[thin]
@@ -42,13 +46,12 @@ def find_footprint(
     if len(some) < decided().shapes.footprint_fewest:
         return []
     blocks = WallBlocks(WallBlocks.over(residuals.at).number[some])
+    by_noise = footprint.moved(some, ("mean",), _width_of_noise(measurement.model))["mean"]
     moved_by = cache(partial(footprint.moved, some, _MODES))
 
     def gains(mode: Mode, divergence_rad: float) -> FloatArray:
         moved = moved_by(divergence_rad)[mode]
-        none = np.zeros_like(moved)
-        more = log_density(rough[some], moved, sigma[some]) - log_density(rough[some], none, sigma[some])
-        return np.where(moved == 0, 0.0, more)
+        return log_density(rough[some], moved, sigma[some]) - log_density(rough[some], by_noise, sigma[some])
 
     tops = {mode: refined(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(tops, key=lambda each: float(gains(each, tops[each]).sum()))
@@ -59,6 +62,17 @@ def find_footprint(
     std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE * divergence))}
     touched = np.abs(footprint.moved(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
     return [ShapeFound(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
+
+
+def _width_of_noise(model: TlsModel) -> float:
+    """Divergence of a beam whose energy lies about its axis as a thin one's directions do that have the model's noise, rad.
+
+    On average such a beam records at edges what the wide one does that records the mean of its returns. Energy that falls as
+    exp(-8 r^2 / D^2) spreads by D / 4 in each direction.
+    """
+    noises = [each for each in model.chain() if isinstance(each, AngleNoise)]
+    both = sum(each.azimuth_sigma_rad**2 + each.zenith_sigma_rad**2 for each in noises)
+    return 4 * float(np.sqrt(both / 2))
 
 
 @dataclass(frozen=True)
