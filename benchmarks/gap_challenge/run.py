@@ -13,6 +13,7 @@ import contextlib
 import io
 import json
 import multiprocessing
+import os
 import shutil
 import sys
 import time
@@ -95,12 +96,18 @@ def _make(job: tuple[Case, Path, Path]) -> None:
 
 
 class _Worker:
-    """A process that diagnoses folder after folder, so that imports are paid once."""
+    """A process that diagnoses folder after folder, so that imports are paid once.
 
-    def __init__(self, hidden: Path) -> None:
+    cores: its own, since threads of several that wait for each other on shared ones cost several times the time.
+    """
+
+    def __init__(self, hidden: Path, cores: set[int]) -> None:
         self.here, there = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(target=_serve, args=(there, str(hidden)), daemon=True)
+        every = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, cores)  # a child begins with what its parent has
         self._process.start()
+        os.sched_setaffinity(0, every)
         self.case: Case | None = None
         self._before_s = 0.0
 
@@ -126,7 +133,9 @@ class _Worker:
 
 def _diagnose_all(cases: list[Case], out: Path, jobs: int, limit_s: float, keep: bool) -> None:
     todo, done = list(reversed(cases)), 0
-    workers = [_Worker(out / "truth") for _ in range(min(jobs, len(todo)))]
+    cores, count = sorted(os.sched_getaffinity(0)), min(jobs, len(todo))
+    shares = [set(cores[number % len(cores) :: count]) for number in range(count)]
+    workers = [_Worker(out / "truth", share) for share in shares]
     while any(worker.case for worker in workers) or todo:
         for number, worker in enumerate(workers):
             reply: dict[str, Any] | None = None
@@ -141,7 +150,7 @@ def _diagnose_all(cases: list[Case], out: Path, jobs: int, limit_s: float, keep:
                 worker.case = None
                 if "error" in reply:
                     worker.stop()
-                    workers[number] = worker = _Worker(out / "truth")
+                    workers[number] = worker = _Worker(out / "truth", shares[number])
             if worker.case is None and todo:
                 case = todo.pop()
                 worker.give(case, _folder(out, case), out / "work" / case.name)
