@@ -46,12 +46,14 @@ def find_footprint(
     if len(some) < decided().shapes.footprint_fewest:
         return []
     blocks = WallBlocks(WallBlocks.over(residuals.at).number[some])
-    by_noise = footprint.moved(some, ("mean",), _width_of_noise(measurement.model))["mean"]
+    jittered = footprint.moved(some, ("mean",), _width_of_noise(measurement.model))["mean"]
+    without = [log_density(rough[some], moved, sigma[some]) for moved in (np.zeros_like(jittered), jittered)]
+    null = np.logaddexp(*without) - np.log(2)  # at a step the one, on a slope that bends the other
     moved_by = cache(partial(footprint.moved, some, _MODES))
 
     def gains(mode: Mode, divergence_rad: float) -> FloatArray:
         moved = moved_by(divergence_rad)[mode]
-        return log_density(rough[some], moved, sigma[some]) - log_density(rough[some], by_noise, sigma[some])
+        return np.asarray(log_density(rough[some], moved, sigma[some]) - null)
 
     tops = {mode: refined(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(tops, key=lambda each: float(gains(each, tops[each]).sum()))
@@ -67,7 +69,7 @@ def find_footprint(
 def _width_of_noise(model: TlsModel) -> float:
     """Divergence of a beam whose energy lies about its axis as a thin one's directions do that have the model's noise, rad.
 
-    On average such a beam records at edges what the wide one does that records the mean of its returns. Energy that falls as
+    Such a thin beam records on average what the wide one does that records the mean of its returns. Energy that falls as
     exp(-8 r^2 / D^2) spreads by D / 4 in each direction.
     """
     noises = [each for each in model.chain() if isinstance(each, AngleNoise)]
