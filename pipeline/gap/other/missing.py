@@ -20,8 +20,7 @@ from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.precipitation import Precipitation
 
 LOSSES = tuple(effect.tag() for effect in catalogue("tls") if effect.shows_in == ShowsIn.RETURNS)
-_PULSES_PER_PATCH = (60.0, 240.0, 960.0)
-"""From some that a bush hides to what a scanner drops of several lines."""
+_PULSES_PER_PATCH = 60.0
 _STRIPS = 8
 """Across a sector, that must agree on its losses."""
 _DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
@@ -117,21 +116,18 @@ def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, inte
 def isolated(at: FloatArray, early: BoolArray) -> int:
     """How many returns come early from drops, which fall anywhere; what stands before the wall, or an edge of it, returns many
     pulses side by side, and then it is none."""
-    patch, count = patches(at, _PULSES_PER_PATCH[0]), int(early.sum())
+    patch, count = patches(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1
     anywhere = number * (1 - (1 - 1 / number) ** count)
     return count if len(np.unique(patch[early])) >= decided().losses.scattered * anywhere else 0
 
 
 def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
-    """Variance of the patches' losses over that of independent ones, at least 1; of patches as large as make most of it."""
-
-    def ratio(pulses: float) -> float:
-        patch = patches(at, pulses)
-        left = np.bincount(patch, lost - chance)
-        return float(np.sum(left**2) / np.sum(np.bincount(patch, chance * (1 - chance))))
-
-    return max(1.0, *(ratio(pulses) for pulses in _PULSES_PER_PATCH))
+    """Variance of the patches' losses over that of independent ones, at least 1."""
+    patch = patches(at, _PULSES_PER_PATCH)
+    left = np.bincount(patch, lost - chance)
+    expected = np.bincount(patch, chance * (1 - chance))
+    return float(max(np.sum(left**2) / np.sum(expected), 1.0))
 
 
 def _strips_agree(missing: Missing, known: MissingFound, free: MissingFound, fit: BoolArray) -> bool:
