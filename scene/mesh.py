@@ -29,6 +29,16 @@ def signed_volumes(corners: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
 
 
+def barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:
+    """(n, 3) weights of the corners at points (n, 3) in triangles (n, 3 corners, 3)."""
+    one, other, within = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], point - corners[:, 0]
+    a, b, c = (np.einsum("ni,ni->n", *pair) for pair in ((one, one), (one, other), (other, other)))
+    d, e = (np.einsum("ni,ni->n", within, side) for side in (one, other))
+    area = np.maximum(a * c - b * b, 1e-300)
+    second, third = (c * d - b * e) / area, (a * e - b * d) / area
+    return np.stack([1 - second - third, second, third], axis=1)
+
+
 def renumbered(faces: NDArray[np.integer]) -> tuple[NDArray[np.int64], IntArray]:
     """(k,) the vertices that faces (m, 3) use, in rising order, and the faces by their places among these."""
     if not len(faces):

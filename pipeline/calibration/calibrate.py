@@ -145,7 +145,8 @@ def calibrate_material(
             for number, name in enumerate(material.names)
         )
     with progress.stage("prepare"):
-        simulator = Reobserver(config, material.site, windows, of_points=material.of_points)
+        error = material.reference_error
+        simulator = Reobserver(config, material.site, windows, of_points=material.of_points, reference_error=error)
         signature = Signature(windows, simulator.silent_heights, _sight(material.site.sensor, windows))
     fitted = parameters(simulator.sensor.model, settings.fit)
     observed = signature.of(measured)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.calibration.reference_error import ReferenceError
 from pipeline.calibration.windows import Windows, choose_windows, unchanged
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.geotiff import read_geotiff
@@ -30,6 +31,7 @@ from sensors.stereo import StereoPair
 from sensors.tls import LaserScanner, Pattern
 
 BoolArray = NDArray[np.bool_]
+_NEIGHBOURS, _SAMPLE = 64, 5000
 _REACH_PX = 2
 """Pixels without a point of their own lie at most so far from one that has, where a cloud covers the ground."""
 
@@ -37,7 +39,8 @@ _REACH_PX = 2
 @dataclass(frozen=True)
 class CalibrationInputs:
     """names: of the e maps; grid, maps: (e, h, w), m; stable: (h, w); drawn: whether the user drew it; site: what measured;
-    of_points: the maps are mean differences of points to the known surface, not of two surfaces."""
+    of_points: the maps are mean differences of points to the known surface, not of two surfaces; reference_error: of that
+    surface, where it is made of points."""
 
     names: tuple[str, ...]
     grid: Grid
@@ -46,6 +49,7 @@ class CalibrationInputs:
     drawn: bool
     site: SensorSite
     of_points: bool
+    reference_error: ReferenceError | None = None
 
     def windows(self, config: SimulationConfig) -> Windows:
         """The windows in which maps are compared."""
@@ -89,11 +93,15 @@ def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: Senso
     measured, names = _maps(paths, config, random)
     _check_noise(measured.maps, names)
     of_points = bool(measured.points)
-    site = _measured_site(read_measurement(paths[0]), config) if of_points else prepare_site(config, sensor, random)
+    if of_points:
+        measurement = read_measurement(paths[0])
+        site, error = _measured_site(measurement, config), ReferenceError.of(measurement)
+    else:
+        site, error = prepare_site(config, sensor, random), None
     areas = config.calibration.stable_areas
     drawn = area_mask(areas, measured.grid) if areas else measured.stable
     stable = _covered(measured.maps, of_points) & (unchanged(list(measured.maps)) if drawn is None else drawn)
-    return CalibrationInputs(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points)
+    return CalibrationInputs(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points, error)
 
 
 def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) -> tuple[MeasuredMaps, tuple[str, ...]]:
@@ -147,11 +155,26 @@ def _measured_site(measurement: Measurement, config: SimulationConfig) -> Sensor
 
 
 def _scanner(measurement: TlsMeasurement, config: SimulationConfig) -> LaserScanner:
-    """With the measurement's pattern; where that is not known, over all of the reference as the config says."""
+    """With the measurement's pattern; where that is not known, over all of the reference as densely as the points lie, since the
+    mean of a pixel has the less noise the more points there are."""
     (position, rotation), model, frame = measurement.station, measurement.model, measurement.frame
     if measurement.pattern is None:
         world = frame.to_world(position), frame.rotation.T @ rotation
-        return LaserScanner.aimed(world, frame, measurement.reference.vertices, config.scanner, model)
+        step = _angular_spacing(measurement)
+        dense = config.scanner.model_copy(update={"azimuth_step_rad": step, "zenith_step_rad": step})
+        return LaserScanner.aimed(world, frame, measurement.reference.vertices, dense, model)
     azimuth, zenith = measurement.pattern.azimuth_rad, measurement.pattern.zenith_rad
     steps = config.scanner.model_copy(update={"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})  # of any size
     return LaserScanner(position, rotation, Pattern.over(azimuth[:2], zenith[:2], steps), steps, model)
+
+
+def _angular_spacing(measurement: TlsMeasurement) -> float:
+    """Side of the square, seen from the scanner, that a point of the first epoch has to itself, rad: median over a sample, of the
+    circle around each that holds 64."""
+    from scipy.spatial import cKDTree
+
+    ray = measurement.cloud.points[measurement.epochs == 0] - measurement.viewpoint
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    count = min(_NEIGHBOURS, len(ray) - 1)
+    reach = cKDTree(ray).query(ray[:: max(len(ray) // _SAMPLE, 1)], [count + 1])[0]
+    return float(np.median(reach) * np.sqrt(np.pi / (count + 0.5)))

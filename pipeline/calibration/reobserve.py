@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.calibration.parameters import Model
+from pipeline.calibration.reference_error import ReferenceError
 from pipeline.calibration.windows import Windows
 from pipeline.config.simulation import SimulationConfig
 from pipeline.noise.measured import point_differences
@@ -56,13 +57,23 @@ class _Patch:
 class Reobserver:
     """Simulates difference maps of noise alone in windows.
 
-    config, site: as a simulation takes them; windows: on the grid of the measured maps. Raises InputError for what cannot be
-    simulated cell by cell.
+    config, site: as a simulation takes them; windows: on the grid of the measured maps; of_points: these are of points;
+    reference_error: of the surface that the points are compared with. Raises InputError for what cannot be simulated cell by
+    cell.
     """
 
-    def __init__(self, config: SimulationConfig, site: SensorSite, windows: Windows, *, of_points: bool = False) -> None:
+    def __init__(
+        self,
+        config: SimulationConfig,
+        site: SensorSite,
+        windows: Windows,
+        *,
+        of_points: bool = False,
+        reference_error: ReferenceError | None = None,
+    ) -> None:
         self.sensor = _checked(config, site)
         self.config, self.site, self.windows, self.of_points = config, site, windows, of_points
+        self.reference_error = reference_error
         self.caster = RayCaster(site.mesh)
         self.silent = _silent(self.sensor.model)
         self.observations = 0
@@ -81,17 +92,19 @@ class Reobserver:
 
     def maps(self, model: Model, epochs: int, random: KeyedRandom) -> FloatArray:
         """(epochs, k, n, n) differences, m, in the windows; NaN where not stable: of a noisy reference and later epochs, or of
-        points, to the wall as it is."""
+        points, to the wall as it is known: with the same error in all epochs."""
         sources = [random.child("epoch", number) for number in range(1, epochs + 1)]
         if self.of_points:
-            return np.stack([self._of_points(model, source) for source in sources])
+            return np.stack([self._of_points(model, source, random.child("reference")) for source in sources])
         reference = self.heights(model, random.child("epoch", 0))
         later = [self.heights(model, source) for source in sources]
         return np.where(self.windows.stable, reference - np.stack(later), np.nan)
 
-    def _of_points(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """(k, n, n) mean differences of the points of each pixel to the wall as it is, m."""
+    def _of_points(self, model: Model, random: KeyedRandom, reference: KeyedRandom) -> FloatArray:
+        """(k, n, n) mean differences of the points of each pixel to the wall as it is known, m."""
         points = self._registered(model, random)[: self._lattice_start]
+        if self.reference_error is not None:
+            points = self.reference_error.moved(points, self.caster, reference)
         values = point_differences(self.caster, points[~np.isnan(points[:, 0])], self.windows.grid)
         return self.windows.cut(values)
 

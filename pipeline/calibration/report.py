@@ -52,8 +52,14 @@ def summary(result: CalibrationResult) -> str:
 
 def warnings(result: CalibrationResult) -> list[str]:
     """What a reader has to know before using the values."""
-    found = result.found
-    texts = [
+    found, error = result.found, result.material.reference_error
+    texts = []
+    if error is not None:
+        texts.append(
+            f"The reference is made of points that are off by {1e3 * error.sigma_m:.3g} mm each: that is simulated beside the "
+            "instrument's noise, and a wrong value goes into the range noise."
+        )
+    texts += [
         f"{first} and {second} cannot be told apart by these maps (correlation {value:+.2f}): only their combination is known."
         for first, second, value in result.inseparable()
     ]

@@ -97,6 +97,7 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
     expected = found.surface.mean(found.x)
     return {
         "sensor": result.sensor,
+        "reference_error_m": 0.0 if result.material.reference_error is None else result.material.reference_error.sigma_m,
         "parameters": {name: {"value": value, "low": low, "high": high} for name, value, low, high in values},
         "confidence": result.confidence,
         "correlation": {"names": names, "matrix": found.correlation},

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.formats.measurement import TlsMeasurement
 from pipeline.gap.residuals.residuals import Rows, part_of, plane_slopes
-from scene.mesh import FloatArray, IntArray
+from scene.mesh import FloatArray, IntArray, barycentric
 from scene.point_planes import PointPlanes
 from sensors.pulses import PulseGeometry
 
@@ -84,7 +84,7 @@ def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
     if measurement.planes is None and not measurement.reference_error_m:
         return found
     corner = scene.mesh.faces[face]
-    weight = _barycentric(position + distance[:, None] * ray, scene.mesh.vertices[corner])
+    weight = barycentric(position + distance[:, None] * ray, scene.mesh.vertices[corner])
     found = replace(found, corner=corner, weight=weight)
     if measurement.planes is None:
         return found
@@ -132,13 +132,3 @@ def _height(normal: FloatArray, triangles: _Triangles) -> FloatArray:
         arc = np.einsum("ni,ni->n", normal[:, j] - normal[:, i], at[:, j] - at[:, i]) / 8
         height += 4 * weight[:, i] * weight[:, j] * arc
     return height
-
-
-def _barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:
-    """(n, 3) of points (n, 3) in triangles (n, 3 corners, 3)."""
-    one, other, within = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], point - corners[:, 0]
-    a, b, c = (np.einsum("ni,ni->n", *pair) for pair in ((one, one), (one, other), (other, other)))
-    d, e = (np.einsum("ni,ni->n", within, side) for side in (one, other))
-    area = np.maximum(a * c - b * b, 1e-300)
-    second, third = (c * d - b * e) / area, (a * e - b * d) / area
-    return np.stack([1 - second - third, second, third], axis=1)
