@@ -58,7 +58,7 @@ def _on_own_raster(
     Outlines grow by whole cells, from steps between cells: on finer ones they grow otherwise.
     """
     shapes = [effect for effect in pair.model.effects if isinstance(effect, RasterEffect) and effect.stage == Stage.MATCH]
-    raster = DisparityRaster.of(measurement, geometry) if shapes else None
+    raster = DisparityRaster.of(measurement.changed(model=pair.model), geometry) if shapes else None
     if raster is None or abs(raster.step - step) < _SAME_STEP:
         return pair, np.zeros(len(geometry))
     others = tuple(effect for effect in pair.model.effects if effect not in shapes)
