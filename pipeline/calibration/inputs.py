@@ -32,6 +32,7 @@ from sensors.tls import LaserScanner, Pattern
 
 BoolArray = NDArray[np.bool_]
 _NEIGHBOURS, _SAMPLE = 64, 5000
+"""In the circle around a point whose size tells how densely points lie, enough for those on its rim not to matter; circles."""
 _REACH_PX = 2
 """Pixels without a point of their own lie at most so far from one that has, where a cloud covers the ground."""
 
@@ -170,11 +171,16 @@ def _scanner(measurement: TlsMeasurement, config: SimulationConfig) -> LaserScan
 
 def _angular_spacing(measurement: TlsMeasurement) -> float:
     """Side of the square, seen from the scanner, that a point of the first epoch has to itself, rad: median over a sample, of the
-    circle around each that holds 64."""
+    circle around each that holds 64. Raises InputError where so many lie in one direction."""
     from scipy.spatial import cKDTree
 
-    ray = measurement.cloud.points[measurement.epochs == 0] - measurement.viewpoint
+    epochs = measurement.epochs
+    ray = measurement.cloud.points[epochs == epochs.min()] - measurement.viewpoint
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     count = min(_NEIGHBOURS, len(ray) - 1)
     reach = cKDTree(ray).query(ray[:: max(len(ray) // _SAMPLE, 1)], [count + 1])[0]
-    return float(np.median(reach) * np.sqrt(np.pi / (count + 0.5)))
+    step = float(np.median(reach) * np.sqrt(np.pi / (count + 0.5)))
+    if not step > 0:
+        problem = f"more than {count} points lie in one direction from the scanner, so that they do not tell its angular steps"
+        raise InputError(problem, where=FILE, remedy="name `pattern`, or give each point once")
+    return step

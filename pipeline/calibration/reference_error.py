@@ -40,9 +40,9 @@ class ReferenceError:
         distance, face = wall.cast(self.eye, np.nan_to_num(ray, nan=1.0))
         corners = wall.mesh.faces[np.maximum(face, 0)]
         weight = barycentric(self.eye + distance[:, None] * ray, wall.mesh.vertices[corners])
-        normal = random.generator()
+        drawn = random.generator()
         if self.shared:
-            off = np.sum(weight * normal.standard_normal(len(wall.mesh.vertices))[corners], axis=1)
+            off = np.sum(weight * drawn.standard_normal(len(wall.mesh.vertices))[corners], axis=1)
         else:
-            off = np.linalg.norm(weight, axis=1) * normal.standard_normal(len(points))
+            off = np.linalg.norm(weight, axis=1) * drawn.standard_normal(len(points))
         return points - np.where(face >= 0, self.sigma_m * off, 0.0)[:, None] * ray

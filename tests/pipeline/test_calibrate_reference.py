@@ -10,7 +10,7 @@ import yaml
 
 from benchmarks.workshop import rays
 from pipeline.calibration.calibrate import calibrate
-from pipeline.calibration.inputs import CalibrationInputs, read_material
+from pipeline.calibration.inputs import CalibrationInputs, _angular_spacing, read_material
 from pipeline.calibration.reference_error import ReferenceError
 from pipeline.calibration.reobserve import Reobserver
 from pipeline.calibration.report import warnings
@@ -18,9 +18,11 @@ from pipeline.calibration.write import to_dict
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.formats.laz import write_laz
+from pipeline.formats.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.build import Request, build
 from pipeline.report.progress import Progress
+from scene.errors import InputError
 from scene.keyed_random import KeyedRandom
 from scene.mesh import TriangleMesh
 from scene.raycast import RayCaster
@@ -117,6 +119,16 @@ def test_maps_of_a_half_are_as_noisy_as_measured_only_with_the_reference_error(h
 
     assert deviation(found.reference_error) == pytest.approx(measured, rel=0.08)
     assert deviation(None) < 0.85 * measured
+
+
+def test_points_that_lie_in_one_direction_are_an_input_error(half: Path) -> None:
+    measurement = read_measurement(half)
+    assert isinstance(measurement, TlsMeasurement)
+    step = _angular_spacing(measurement)
+    assert step == pytest.approx(6.6e-4 * np.sqrt(2), rel=0.03)
+    twice = PointCloud(np.repeat(measurement.cloud.points[:100], 70, axis=0), extra={"epoch": np.full(7000, 3)})
+    with pytest.raises(InputError, match="in one direction"):
+        _angular_spacing(measurement.changed(cloud=twice))
 
 
 @pytest.mark.slow

@@ -172,33 +172,35 @@ def test_a_deadlocked_worker_ends_the_job(monkeypatch: pytest.MonkeyPatch, capfd
     assert "took no processor time for 1 s" in capfd.readouterr().err
 
 
-def test_a_cluster_of_the_users_without_workers_ends_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def no_workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The address of a scheduler without any, which is given up after a second."""
     monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
     monkeypatch.setattr(cluster, "_EMPTY_S", 1.0)
-    with (
-        distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty,
-        pytest.raises(OutsideError, match="the scheduler has no workers; what was finished is kept"),
-    ):
-        list(cluster.fill_on_cluster(ORDERS, 0, empty.scheduler_address))
+    with distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty:
+        yield empty.scheduler_address
+
+
+def test_a_cluster_of_the_users_without_workers_ends_the_job(no_workers: str) -> None:
+    with pytest.raises(OutsideError, match="the scheduler has no workers; what was finished is kept"):
+        list(cluster.fill_on_cluster(ORDERS, 0, no_workers))
 
 
 @pytest.mark.parametrize("error", [TimeoutError("late"), OSError("gone"), RuntimeError("Cannot change state of Timeout")])
-def test_an_error_while_closing_does_not_hide_the_outcome(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+def test_an_error_while_closing_does_not_hide_the_outcome(
+    monkeypatch: pytest.MonkeyPatch, no_workers: str, error: Exception
+) -> None:
     """The last is what a client of a busy machine said that was about to give up its connection to a dead scheduler."""
     close = distributed.Client.close
 
-    def failing(client: distributed.Client, timeout: float) -> None:
+    def failing(client: distributed.Client, timeout: float | None = None) -> None:
         close(client, timeout=timeout)
-        raise error
+        if timeout is not None:  # as the program closes it, not the collector
+            raise error
 
     monkeypatch.setattr(distributed.Client, "close", failing)
-    monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
-    monkeypatch.setattr(cluster, "_EMPTY_S", 0.2)
-    with (
-        distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty,
-        pytest.raises(OutsideError, match="the scheduler has no workers"),
-    ):
-        list(cluster.fill_on_cluster(ORDERS, 0, empty.scheduler_address))
+    with pytest.raises(OutsideError, match="the scheduler has no workers"):
+        list(cluster.fill_on_cluster(ORDERS, 0, no_workers))
 
 
 def test_a_scheduler_that_dies_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
