@@ -78,10 +78,12 @@ if ! uv_is_recent "$uv"; then
     fi
 fi
 
-# dataset: `scarpsim dataset --workers`. --inexact keeps what an earlier set-up installed. --compile-bytecode: where Python may not
-# write bytecode (PYTHONDONTWRITEBYTECODE, common in containers) a command took 5 s longer each time, TensorFlow's import 13 s.
+# dataset: `scarpsim dataset --workers`. --inexact keeps what an earlier set-up installed. --compile-bytecode, and compileall for
+# what is in this folder: where Python may not write bytecode (PYTHONDONTWRITEBYTECODE, common in containers) a command took 6 s
+# longer each time, TensorFlow's import 13 s.
 # shellcheck disable=SC2046,SC2086  # a word each
 "$uv" sync --compile-bytecode --quiet --locked --inexact $groups $(printf ' --extra %s' dataset $extras) --python "$python" || fail "the environment could not be made from uv.lock"
+.venv/bin/python -m compileall -q scene sensors pipeline || fail "the program's own files could not be compiled"
 
 # -P: the script's folder stays off the path, where modules have names of the standard library's.
 # shellcheck disable=SC2086

@@ -36,6 +36,7 @@ from pipeline.formats.rounded_points import check_rounded_points
 from pipeline.formats.scanner_poses import Face, Pose, Scanned, ScannerPose, set_ups
 from pipeline.formats.surface_datum import told_datum
 from pipeline.formats.surface_fit import SurfaceFit, air_side, check_in_metres
+from pipeline.formats.surroundings import Surroundings
 from pipeline.registration.rigid import rotation_matrix
 from scene.cleaning import weld
 from scene.config import Config, load_yaml, parse
@@ -200,16 +201,19 @@ class StereoMeasurement(MeasurementBase):
     """A surface that a stereo pair gave.
 
     cameras: the nominal calibration, world frame; shaped_px: (n,) what those of the model's effects that look at neighbouring
-    pixels add to each point's disparity, where that was found once for cameras that stand about here, None where it was not.
+    pixels add to each point's disparity, and surroundings: what lies about the places that the pixels see, each where that was
+    found once for cameras that stand about here, None where it was not.
     """
 
     sensor = "stereo"
     model: StereoModel
     cameras: CameraPair
     shaped_px: FloatArray | None = None
+    surroundings: Surroundings | None = None
 
     def part(self, rows: NDArray[np.int64]) -> Self:
-        return super().part(rows).changed(shaped_px=None if self.shaped_px is None else self.shaped_px[rows])
+        shaped = None if self.shaped_px is None else self.shaped_px[rows]
+        return super().part(rows).changed(shaped_px=shaped, surroundings=self.surroundings and self.surroundings.part(rows))
 
     @property
     def viewpoint(self) -> FloatArray:

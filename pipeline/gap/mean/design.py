@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -32,8 +32,8 @@ class Families:
 
     @classmethod
     def of(cls, families: list[Candidate | SineGrid]) -> Families:
-        """Of either kind, in any order."""
-        plain = [family for family in families if isinstance(family, Candidate)]
+        """Of either kind, in any order; effects of the catalogue come first."""
+        plain = sorted((family for family in families if isinstance(family, Candidate)), key=lambda each: each.empirical)
         return cls(plain, [family for family in families if isinstance(family, SineGrid)])
 
     @cached_property
@@ -106,14 +106,16 @@ class Design:
         fixed, value = fixed.kept(bases), value.kept(bases)
         noise = NoiseDraws.of(model, DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]
-        waves = Waves.of(model, grids, fixed, value, noise)
+        place = _places(chosen.plain, count)
+        asked = count + sum(len(place[each]) for each in chosen.plain if not each.empirical)  # of free forms few are
+        waves = Waves.of(model, grids, fixed.weighed[:, :asked], value, noise)
         known = [np.zeros(count), *(precision_of(each, each.columns.shape[1]) for each in chosen.plain)]
         equations = assembled(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
-        place = _places(chosen.plain, count)
         drawn = noise.products(fixed.within[noise.rows], model.noise.on_nodes(fixed.within))
-        return cls(
+        found = cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, place, waves, drawn, equations
         )  # fmt: skip
+        return found._crossed(found.base)
 
     @cached_property
     def base(self) -> list[int]:
@@ -136,18 +138,29 @@ class Design:
         return [self.place[candidate] for candidate in self.families.plain]
 
     def holding(self, candidate: Candidate) -> Design:
-        """With fixed columns for a candidate: those of a sine are at its period refined."""
-        if candidate in self.place:
-            return self
+        """With a candidate for others to stand beside; the columns of a sine are at its period refined."""
+        design = self if candidate in self.place else self._with_sine(candidate)
+        return design._crossed(design.place[candidate])
+
+    def _crossed(self, columns: list[int]) -> Design:
+        """With the products of the sines with some of the fixed columns."""
+        known = max(columns) < self.waves.fixed.shape[1]
+        within = self.waves.fixed[:, columns] if known else self._asked(columns)
+        products = self.waves.at(self.equations.at, within, [basis[:, columns] for basis in self.fixed.between])
+        return replace(self, equations=self.equations.holding(columns, products))
+
+    def _asked(self, columns: list[int]) -> FloatArray:
+        return wave_products(self.grids, self.fixed.weighed[:, columns], self.model.root)
+
+    def _with_sine(self, candidate: Candidate) -> Design:
         (found,) = self.refined([candidate])[0]
         added = self.model.project(_without(self.pose, self._matrix([found], None)))
+        equations = extended(self.equations, self.fixed, self.value, added)
         start = self.fixed.within.shape[1]
-        products = wave_products(self.grids, added.weighed, self.model.root)
-        equations = extended(self.model, self.equations, self.fixed, self.value, added, products, self.waves.means)
         place = {**self.place, candidate: list(range(start, start + added.within.shape[1]))}
         return replace(self, fixed=self.fixed.beside(added), equations=equations, place=place)
 
-    def columns(self, candidates: list[Candidate]) -> list[int]:
+    def columns(self, candidates: Sequence[Candidate]) -> list[int]:
         """Numbers of the pose's columns and of those of candidates that it holds."""
         return [*self.base, *(column for each in candidates for column in self.place[each])]
 

@@ -22,7 +22,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import cholesky, eigh, solve_triangular
 from scipy.linalg.lapack import dsysv
-from scipy.spatial.distance import cdist
+from scipy.spatial.distance import pdist, squareform
 from scipy.special import j0
 
 from pipeline.gap.mean.within_noise import WithinNoise
@@ -90,10 +90,12 @@ class MeanModel:
         self._root = cholesky(variance, lower=True)
         self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))
         scale = typical * np.sqrt(self._total)
-        distance = cdist(cells.centre, cells.centre) / cells.side_m
+        distance = pdist(cells.centre / cells.side_m)
 
         def basis(correlation: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
-            half = self._whitened(correlation(distance) * np.outer(scale, scale))
+            found = squareform(correlation(distance))
+            np.fill_diagonal(found, 1.0)
+            half = self._whitened(found * np.outer(scale, scale))
             values, vectors = eigh(self._whitened(half.T), driver="evd", overwrite_a=True)
             return np.maximum(values, 0.0), vectors
 
@@ -134,7 +136,7 @@ class MeanModel:
         for number, basis in enumerate(kept):
             low, high = max(tops[:, basis].min() - 1, 0), min(tops[:, basis].max() + 1, len(ratios) - 1)
             places = np.unique(np.rint(np.linspace(low, high, min(_MOST_RATIOS, high - low + 1))).astype(int))
-            chosen += [self._at(number, ratios[place]) for place in places]
+            chosen += [narrower._at(number, ratios[place]) for place in places]
         return narrower, [*dict.fromkeys(chosen)], kept
 
     @property
@@ -292,10 +294,10 @@ class _Normal:
 
     def _equations(self, at: Covariance) -> tuple[FloatArray, FloatArray, float]:
         """Matrix (k, k), right side (k,), and the log-likelihood without the columns."""
-        basis, y = self.columns.between[at.length], self.value.between[at.length][:, 0]
-        weighted = basis * at.weight[:, None]
-        constant = 0.5 * (np.log(at.weight).sum() - y @ (at.weight * y) - self.square)
-        return self.gram + weighted.T @ basis, self.right + weighted.T @ y, float(constant)
+        root = np.sqrt(at.weight)
+        basis, y = self.columns.between[at.length] * root[:, None], self.value.between[at.length][:, 0] * root
+        constant = 0.5 * (np.log(at.weight).sum() - y @ y - self.square)
+        return self.gram + basis.T @ basis, self.right + basis.T @ y, float(constant)
 
 
 def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> MeanFit:

@@ -1,14 +1,17 @@
 """The normal equations of all candidates at every covariance of the cell means, so that any set of them can be compared at once.
 
 Columns are of two kinds: fixed ones, whose products with each other are all known, and searched sines, of each of which only the
-products with itself and with the fixed columns are. A sine that is to stand beside others becomes fixed first (`extended`).
+products with itself and with those fixed columns are that something stands beside (`holding`). A sine that is to stand beside
+others becomes fixed first (`extended`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
@@ -26,19 +29,19 @@ _AT_ONCE = 8
 @dataclass(frozen=True)
 class Waves:
     """Products of w sines (2 w columns) on the deviations within cells, by the inverse covariance of their noise. fixed: (2 w, k)
-    with fixed columns; own: (w, 2, 2); right: (2 w, v) with the values; noise: (2 w, d) with draws of noise; means: (m, 2 w) of
-    the cells."""
+    with the first k of the fixed columns; own: (w, 2, 2); right: (2 w, v) with the values; noise: (2 w, d) with draws of noise;
+    between: (m, 2 w) the cells' means in each basis."""
 
     fixed: FloatArray
     own: FloatArray
     right: FloatArray
     noise: FloatArray
-    means: FloatArray
+    between: list[FloatArray]
 
     @classmethod
-    def of(cls, model: MeanModel, grids: list[SineGrid], fixed: Projected, value: Projected, noise: NoiseDraws) -> Waves:
-        """Of all sines of some grids."""
-        beside = np.concatenate([fixed.weighed, value.weighed], axis=1)
+    def of(cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: Projected, noise: NoiseDraws) -> Waves:
+        """Of all sines of some grids. fixed: (n, k) columns, weighed."""
+        beside = np.concatenate([fixed, value.weighed], axis=1)
 
         def some(grid: SineGrid) -> tuple[FloatArray, ...]:
             columns = grid.columns(model.root)
@@ -50,20 +53,48 @@ class Waves:
             return columns.T @ beside, own, drawn, means.T
 
         parts = side_by_side(some, [part for grid in grids for part in grid.chunks])
-        count = fixed.within.shape[1]
+        count = fixed.shape[1]
         if not parts:
             empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
-            return cls(*empty, np.zeros((0, noise.white.shape[1])), np.zeros((model.cells, 0)))
+            return cls(*empty, np.zeros((0, noise.white.shape[1])), model.between(np.zeros((model.cells, 0))))
         products, own, drawn, means = (np.concatenate([part[k] for part in parts]) for k in range(4))
-        return cls(products[:, :count], own, products[:, count:], drawn, means.T)
+        return cls(products[:, :count], own, products[:, count:], drawn, model.between(means.T))
+
+    def at(self, covariances: list[Covariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
+        """(C, 2 w, a) products with some columns at each covariance. within: (2 w, a); between: (m, a) in each basis."""
+        found = np.empty((len(covariances), *within.shape))
+        for basis, rows in _by_basis(covariances).items():
+            weighted = [between[basis] * covariances[row].weight[:, None] for row in rows]
+            products = self.between[basis].T @ np.concatenate(weighted, axis=1)
+            found[rows] = within + products.reshape(len(within), len(rows), within.shape[1]).transpose(1, 0, 2)
+        return found
+
+    def own_at(self, covariances: list[Covariance]) -> FloatArray:
+        """(C, w, 2, 2) products of each sine with itself at each covariance."""
+        found = np.empty((len(covariances), *self.own.shape))
+        for basis, rows in _by_basis(covariances).items():
+            weights = np.stack([covariances[row].weight for row in rows])
+            pair = self.between[basis][:, 0::2], self.between[basis][:, 1::2]
+            for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+                found[rows, :, i, j] = self.own[:, i, j] + weights @ (pair[i] * pair[j])
+        return found
+
+
+def _by_basis(covariances: list[Covariance]) -> dict[int, list[int]]:
+    """Of each basis in use the numbers of its covariances."""
+    found: dict[int, list[int]] = {}
+    for row, each in enumerate(covariances):
+        found.setdefault(each.length, []).append(row)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Draws of the noise within cells. rows: some n' of the points; white: (n', d) on them; on_nodes: (q, d) by `WithinNoise`."""
+    """Draws of the noise within cells. rows: some n' of the points; white: (n', d) on them, in single precision, which draws do
+    not need more of; on_nodes: (q, d) by `WithinNoise`."""
 
     rows: slice
-    white: FloatArray
+    white: NDArray[np.float32]
     on_nodes: FloatArray
 
     @classmethod
@@ -73,11 +104,11 @@ class NoiseDraws:
         few = len(model.root[rows])
         white = random.generator().standard_normal((few, count)) * np.sqrt(len(model) / few)
         on_nodes = model.noise.drawn(white, rows, model.planes(white, rows)[: model.cells], random.child("nodes"))
-        return cls(rows, white / np.sqrt(model.noise.white), on_nodes)
+        return cls(rows, (white / np.sqrt(model.noise.white)).astype(np.float32), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
         """(k, d) of columns with the draws, by the inverse covariance. within: (n', k); on_nodes: (q, k)."""
-        return np.asarray(within.T @ self.white + on_nodes.T @ self.on_nodes)
+        return np.asarray(within.astype(np.float32).T @ self.white + on_nodes.T @ self.on_nodes)
 
 
 def _squares(columns: FloatArray) -> FloatArray:
@@ -95,7 +126,8 @@ def wave_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) 
 @dataclass(frozen=True)
 class Equations:
     """For each of C covariances. fixed: (C, k, k); right: (C, k, v); constant: (C, v) log-likelihood without any column;
-    wave_fixed: (C, 2 w, k); wave_own: (C, w, 2, 2); wave_right: (C, 2 w, v); at: the covariances."""
+    wave_fixed: (C, 2 w, h) with the columns that are held; wave_own: (C, w, 2, 2); wave_right: (C, 2 w, v); at: the covariances;
+    held: numbers of those h of the fixed columns."""
 
     at: list[Covariance]
     fixed: FloatArray
@@ -104,6 +136,7 @@ class Equations:
     wave_fixed: FloatArray
     wave_own: FloatArray
     wave_right: FloatArray
+    held: tuple[int, ...] = ()
 
     def with_precision(self, precision: FloatArray) -> Equations:
         """The same where the fixed columns' coefficients are known to lie about 0. precision: (k,) inverse variances."""
@@ -113,16 +146,20 @@ class Equations:
         """The same columns with other values."""
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
+    def holding(self, columns: list[int], products: FloatArray) -> Equations:
+        """With the products (C, 2 w, a) of the sines with some more of the fixed columns."""
+        return replace(self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held=(*self.held, *columns))
+
     def some(self, chosen: list[int]) -> Equations:
         """At some of the covariances."""
-        return Equations([self.at[index] for index in chosen], *(array[chosen] for array in self._arrays))
+        return self._of([self.at[index] for index in chosen], chosen)
 
     def _part(self, rows: slice) -> Equations:
-        return Equations(self.at[rows], *(array[rows] for array in self._arrays))
+        return self._of(self.at[rows], rows)
 
-    @property
-    def _arrays(self) -> tuple[FloatArray, ...]:
-        return self.fixed, self.right, self.constant, self.wave_fixed, self.wave_own, self.wave_right
+    def _of(self, at: list[Covariance], rows: Any) -> Equations:
+        names = ("fixed", "right", "constant", "wave_fixed", "wave_own", "wave_right")
+        return replace(self, at=at, **{name: getattr(self, name)[rows] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
         """(C, v) with the fixed columns `base`."""
@@ -136,36 +173,34 @@ class Equations:
         return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
 
     def profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Largest log-likelihoods over the covariances: (v,) of `base`, (f, v) with each list of columns added, (w, v) with each
-        sine added."""
+        """Largest log-likelihoods over the covariances: (v,) of `base`, all of which are held, (f, v) with each list of columns
+        added, (w, v) with each sine added."""
         parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.at), _AT_ONCE)]
         found = side_by_side(lambda part: part._profile(base, fixed), parts)
         plain, gains, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
         return plain, gains, waves
 
     def _profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        count = self.right.shape[2]
-        wanted = sorted({column for columns in fixed for column in columns})
-        place = {column: row for row, column in enumerate(wanted)}
-        beside = self.fixed[:, base][:, :, wanted]
-        waves = self.wave_fixed[:, :, base].transpose(0, 2, 1)
-        solved = self._solved(base, np.concatenate([self.right[:, base], beside, waves], axis=2))
-        value, others, sines = np.split(solved, [count, count + len(wanted)], axis=2)
+        count, whole = self.right.shape[2], self.fixed.shape[2]
+        waves = self.wave_fixed[:, :, [self.held.index(column) for column in base]]
+        beside = self.fixed[:, base]
+        solved = self._solved(base, np.concatenate([self.right[:, base], beside, waves.transpose(0, 2, 1)], axis=2))
+        value, others, sines = np.split(solved, [count, count + whole], axis=2)
         plain = self.constant + 0.5 * np.einsum("ckv,ckv->cv", self.right[:, base], value)
-        left = self.right[:, wanted] - beside.transpose(0, 2, 1) @ value
-        own = self.fixed[:, wanted][:, :, wanted]
-        rest = own - beside.transpose(0, 2, 1) @ others
-        gains = np.stack(
-            [(plain + _gain(rest, own, left, [place[column] for column in columns])).max(axis=0) for columns in fixed]
-        ) if fixed else np.zeros((0, count))  # fmt: skip
-        turned = self.wave_right - self.wave_fixed[:, :, base] @ value
-        return plain.max(axis=0), gains, self._wave_profile(plain, turned, sines, base)
+        left = self.right - beside.transpose(0, 2, 1) @ value
+        gains = np.zeros((len(fixed), count))
+        for size in {len(columns) for columns in fixed}:
+            rows = [row for row, columns in enumerate(fixed) if len(columns) == size]
+            columns = np.array([fixed[row] for row in rows])
+            own = self.fixed[:, columns[:, :, None], columns[:, None, :]]
+            rest = own - beside[:, :, columns].transpose(0, 2, 3, 1) @ others[:, :, columns].transpose(0, 2, 1, 3)
+            gains[rows] = (plain[:, None] + _gain(rest, own, left[:, columns])).max(axis=0)
+        return plain.max(axis=0), gains, self._wave_profile(plain, self.wave_right - waves @ value, sines, waves)
 
-    def _wave_profile(self, plain: FloatArray, right: FloatArray, solved: FloatArray, base: list[int]) -> FloatArray:
+    def _wave_profile(self, plain: FloatArray, right: FloatArray, solved: FloatArray, crossed: FloatArray) -> FloatArray:
         """Two columns at a time: the explained square by the inverse of a 2 x 2 matrix."""
-        count = self.wave_own.shape[1]
-        crossed = self.wave_fixed[:, :, base].reshape(len(self.at), count, 2, len(base))
-        mine = solved.transpose(0, 2, 1).reshape(len(self.at), count, 2, len(base))
+        shape = len(self.at), self.wave_own.shape[1], 2, crossed.shape[2]
+        crossed, mine = crossed.reshape(shape), solved.transpose(0, 2, 1).reshape(shape)
         matrix = self.wave_own - crossed @ mine.transpose(0, 1, 3, 2)
         a, b, d = (matrix[:, :, i, j][..., None] for i, j in ((0, 0), (0, 1), (1, 1)))
         r, s = right[:, 0::2], right[:, 1::2]
@@ -176,58 +211,40 @@ class Equations:
         return np.asarray((plain[:, None] + np.maximum(gains, 0.0)).max(axis=0))
 
 
-def _gain(rest: FloatArray, own: FloatArray, left: FloatArray, columns: list[int]) -> FloatArray:
-    """(C, v) explained by some columns of what the base leaves: `rest` of their products `own`, `left` of the right side."""
-    matrix, right = rest[:, columns][:, :, columns], left[:, columns]
-    scale = np.sqrt(np.maximum(np.einsum("ckk->ck", own)[:, columns], 1e-300))
-    values, vectors = np.linalg.eigh(matrix / scale[:, :, None] / scale[:, None, :])
-    turned = vectors.transpose(0, 2, 1) @ (right / scale[:, :, None])
+def _gain(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArray:
+    """(C, f, v) explained by sets of n columns of what the base leaves: `rest` (C, f, n, n) of their products `own`, `left`
+    (C, f, n, v) of the right side."""
+    scale = np.sqrt(np.maximum(np.einsum("cfkk->cfk", own), 1e-300))
+    values, vectors = np.linalg.eigh(rest / scale[..., :, None] / scale[..., None, :])
+    turned = vectors.swapaxes(2, 3) @ (left / scale[..., None])
     share = np.where(values > _SMALLEST, 1 / np.maximum(values, _SMALLEST), 0.0)
-    return np.asarray(0.5 * np.einsum("ck,ckv->cv", share, turned**2))
+    return np.asarray(0.5 * np.einsum("cfk,cfkv->cfv", share, turned**2))
 
 
 def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: Projected, waves: Waves) -> Equations:
-    """The equations at the covariances `at`."""
-    between = model.between(waves.means)
+    """The equations at the covariances `at`, in which no column is held yet."""
     gram, right = fixed.within.T @ fixed.weighed, fixed.within.T @ value.weighed
     square = np.einsum("nv,nv->v", value.within, value.weighed)
 
     def at_one(each: Covariance) -> tuple[FloatArray, ...]:
-        basis, y, sines = fixed.between[each.length], value.between[each.length], between[each.length]
-        weight = each.weight[:, None]
-        turned = (sines * weight).T
-        pairs = turned.reshape(-1, 2, len(weight)), sines.T.reshape(-1, 2, len(weight))
-        constant = 0.5 * (np.log(each.weight).sum() - np.sum(y * weight * y, axis=0) - square)
-        return (
-            gram + (basis * weight).T @ basis,
-            right + (basis * weight).T @ y,
-            constant,
-            waves.fixed + turned @ basis,
-            waves.own + pairs[0] @ pairs[1].transpose(0, 2, 1),
-            waves.right + turned @ y,
-        )
+        root = np.sqrt(each.weight)[:, None]
+        basis, y = fixed.between[each.length] * root, value.between[each.length] * root
+        constant = 0.5 * (np.log(each.weight).sum() - np.sum(y**2, axis=0) - square)
+        return gram + basis.T @ basis, right + basis.T @ y, constant
 
-    return Equations(at, *(np.stack(parts) for parts in zip(*side_by_side(at_one, at), strict=True)))
+    products, sides, constant = (np.stack(part) for part in zip(*side_by_side(at_one, at), strict=True))
+    nothing = np.empty((len(at), len(waves.right), 0))
+    return Equations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
 
 
-def extended(
-    model: MeanModel,
-    equations: Equations,
-    had: Projected,
-    value: Projected,
-    added: Projected,
-    waves: FloatArray,
-    means: FloatArray,
-) -> Equations:
-    """With further fixed columns. had: the fixed columns so far; waves: (2 w, a) products with the sines; means: theirs."""
-    between = model.between(means)
+def extended(equations: Equations, had: Projected, value: Projected, added: Projected) -> Equations:
+    """With further fixed columns. had: the fixed columns so far."""
     cross, own = had.within.T @ added.weighed, added.within.T @ added.weighed
     right = added.within.T @ value.weighed
-    fixed, sides, sines = [], [], []
+    fixed, sides = [], []
     for row, each in enumerate(equations.at):
         weighted = added.between[each.length] * each.weight[:, None]
         beside = cross + had.between[each.length].T @ weighted
         fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.length].T @ weighted]]))
         sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.length]]))
-        sines.append(np.concatenate([equations.wave_fixed[row], waves + between[each.length].T @ weighted], axis=1))
-    return replace(equations, fixed=np.stack(fixed), right=np.stack(sides), wave_fixed=np.stack(sines))
+    return replace(equations, fixed=np.stack(fixed), right=np.stack(sides))

@@ -28,13 +28,12 @@ class NullGains:
         """By the most likely covariances, each family at its best value."""
         near = design.equations.some(design.likely[:_NEAR_NULL])
         draws = design.model.null_draws(design.null, DRAWS, random.child("between"))
-        sines = design.model.between(design.waves.means)
 
         def values(at: Covariance) -> tuple[FloatArray, FloatArray, FloatArray]:
             weighted = draws[at.length] * at.weight[:, None]
             constant = 0.5 * (np.log(at.weight).sum() - np.sum(draws[at.length] * weighted, axis=0))
             right = design.drawn + design.fixed.between[at.length].T @ weighted
-            return right, constant, design.waves.noise + sines[at.length].T @ weighted
+            return right, constant, design.waves.noise + design.waves.between[at.length].T @ weighted
 
         right, constant, waves = (np.stack(part) for part in zip(*side_by_side(values, near.at), strict=True))
         drawn = near.of_values(right, constant, waves)

@@ -39,7 +39,8 @@ class MeanSearch:
         """pose_precision: (p,) inverse variance of the coefficients of `residuals.pose` before there are data, 0 by default."""
         self.design = Design.of(residuals, families, random, pose_precision)
         self._null = NullGains.of(self.design, random)
-        self._holding: dict[tuple[Candidate, ...], Design] = {}
+        self._holding: dict[tuple[Candidate, ...], Design] = {(): self.design}
+        self._profiles: dict[tuple[Candidate, ...], tuple[FloatArray, ...]] = {}
         alone = sorted(self._tried((), {}), key=lambda each: each.gain) if gains_alone is None else []
         self.gains_alone = gains_alone or {(each.name, each.empirical): each.gain for each in alone}
 
@@ -52,10 +53,8 @@ class MeanSearch:
         return self._tried(members, self.gains_alone)
 
     def _tried(self, members: Members, alone: Mapping[Explanation, float]) -> tuple[Tried, ...]:
-        candidates = [member.candidate for member in members]
-        design = self._with(candidates)
-        plain, fixed, searched = design.equations.profile(design.columns(candidates), design.plain_columns)
-        families, found = design.families, []
+        plain, fixed, searched = self._profile(tuple(member.candidate for member in members))
+        families, found = self.design.families, []
         for name, (rows, sines) in families.members.items():
             gains = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
             best = int(np.argmax(gains))
@@ -65,14 +64,18 @@ class MeanSearch:
             found.append(Tried(candidate.name, candidate.empirical, gain - self._null.penalty(name), gain, candidate, slight))
         return tuple(sorted(found, key=lambda item: -item.score))
 
-    def _with(self, candidates: list[Candidate]) -> Design:
-        """The design with columns for all of them; kept, since the same sets are asked for again and again."""
-        key = tuple(candidate for candidate in candidates if candidate not in self.design.place)
-        if not key:
-            return self.design
-        if key not in self._holding:
-            self._holding[key] = self._with([*key[:-1]]).holding(key[-1])
-        return self._holding[key]
+    def _profile(self, candidates: tuple[Candidate, ...]) -> tuple[FloatArray, ...]:
+        """As `Equations.profile`, beside some candidates; kept, since the same sets are asked for again and again."""
+        if candidates not in self._profiles:
+            design = self._with(candidates)
+            self._profiles[candidates] = design.equations.profile(design.columns(candidates), design.plain_columns)
+        return self._profiles[candidates]
+
+    def _with(self, candidates: tuple[Candidate, ...]) -> Design:
+        """The design that holds all of them."""
+        if candidates not in self._holding:
+            self._holding[candidates] = self._with(candidates[:-1]).holding(candidates[-1])
+        return self._holding[candidates]
 
     def p_value(self, score: float) -> float:
         """Of the largest score over all families where there is nothing."""
@@ -103,7 +106,7 @@ class MeanSearch:
 
     def score(self, members: Members) -> float:
         """Of effects together, their periods at the top of the likelihood: the steps of the search cost a strong sine some."""
-        candidates = [member.candidate for member in members]
+        candidates = tuple(member.candidate for member in members)
         design = self._with(candidates)
         both = (design.equations.log_likelihood(base)[:, 0].max() for base in (design.columns(candidates), design.base))
         with_them, without = both
@@ -178,7 +181,7 @@ class MeanSearch:
 
     def leading(self) -> list[Candidate]:
         """Effects of the catalogue that are large and explain much by themselves, each variant for itself, best first."""
-        plain, fixed, _ = self.design.equations.profile(self.design.base, self.design.plain_columns)
+        plain, fixed, _ = self._profile(())
         gains = fixed[:, 0] - plain[0]
         found = [(gain, each) for gain, each in zip(gains, self.design.families.plain, strict=True) if not each.empirical]
         ranked = sorted(found, key=lambda item: -item[0])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pipeline.formats.measurement import FILE, Measurement, TlsMeasurement
+from pipeline.formats.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.formats.measurement_checks import check_noise
 from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import Tried
@@ -38,6 +38,7 @@ from pipeline.gap.residuals.changes import SceneChange, moved_share
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.stereo_residuals import with_surroundings
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.thinning import thinned
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
@@ -119,6 +120,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
     held_points |= _held_epoch(measurement.epochs)
     there, plain, surveyed = settled(measurement, first.index[~held_points[first.index]], first)
+    there = with_surroundings(there) if isinstance(there, StereoMeasurement) else there
     if isinstance(there, TlsMeasurement) and isinstance(plain, TlsResiduals):
         plain = replace(plain, missing=missing_returns(there, plain))
     clock.lap("residuals")

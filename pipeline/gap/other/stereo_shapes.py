@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ _FILTERED = 0.02
 @dataclass(frozen=True)
 class _Witnesses:
     """residuals: without effects on the shape; raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px;
-    sigma: (n,) their spread; blocks; held_out: (n,) points that have no say."""
+    sigma: (n,) their spread; blocks; held_out: (n,) points that have no say; beside: effects that are known."""
 
     residuals: StereoResiduals
     raster: DisparityRaster
@@ -52,44 +53,60 @@ class _Witnesses:
     sigma: FloatArray
     blocks: WallBlocks
     held_out: BoolArray
+    beside: list[Effect]
 
-    def gains(self, beside: list[Effect], effect: Effect) -> FloatArray:
-        """(n,) log-likelihood with an effect beside others less that of the others alone."""
-        without = self.raster.moved(beside, self.disparity)
-        moved = self.raster.moved([*beside, effect], self.disparity)
+    @cached_property
+    def without(self) -> FloatArray:
+        """(n,) what the known effects alone add to the disparities, px."""
+        return self.moved([])
+
+    @cached_property
+    def density(self) -> FloatArray:
+        """(n,) log density of the residuals with the known effects alone."""
+        return log_density(self.rough, self.without, self.sigma)
+
+    def moved(self, effects: list[Effect]) -> FloatArray:
+        """(n,) what effects beside the known ones add to the disparities, px."""
+        return self.raster.moved([*self.beside, *effects], self.disparity)
+
+    def gains(self, effect: Effect) -> FloatArray:
+        """(n,) log-likelihood with an effect beside the known ones less that of these alone."""
+        moved = self.moved([effect])
+        counts = (moved != self.without) & ~self.held_out
         if isinstance(effect, EdgeFattening):
             clear = np.maximum(decided().shapes.clear_sigmas * self.sigma, decided().shapes.clear_step * self.raster.jump_px)
-            moved = np.where(np.abs(moved - without) > clear, moved, without)
-        more = log_density(self.rough, moved, self.sigma) - log_density(self.rough, without, self.sigma)
-        return np.where((moved == without) | self.held_out, 0.0, more)
+            counts &= np.abs(moved - self.without) > clear
+        rows = np.flatnonzero(counts)
+        gains = np.zeros(len(moved))
+        gains[rows] = log_density(self.rough[rows], moved[rows], self.sigma[rows]) - self.density[rows]
+        return gains
 
-    def found(self, effect: Effect, beside: list[Effect], std: dict[str, float], gain: float) -> ShapeFound:
-        """An effect that the points ask for beside others."""
-        return ShapeFound(effect, std, gain, _touched(effect, beside, self.raster, self.disparity))
+    def found(self, effect: Effect, std: dict[str, float], gain: float) -> ShapeFound:
+        """An effect that the points ask for beside the known ones."""
+        return ShapeFound(effect, std, gain, _touched(effect, self.beside, self.raster, self.disparity))
 
     @property
     def times_predicted(self) -> float:
         """How many predicted sigmas the residuals spread."""
         return float(self.sigma[0] / self.residuals.sigma[0])
 
-    def registered_with(self, effects: list[Effect]) -> _Witnesses:
-        """With the registration and the spread that the residuals have where some effects are in the model."""
-        moved = np.nan_to_num(self.raster.moved(effects, self.disparity))
+    def registered_with(self, effect: Effect) -> _Witnesses:
+        """With the registration and the spread that the residuals have where an effect beside the known ones is in the model."""
+        moved = np.nan_to_num(self.moved([effect]))
         value, _, scale = registered(replace(self.residuals, value=self.residuals.value - moved))
         return replace(self, rough=value + moved, sigma=scale * self.residuals.sigma)
 
-    def likelier(self, beside: list[Effect], found: list[ShapeFound]) -> ShapeFound:
+    def likelier(self, found: list[ShapeFound]) -> ShapeFound:
         """Of effects that may feign each other, the one that explains more of the points that any of them moves clearly."""
-        without = self.raster.moved(beside, self.disparity)
-        moved = [self.raster.moved([*beside, each.effect], self.disparity) for each in found]
+        moved = [self.moved([each.effect]) for each in found]
         least = decided().shapes.clear_sigmas * self.sigma
-        clear = ~self.held_out & np.any([np.abs(each - without) > least for each in moved], axis=0)
-        settled = [self.registered_with([*beside, each.effect]) for each in found]
+        clear = ~self.held_out & np.any([np.abs(each - self.without) > least for each in moved], axis=0)
+        settled = [self.registered_with(each.effect) for each in found]
         gains = [log_density(w.rough, each, w.sigma)[clear].sum() for w, each in zip(settled, moved, strict=True)]
         return found[int(np.argmax(gains))]
 
 
-_Trial = Callable[[_Witnesses, list[Effect]], ShapeFound | None]
+_Trial = Callable[[_Witnesses], ShapeFound | None]
 
 
 def find_shapes(
@@ -117,15 +134,13 @@ def find_shapes(
         scale * part.sigma,
         WallBlocks.over(part.at),
         held_out[points],
+        list(believed),
     )
     found: list[ShapeFound] = []
 
-    def smoothing(untouched: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+    def smoothing(untouched: _Witnesses) -> ShapeFound | None:
         touched = np.any([np.zeros(len(points), dtype=bool), *(each.touched for each in found)], axis=0)
-        return _smoothing(replace(untouched, held_out=untouched.held_out | touched), beside)
-
-    def asked(trial: _Trial) -> ShapeFound | None:
-        return trial(witnesses, [*believed, *(each.effect for each in found)])
+        return _smoothing(replace(untouched, held_out=untouched.held_out | touched))
 
     trials: dict[str, _Trial] = {
         EdgeFattening.tag(): _fattening,
@@ -135,13 +150,13 @@ def find_shapes(
     for name in {effect.name for effect in believed}:
         del trials[name]
     while trials:
-        shapes = zip(trials, side_by_side(asked, trials.values()), strict=True)
+        there = replace(witnesses, beside=[*believed, *(each.effect for each in found)])
+        shapes = zip(trials, side_by_side(partial(_asked, there), trials.values()), strict=True)
         tried = {name: each for name, each in shapes if each is not None}
         if not tried:
             break
         feigned = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
-        beside = [*believed, *(each.effect for each in found)]
-        likely = [witnesses.likelier(beside, feigned)] if feigned else []
+        likely = [there.likelier(feigned)] if feigned else []
         found.append(max([*likely, *tried.values()], key=lambda each: each.gain))
         del trials[found[-1].name]
     if len(points) == len(rough):
@@ -152,6 +167,10 @@ def find_shapes(
         replace(each, touched=_touched(each.effect, others, raster, disparity))
         for each, others in zip(found, before, strict=True)
     ]
+
+
+def _asked(witnesses: _Witnesses, trial: _Trial) -> ShapeFound | None:
+    return trial(witnesses)
 
 
 def _touched(effect: Effect, beside: list[Effect], raster: DisparityRaster, disparity: FloatArray) -> BoolArray:
@@ -165,7 +184,7 @@ def _touched(effect: Effect, beside: list[Effect], raster: DisparityRaster, disp
     return raster.filled(beside)
 
 
-def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+def _fattening(witnesses: _Witnesses) -> ShapeFound | None:
     """Radii are whole cells: any between one and the next does the same. Outlines that do not grow alike make it unsure.
 
     What a matcher takes for a depth step, rather than for a slope that it follows, is in no measurement: several are tried.
@@ -173,10 +192,10 @@ def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
     raster = witnesses.raster
 
     def gains(radius: float) -> FloatArray:
-        return there.gains(beside, _grown(int(radius), height, raster)) if radius else np.zeros(len(witnesses.rough))
+        return there.gains(_grown(int(radius), height, raster)) if radius else np.zeros(len(witnesses.rough))
 
     def gain_of(outline: tuple[int, float]) -> float:
-        return float(witnesses.gains(beside, _grown(*outline, raster)).sum())
+        return float(witnesses.gains(_grown(*outline, raster)).sum())
 
     there = witnesses
     outlines = [(radius, height) for height in _STEPS for radius in _RADII]
@@ -184,7 +203,7 @@ def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
     radius, height = max(outlines, key=lambda each: found[each])
     if witnesses.times_predicted > decided().shapes.wide:
         # outlines that grow far spoil the registration and the spread by which points would bear witness of them
-        settled = side_by_side(lambda each: witnesses.registered_with([*beside, _grown(*each, raster)]), outlines)
+        settled = side_by_side(lambda each: witnesses.registered_with(_grown(*each, raster)), outlines)
         far, best = min(zip(outlines, settled, strict=True), key=lambda each: each[1].times_predicted)
         if best.times_predicted < witnesses.times_predicted / decided().shapes.wide:
             (radius, height), there = far, best
@@ -193,7 +212,7 @@ def _fattening(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None
         return None
     uneven = min(there.blocks.std(gains, radius, 1.0), float(radius))
     std = {"radius_px": raster.step * float(np.hypot(np.sqrt(1 / 12), uneven))}
-    return witnesses.found(_grown(radius, height, raster), beside, std, gain)
+    return witnesses.found(_grown(radius, height, raster), std, gain)
 
 
 def _grown(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening:
@@ -202,42 +221,42 @@ def _grown(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening
     return EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.jump_px)
 
 
-def _smoothing(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+def _smoothing(witnesses: _Witnesses) -> ShapeFound | None:
     """The standard deviation at the top of the likelihood."""
     step = witnesses.raster.step
 
     def gains(sigma: float) -> FloatArray:
-        return witnesses.gains(beside, Smoothing(sigma_px=sigma))
+        return witnesses.gains(Smoothing(sigma_px=sigma))
 
     sigma = refined(gains, [step * each for each in _SIGMAS], _FINER)
     if witnesses.blocks.tested(gains(sigma)) is None:
         return None
     for _ in range(_REGISTRATIONS):  # that of the first trial, and its spread, make up for some of the low-pass
-        witnesses = witnesses.registered_with([*beside, Smoothing(sigma_px=sigma)])
+        witnesses = witnesses.registered_with(Smoothing(sigma_px=sigma))
         sigma = refined(gains, [sigma], _FINER)
     gain = witnesses.blocks.tested(gains(sigma))
     if gain is None:
         return None
     std = float(np.hypot(witnesses.blocks.std(gains, sigma), _FILTERED * sigma))
-    return witnesses.found(Smoothing(sigma_px=sigma), beside, {"sigma_px": std}, gain)
+    return witnesses.found(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain)
 
 
-def _filling(witnesses: _Witnesses, beside: list[Effect]) -> ShapeFound | None:
+def _filling(witnesses: _Witnesses) -> ShapeFound | None:
     """Points where the right camera sees nothing, at the disparity of the background beside them.
 
     Without it hardly any of those cells holds a point (up to a fifth, by edges that are not quite where the reference has them).
     """
     raster = witnesses.raster
-    points = raster.filled(beside)
-    gain = float(witnesses.gains(beside, OcclusionFill(reach_px=1e5))[points].sum())
+    points = raster.filled(witnesses.beside)
+    gain = float(witnesses.gains(OcclusionFill(reach_px=1e5))[points].sum())
     if points.sum() < decided().shapes.fewest_filled or gain < decided().shapes.least_filled_gain:
         return None
-    widths, held = _strips(raster.after(beside), raster)
+    widths, held = _strips(raster.after(witnesses.beside), raster)
     reach, std = _reach(widths, held, raster.step)
     narrow = held[widths <= reach / raster.step]
     if narrow.mean() < decided().shapes.least_held:
         return None
-    return witnesses.found(OcclusionFill(reach_px=reach), beside, {"reach_px": std}, gain)
+    return witnesses.found(OcclusionFill(reach_px=reach), {"reach_px": std}, gain)
 
 
 def _strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArray[np.int64], BoolArray]:

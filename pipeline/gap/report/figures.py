@@ -98,8 +98,10 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
     """Means and spreads against each covariate, with two standard errors, and what the named effects explain on top."""
     names = [name for name, _, _ in standardised(found)]
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
-    figure = Figure(figsize=(11.5, 4.0 * rows), layout="constrained")
+    figure = Figure(figsize=(11.5, 4.0 * rows))
     panels = np.atleast_2d(figure.subplots(2 * rows, _COLUMNS, height_ratios=[1.4, 1.0] * rows))
+    # margins of so many inches: all panels are alike, and a layout that is worked out takes as long as the drawing
+    figure.subplots_adjust(0.055, 0.3 / (4.0 * rows), 0.99, 1 - 0.3 / (4.0 * rows), wspace=0.22, hspace=0.33)
     kept = steady(found)
     unit = 1e3 * found.residuals.depth_m[kept]
     before, after = found.before[kept] * unit, found.after[kept] * unit

@@ -19,6 +19,7 @@ from pipeline.gap.residuals.tls_residuals import tls_residuals
 from scene.mesh import FloatArray
 
 _ROUNDS = 6
+_AT_ONCE = 2048
 _FEWEST = 100
 _FAR_M, _MOST_MOVES = 0.002, 3
 _FAR_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
@@ -31,20 +32,32 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     kept, scale = residuals.smooth.copy(), 1.0
     value, pose = residuals.value, np.zeros(residuals.pose.shape[1])
     for _ in range(_ROUNDS):
-        pose = pose_of(residuals, kept)
+        before, pose = kept, pose_of(residuals, kept)
         value = residuals.value - residuals.pose @ pose
         z = np.abs(value / residuals.sigma)
         scale = max(1.0, nmad(z[residuals.smooth], 0.0))
         kept = residuals.smooth & (z < decided().points.unregistered * scale)
         if kept.sum() < _FEWEST:
             kept = residuals.smooth
+        if np.array_equal(kept, before):  # the next rounds would be the same
+            break
     return value, pose, scale
 
 
 def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
     """(6,) shift (m) and turn (rad) by weighted least squares over some rows (a mask or indices)."""
-    sigma = residuals.sigma[rows]
-    return np.asarray(np.linalg.lstsq(residuals.pose[rows] / sigma[:, None], residuals.value[rows] / sigma, rcond=None)[0])
+    design = np.concatenate([residuals.pose[rows], residuals.value[rows, None]], axis=1) / residuals.sigma[rows, None]
+    triangle = _triangle(design)
+    return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=np.finfo(float).eps * len(design))[0])
+
+
+def _triangle(design: FloatArray) -> FloatArray:
+    """(m, k) that has the same products of columns as (n, k), by QR of some thousand rows at a time, which stay in the cache."""
+    while len(design) > _AT_ONCE:
+        whole = len(design) // _AT_ONCE * _AT_ONCE
+        triangles = np.asarray(np.linalg.qr(design[:whole].reshape(-1, _AT_ONCE, design.shape[1]), mode="r"))
+        design = np.concatenate([triangles.reshape(-1, design.shape[1]), design[whole:]])
+    return design
 
 
 def raw_residuals(measurement: Measurement) -> Residuals:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurement import StereoMeasurement
+from pipeline.formats.surroundings import Surroundings
 from pipeline.gap.residuals.disparity_raster import MOST_CELLS, DisparityRaster, cells_over, spacing, through
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
@@ -32,8 +33,10 @@ from sensors.effects.raster_effect import RasterEffect
 from sensors.model import StereoModel
 
 _PROBE_PX = 3.0
-_EDGE_PX = 1.0
-"""A surface that departs by more from its tangent plane within some pixels counts as an edge."""
+_EDGE_PX, _MOST_EDGE_PX = 1.0, 10.0
+"""A surface that departs by more from its tangent plane within some pixels counts as an edge; the most that is told apart."""
+_STAYS_PX = 0.5
+"""A pixel that sees a place no farther from another has that one's surroundings."""
 _LEAST_VARIANCE = 1e-8
 """Of a disparity, px2: a model without noise divides by nothing."""
 _REGISTRATION_STEPS, _NUDGE = 3, 1e-4
@@ -87,23 +90,17 @@ def _miss(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> Flo
 def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     """Disparity residuals with predicted spread and covariates; points whose pixel does not see the surface are left out."""
     nominal, model = NominalPair.of(measurement), measurement.model
-    points, extra = measurement.cloud.points, measurement.cloud.extra
-    given = "pixel_x" in extra and "pixel_y" in extra
-    if given:
-        u, v = (np.asarray(extra[key], dtype=np.float64) for key in ("pixel_x", "pixel_y"))
-        points = on_their_rays(nominal.pair.left, points, u, v)
-    else:
-        u, v = project(nominal.pair.left, points)
+    u, v, points = _pixels(nominal, measurement)
     measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
     real = real_pair(nominal, model.effects, measurement)
-    geometry, curvature, depth = _reference(nominal, real, measurement.scene, u, v, measured)
-    hidden = is_hidden(measurement.scene, real.right.position, geometry.point)
+    geometry, depth = _reference(nominal, real, measurement.scene, u, v, measured)
+    about = _surroundings(measurement, nominal, real, geometry, depth)
     geometry = replace(geometry, shaped=_shaped_px(measurement, geometry))
     hit = np.isfinite(geometry.disparity)
     slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
-    covariates = _covariates(nominal, geometry, depth, curvature)
+    covariates = _covariates(nominal, geometry, depth, about)
     mean = _mean_error(model, geometry) + _empirical(model, covariates)
-    even = hit & ~hidden & (curvature < _EDGE_PX)
+    even = hit & ~about.hidden & (about.edge_px < _EDGE_PX)
     whole = StereoResiduals(
         value=measured - geometry.disparity - mean,
         sigma=np.full(len(u), np.sqrt(max(model.variance, _LEAST_VARIANCE))),
@@ -116,9 +113,32 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         index=np.arange(len(u)),
         geometry=geometry,
         shared_noise=SharedNoise.of(model, np.stack([u, v], axis=1)),
-        notes=(*measurement.notes, *_notes(given, u, v)),
+        notes=(*measurement.notes, *_notes(_recorded(measurement), u, v)),
     )
     return whole.part(hit)
+
+
+def with_surroundings(measurement: StereoMeasurement) -> StereoMeasurement:
+    """With what lies about the places that the pixels see, which is not looked for again where these move little."""
+    nominal = NominalPair.of(measurement)
+    real = real_pair(nominal, measurement.model.effects, measurement)
+    u, v, _ = _pixels(nominal, measurement)
+    geometry, depth = _reference(nominal, real, measurement.scene, u, v, np.zeros(len(u)))
+    return measurement.changed(surroundings=_surroundings(measurement, nominal, real, geometry, depth))
+
+
+def _recorded(measurement: StereoMeasurement) -> bool:
+    """Whether the points come with their pixels."""
+    return "pixel_x" in measurement.cloud.extra and "pixel_y" in measurement.cloud.extra
+
+
+def _pixels(nominal: NominalPair, measurement: StereoMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Column and row (n,) of each point in the left image, px, and the points (n, 3) on the rays of these."""
+    points, left = measurement.cloud.points, nominal.pair.left
+    if not _recorded(measurement):
+        return *project(left, points), points
+    u, v = (np.asarray(measurement.cloud.extra[key], dtype=np.float64) for key in ("pixel_x", "pixel_y"))
+    return u, v, on_their_rays(left, points, u, v)
 
 
 def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
@@ -136,39 +156,56 @@ def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
 
 def _reference(
     nominal: NominalPair, real: CameraPair, scene: RayCaster, u: FloatArray, v: FloatArray, measured: FloatArray
-) -> tuple[PixelGeometry, FloatArray, FloatArray]:
-    """What the pixels of the cameras as the model has them (`real`) see on the reference, its disparity in the nominal pair, the
-    departure from the tangent plane beside it (px), and the depth (m)."""
-    left = real.left
+) -> tuple[PixelGeometry, FloatArray]:
+    """What the pixels of the cameras as the model has them (`real`) see on the reference, its disparity in the nominal pair, and
+    the depth (m)."""
+    left, camera = real.left, real.right
     ray = rays(left, u, v)
     distance, face = scene.cast(left.position, ray)
-    normal = scene.mesh.face_normals(np.maximum(face, 0))
     point = left.position + distance[:, None] * ray
-    right = project(real.right, point)
-    disparity = nominal.disparity((u, v), right)
-    curvature = np.zeros(len(u))
-    for du, dv in ((_PROBE_PX, 0.0), (-_PROBE_PX, 0.0), (0.0, _PROBE_PX), (0.0, -_PROBE_PX)):
-        beside = rays(left, u + du, v + dv)
-        seen = scene.cast(left.position, beside)[0]
-        flat = np.einsum("ni,ni->n", point - left.position, normal) / np.einsum("ni,ni->n", beside, normal)
-        step = nominal.geometry.f * nominal.geometry.base_m * (1 / seen - 1 / flat)
-        curvature = np.maximum(curvature, np.nan_to_num(np.abs(step), nan=np.inf))
-    camera = real.right
+    right = project(camera, point)
     geometry = PixelGeometry(
         u=u,
         v=v,
         v_right=right[1],
-        disparity=disparity,
+        disparity=nominal.disparity((u, v), right),
         found=measured,
         point=point,
-        normal=normal,
+        normal=scene.mesh.face_normals(np.maximum(face, 0)),
         radius=np.hypot(u - left.width / 2, v - left.height / 2),
         radius_right=np.hypot(right[0] - camera.width / 2, right[1] - camera.height / 2),
         tangent=nominal.tangent(u, v),
         infinity=np.full(len(u), nominal.geometry.offset),
         shaped=np.zeros(len(u)),
     )
-    return geometry, curvature, distance
+    return geometry, distance
+
+
+def _surroundings(
+    measurement: StereoMeasurement, nominal: NominalPair, real: CameraPair, geometry: PixelGeometry, depth: FloatArray
+) -> Surroundings:
+    """Those that the measurement knows, and what the pixels that see other places have about them."""
+    known = measurement.surroundings or Surroundings.nowhere(len(geometry))
+    away_px = nominal.geometry.f * np.linalg.norm(geometry.point - known.point, axis=1) / depth
+    rows = np.flatnonzero(np.isfinite(depth) & ~(away_px < _STAYS_PX))
+    if not len(rows):
+        return known
+    moved = geometry.part(rows)
+    edge = _edge_px(nominal, real.left, measurement.scene, moved)
+    return known.changed(rows, Surroundings(moved.point, edge, is_hidden(measurement.scene, real.right.position, moved.point)))
+
+
+def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: PixelGeometry) -> FloatArray:
+    """(n,) departure of the reference from its tangent planes beside what the pixels see, px of disparity."""
+    edge = np.zeros(len(geometry))
+    for du, dv in ((_PROBE_PX, 0.0), (-_PROBE_PX, 0.0), (0.0, _PROBE_PX), (0.0, -_PROBE_PX)):
+        beside = rays(left, geometry.u + du, geometry.v + dv)
+        seen = scene.cast(left.position, beside)[0]
+        flat = np.einsum("ni,ni->n", geometry.point - left.position, geometry.normal)
+        flat /= np.einsum("ni,ni->n", beside, geometry.normal)
+        step = nominal.geometry.f * nominal.geometry.base_m * (1 / seen - 1 / flat)
+        edge = np.maximum(edge, np.nan_to_num(np.abs(step), nan=_MOST_EDGE_PX))
+    return np.minimum(edge, _MOST_EDGE_PX)
 
 
 def _pose(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
@@ -208,7 +245,7 @@ def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatAr
     return total
 
 
-def _covariates(nominal: NominalPair, geometry: PixelGeometry, depth: FloatArray, curvature: FloatArray) -> dict[str, FloatArray]:
+def _covariates(nominal: NominalPair, geometry: PixelGeometry, depth: FloatArray, about: Surroundings) -> dict[str, FloatArray]:
     ray = geometry.point - nominal.pair.left.position
     cosine = np.abs(np.einsum("ni,ni->n", ray, geometry.normal)) / np.linalg.norm(ray, axis=1)
     return {
@@ -219,5 +256,5 @@ def _covariates(nominal: NominalPair, geometry: PixelGeometry, depth: FloatArray
         "disparity": geometry.disparity,
         "disparity_fraction": geometry.found - np.floor(geometry.found),
         "incidence": np.arccos(np.clip(cosine, 0, 1)),
-        "edge_step": np.minimum(curvature, 10.0),
+        "edge_step": about.edge_px,
     }

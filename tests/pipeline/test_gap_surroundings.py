@@ -1,0 +1,66 @@
+"""What lies about the places that pixels see, which is looked for once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.gap_challenge.cases import Case, make
+from pipeline.formats.measurement import StereoMeasurement, read_measurement
+from pipeline.formats.surroundings import Surroundings
+from pipeline.gap.residuals.stereo_residuals import stereo_residuals, with_surroundings
+from scene.raycast import RayCaster
+
+
+@pytest.fixture(scope="module")
+def measurement(tmp_path_factory: pytest.TempPathFactory) -> StereoMeasurement:
+    folder = tmp_path_factory.mktemp("surroundings")
+    make(Case(0, (8, 1), "none", "stereo", (), 8_000, 8_000), folder / "case", folder / "truth.json")
+    read = read_measurement(folder / "case")
+    assert isinstance(read, StereoMeasurement)
+    return read
+
+
+def _casts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The rays of each cast from here on."""
+    counts: list[int] = []
+    cast = RayCaster.cast
+
+    def counted(self: RayCaster, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        counts.append(len(directions))
+        return cast(self, origins, directions)
+
+    monkeypatch.setattr(RayCaster, "cast", counted)
+    return counts
+
+
+def test_a_pair_that_stands_still_casts_one_ray_a_pixel(measurement: StereoMeasurement, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, known = stereo_residuals(measurement), with_surroundings(measurement)
+    counts = _casts(monkeypatch)
+    found = stereo_residuals(known)
+    assert counts == [len(measurement.cloud.points)]
+    for name in ("value", "smooth", "even"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))
+    np.testing.assert_array_equal(found.covariates["edge_step"], plain.covariates["edge_step"])
+    some = np.arange(0, len(plain), 7)
+    np.testing.assert_array_equal(stereo_residuals(known.part(plain.index[some])).even, plain.even[some])
+
+
+def test_pixels_that_see_other_places_are_looked_at_again(
+    measurement: StereoMeasurement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Known of places a third of a pixel away it is taken over, whatever it says; of places five pixels away it is not."""
+    about, expected = with_surroundings(measurement).surroundings, stereo_residuals(measurement)
+    assert about is not None
+    depth = float(np.nanmedian(np.linalg.norm(about.point - measurement.viewpoint, axis=1)))
+    pixel_m = depth / float(measurement.cameras.left.f_px)
+    assert not expected.even.all()
+    for pixels, again in ((0.3, False), (5.0, True)):
+        beside = Surroundings(
+            about.point + np.array([pixels * pixel_m, 0, 0]), np.zeros(len(about.point)), np.zeros_like(about.hidden)
+        )
+        counts = _casts(monkeypatch)
+        found = stereo_residuals(measurement.changed(surroundings=beside))
+        assert (max(counts[1:], default=0) > 0.9 * len(found)) == again
+        np.testing.assert_array_equal(found.even, expected.even if again else np.ones(len(found), dtype=bool))
+        monkeypatch.undo()
