@@ -13,7 +13,7 @@ from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import read_measurement
 from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.signatures import mean_families
+from pipeline.gap.mean.signatures import _searched, mean_families
 from pipeline.gap.naming.entries import Estimate, from_mean
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.residuals.disparity_raster import spacing
@@ -26,6 +26,7 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from sensors.curve import surface_on_host
 from sensors.effects.disparity_empirical import DisparityEmpirical
+from sensors.effects.row_jitter import RowJitter
 
 SIDE, STRIDE, SIGMA, PERIOD = 100, 4.0, 0.2, 64.0
 PIXELS = STRIDE * np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
@@ -51,6 +52,18 @@ def best(found: Residuals, families: list[Candidate]) -> tuple[MeanSearch, Estim
     candidates, fit = search.design.refined([chosen.candidate])
     width = len(fit.coefficients) - found.pose.shape[1]
     return search, Estimate(chosen, candidates[0], fit.coefficients[-width:], fit.covariance[-width:, -width:])
+
+
+@pytest.mark.parametrize(("stride", "shortest"), [(4.0, 20.0), (27.0, 54.0)])
+def test_periods_are_searched_as_far_as_the_rows_tell_them_apart(stride: float, shortest: float) -> None:
+    """Sampled every 27 px, a jitter of 26.2 px is a wave of 884 px: a slanting wave was named so."""
+    pixels = PIXELS * stride / STRIDE
+    assert RowJitter.searched is not None
+    nowhere = PixelGeometry(*pixels.T, pixels[:, 1], *[np.zeros(len(pixels))] * 9)
+    for camera in ("left", "right"):
+        (grid,) = _searched(RowJitter, RowJitter.searched, nowhere, {"camera": camera})
+        assert 1 / grid.frequencies[-1] == pytest.approx(shortest)
+    assert np.sin(2 * np.pi * 27 / 26.2 * np.arange(9)) == pytest.approx(np.sin(2 * np.pi * 27 / 884.25 * np.arange(9)))
 
 
 def square(x: FloatArray, period: float) -> FloatArray:

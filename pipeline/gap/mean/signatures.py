@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid, Wave, amplitude_and_phase, frequencies, variants
-from pipeline.gap.residuals.disparity_raster import through
+from pipeline.gap.residuals.disparity_raster import spacing, through
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
 from pipeline.gap.residuals.residuals import Geometry, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
@@ -84,14 +84,22 @@ def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: d
     (amplitude,) = effect.typical_sizes()
     x = np.asarray(effect(**fixed).argument(geometry), dtype=np.float64)
     reach = max(float(np.ptp(np.quantile(x, [0.01, 0.99]))), search.shortest)
-    low = 1 / search.longest if search.longest else search.cycles / reach
-    if low >= 1 / search.shortest:
+    low, high = 1 / search.longest if search.longest else search.cycles / reach, 1 / _shortest(search, geometry)
+    if low >= high:
         return
     angle = 2 * np.pi * x / search.shortest
     columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
     factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
-    tried = frequencies(low, 1 / search.shortest, 0.3 / reach, _MOST_PERIODS)
+    tried = frequencies(low, high, 0.3 / reach, _MOST_PERIODS)
     yield SineGrid(effect.tag(), amplitude, Wave(search.period, factor, x, low), tried, fixed)
+
+
+def _shortest(search: Search, geometry: Geometry) -> float:
+    """Of the periods: pixels that lie farther apart than half of one would show it as a longer one."""
+    if not isinstance(geometry, PixelGeometry):
+        return search.shortest
+    step = spacing({"image_x": geometry.u, "image_y": geometry.v}[search.along])
+    return search.shortest if step is None else max(search.shortest, 2 * step)
 
 
 def _of_cameras(
