@@ -144,13 +144,12 @@ class Design:
 
     def _crossed(self, columns: list[int]) -> Design:
         """With the products of the sines with some of the fixed columns."""
-        known = max(columns) < self.waves.fixed.shape[1]
-        within = self.waves.fixed[:, columns] if known else self._asked(columns)
+        if max(columns) < self.waves.fixed.shape[1]:
+            within = self.waves.fixed[:, columns]
+        else:
+            within = wave_products(self.grids, self.fixed.weighed[:, columns], self.model.root)
         products = self.waves.at(self.equations.at, within, [basis[:, columns] for basis in self.fixed.between])
         return replace(self, equations=self.equations.holding(columns, products))
-
-    def _asked(self, columns: list[int]) -> FloatArray:
-        return wave_products(self.grids, self.fixed.weighed[:, columns], self.model.root)
 
     def _with_sine(self, candidate: Candidate) -> Design:
         (found,) = self.refined([candidate])[0]

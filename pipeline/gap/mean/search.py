@@ -46,7 +46,9 @@ class MeanSearch:
 
     def select(self) -> tuple[list[Chosen], tuple[Tried, ...]]:
         """Explanations, and what was tried beside all of them."""
-        return Choice(self).select()
+        found = Choice(self).select()
+        self._holding = {(): self.design}  # a design with a sine is as large as the search itself
+        return found
 
     def tried(self, members: Members) -> tuple[Tried, ...]:
         """Every family's best variant beside some effects, best score first."""

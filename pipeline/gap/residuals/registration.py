@@ -20,6 +20,7 @@ from scene.mesh import FloatArray
 
 _ROUNDS = 6
 _AT_ONCE = 2048
+"""Rows of a design together, whatever the number of threads: 100 kB of one set-up."""
 _FEWEST = 100
 _FAR_M, _MOST_MOVES = 0.002, 3
 _FAR_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
@@ -52,7 +53,7 @@ def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatA
 
 
 def _triangle(design: FloatArray) -> FloatArray:
-    """(m, k) that has the same products of columns as (n, k), by QR of some thousand rows at a time, which stay in the cache."""
+    """(m, k) that has the same products of columns as (n, k), by QR of some rows at a time, which stay in the cache."""
     while len(design) > _AT_ONCE:
         whole = len(design) // _AT_ONCE * _AT_ONCE
         triangles = np.asarray(np.linalg.qr(design[:whole].reshape(-1, _AT_ONCE, design.shape[1]), mode="r"))
