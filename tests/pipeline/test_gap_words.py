@@ -50,7 +50,8 @@ def test_every_covariate_has_words() -> None:
     rays = SimpleNamespace(range_m=one, azimuth=one, zenith=one, cos_incidence=one, power=one, line=one, share=one)
     pixels = SimpleNamespace(point=axis, normal=axis, u=one, v=one, radius=one, disparity=one, found=one)
     pair = SimpleNamespace(pair=SimpleNamespace(left=SimpleNamespace(position=np.zeros(3))))
-    names = {*tls_residuals._covariates(rays, one), *stereo_residuals._covariates(pair, pixels, one, one), "log_power"}
+    about = SimpleNamespace(edge_px=one)
+    names = {*tls_residuals._covariates(rays, one), *stereo_residuals._covariates(pair, pixels, one, about), "log_power"}
     for kind in (RangeEmpirical, DisparityEmpirical, AngleEmpirical):
         names |= set(get_args(kind.model_fields["covariate"].annotation))
     assert names <= set(_COVARIATES)
