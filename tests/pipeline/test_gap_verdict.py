@@ -154,6 +154,13 @@ def test_effects_that_leave_most_of_the_gap_open_are_not_the_answer() -> None:
         assert ("spread far more than the model predicts" in said) == wide
 
 
+def test_an_empirical_term_beside_effects_does_not_say_that_none_passed() -> None:
+    for found, _, said in _every():
+        kinds = {effect.kind for effect in found.effects}
+        assert ("explain a part of what is missing" in said) == (len(kinds) == 2)
+        assert ("no effect of the catalogue passes its own test" in said) == (kinds == {"empirical"})
+
+
 def test_what_an_effect_leaves_over_is_said() -> None:
     for found, evidence, said in _every():
         left = bool(found.effects) and evidence.p_value is not None and evidence.p_value <= 0.01

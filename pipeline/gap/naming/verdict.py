@@ -33,6 +33,7 @@ STILL_WIDE = (
 STILL_REJECTED = (
     "Effects were named, but the model is rejected with them too, and the gap is too small to show that they close any of it."
 )
+PARTLY = "The model is rejected: effects of the catalogue explain a part of what is missing, and an empirical term describes more."
 NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
 MUCH_MOVED = "Much of the wall is not where the reference has it: of what is left nothing can be said of the sensor."
 TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
@@ -128,7 +129,10 @@ def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> s
         return MUCH_MOVED
     if verdict in ("no_gap", "unknown") and evidence.only_too_noisy(named):
         return TOO_NOISY
-    if verdict == "unknown" and not any(item.kind == "empirical" for item in named):
+    kinds = {item.kind for item in named}
+    if verdict == "unknown" and len(kinds) > 1:
+        return PARTLY
+    if verdict == "unknown" and "empirical" not in kinds:
         if not named:
             return NOT_DESCRIBED
         if evidence.stays_open:
