@@ -33,7 +33,9 @@ STILL_WIDE = (
 STILL_REJECTED = (
     "Effects were named, but the model is rejected with them too, and the gap is too small to show that they close any of it."
 )
-PARTLY = "The model is rejected: effects of the catalogue explain a part of what is missing, and an empirical term describes more."
+PARTLY = (
+    "The model is rejected: effects of the catalogue explain a part of what is missing, and an empirical term describes more."
+)
 NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
 MUCH_MOVED = "Much of the wall is not where the reference has it: of what is left nothing can be said of the sensor."
 TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
