@@ -121,7 +121,7 @@ def find_shapes(
     if raster is None:
         return []
     scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
-    believed = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+    believed: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
     disparity = residuals.geometry.disparity
     had = raster.moved(believed, disparity)
     searched, points = raster.searched()
@@ -134,7 +134,7 @@ def find_shapes(
         scale * part.sigma,
         WallBlocks.over(part.at),
         held_out[points],
-        list(believed),
+        believed,
     )
     found: list[ShapeFound] = []
 

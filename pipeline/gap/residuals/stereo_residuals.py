@@ -36,7 +36,7 @@ _PROBE_PX = 3.0
 _EDGE_PX, _MOST_EDGE_PX = 1.0, 10.0
 """A surface that departs by more from its tangent plane within some pixels counts as an edge; the most that is told apart."""
 _STAYS_PX = 0.5
-"""A pixel that sees a place no farther from another has that one's surroundings."""
+"""A pixel that sees a place no farther from another, a sixth of what is probed about it, has that one's surroundings."""
 _LEAST_VARIANCE = 1e-8
 """Of a disparity, px2: a model without noise divides by nothing."""
 _REGISTRATION_STEPS, _NUDGE = 3, 1e-4
@@ -119,7 +119,10 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
 
 
 def with_surroundings(measurement: StereoMeasurement) -> StereoMeasurement:
-    """With what lies about the places that the pixels see, which is not looked for again where these move little."""
+    """With what lies about the places that the pixels see, which is not looked for again where these move little.
+
+    What the right camera does not see is taken over too, wherever it stands: a few points beside edges where it moves far.
+    """
     nominal = NominalPair.of(measurement)
     real = real_pair(nominal, measurement.model.effects, measurement)
     u, v, _ = _pixels(nominal, measurement)
