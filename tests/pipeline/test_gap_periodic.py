@@ -11,7 +11,7 @@ from gap_cases import write_scan
 
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import read_measurement
-from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated
+from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated, twice_a_pixel
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.signatures import _searched, mean_families
 from pipeline.gap.naming.entries import Estimate, from_mean
@@ -43,7 +43,7 @@ def residuals(error: FloatArray) -> StereoResiduals:
     return StereoResiduals(value, sigma, unit, every, every, pose, at, covariates, np.arange(count), nowhere)
 
 
-def best(found: Residuals, families: list[Candidate]) -> tuple[MeanSearch, Estimate]:
+def best(found: Residuals, families: list[Candidate | SineGrid]) -> tuple[MeanSearch, Estimate]:
     """The form that a search chooses, with its values."""
     search = MeanSearch(
         found, [*free_forms("image_x", PIXELS[:, 0]), *free_forms("image_y", PIXELS[:, 1]), *families], KeyedRandom(1)
@@ -97,13 +97,30 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
     column = PIXELS[:, 0] / STRIDE
     error = 0.1 * np.array([0.0, 1.0, -0.6, 0.3, -0.2])[(column % lines).astype(int)]
     found = residuals(error)
-    _, estimate = best(found, repeated("image_x", column, STRIDE))
+    _, estimate = best(found, [*repeated("image_x", column, STRIDE)])
     assert estimate.candidate.form == f"{REPEATED} {lines}"
     entry = from_mean(estimate, found).entry
     assert entry["along"]["period"] == lines * STRIDE
     effect = DisparityEmpirical.model_validate(entry)
     curve = surface_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
     assert np.std(curve - curve.mean() - (error - error.mean())) < 0.25 * np.std(error)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.985])
+def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: float) -> None:
+    """Two cycles a pixel, of a rectification whose principal distance may be another, on a wall of 40 px of disparity; the sine's
+    amplitude of 0.1 px is known to 0.2 sqrt(2 / 10,000) = 3 %."""
+    x, y = PIXELS.T / (STRIDE * SIDE)
+    disparity = 500 + 40 * (x + 0.3 * np.sin(5 * y) + 0.1 * np.sin(9 * x * y))
+    error = 0.1 * np.sin(4 * np.pi * scale * disparity + 0.7)
+    found = replace(residuals(error), covariates={"image_x": PIXELS[:, 0], "image_y": PIXELS[:, 1], "disparity": disparity})
+    _, estimate = best(found, [*free_forms("disparity", disparity), *twice_a_pixel("disparity", disparity)])
+    entry = from_mean(estimate, found).entry
+    assert entry["covariate"] == "disparity"
+    assert entry["along"]["period"] == pytest.approx(0.5 / scale, rel=1e-3)
+    effect = DisparityEmpirical.model_validate(entry)
+    curve = surface_on_host(disparity, disparity, effect.along, effect.across, effect.values_px)
+    assert curve @ error / (error @ error) == pytest.approx(1.0, abs=0.12)
 
 
 @pytest.mark.parametrize(("points", "least"), [(12_000, 34), (300, 0)])

@@ -29,6 +29,10 @@ _DEGREE = 4
 OVERTONES = 5, 11
 """Up to which there may be some beside a sine: what a smooth error has, and what an error that jumps has."""
 _REPEATED = range(2, 9)
+SCALE_UNKNOWN = 0.03
+"""By how much the principal distance in which disparities were found may be another than the nominal one."""
+MOST_SCALES = 80
+"""Of a searched sine of the fraction of a disparity."""
 _DIRECTIONS = (30, 60, 120, 150)
 """Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
 
@@ -287,6 +291,16 @@ def repeated(covariate: str, number: FloatArray, step: float) -> list[Candidate]
             form = _free(covariate, f"{REPEATED} {lines}", columns)
             found.append(replace(form, fixed={"lines": lines}, period=lines * abs(step)))
     return found
+
+
+def twice_a_pixel(covariate: str, disparity: FloatArray) -> list[SineGrid]:
+    """A sine of two cycles per pixel of the disparity (n,), px: an interpolation between pixels is off the same way at each half.
+
+    One cycle per pixel is an effect of the catalogue.
+    """
+    x, reach, unit = _standardised(disparity), reach_of(disparity), float(disparity.std())
+    tried = unit * frequencies(2 * (1 - SCALE_UNKNOWN), 2 * (1 + SCALE_UNKNOWN), 0.3 / max(reach, 1.0), MOST_SCALES)
+    return [SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True)] if unit else []
 
 
 def surface_form(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:

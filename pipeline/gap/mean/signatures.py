@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
-from pipeline.gap.mean.candidates import Candidate, SineGrid, Wave, amplitude_and_phase, frequencies, variants
+from pipeline.gap.mean.candidates import (
+    MOST_SCALES,
+    SCALE_UNKNOWN,
+    Candidate,
+    SineGrid,
+    Wave,
+    amplitude_and_phase,
+    frequencies,
+    variants,
+)
 from pipeline.gap.residuals.disparity_raster import spacing, through
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
 from pipeline.gap.residuals.residuals import Geometry, Residuals
@@ -28,7 +37,6 @@ _STEP = 0.1
 _PHASE = "phase_rad"
 _MOST_PERIODS = 2000
 """Of one effect; for a wobble over 8,000 scan lines, one of them is then at most half a cycle off over all lines."""
-_SCALE_UNKNOWN = 0.03
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 
 
@@ -148,5 +156,5 @@ def _locking(geometry: PixelGeometry) -> list[SineGrid]:
     return [
         SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity, float(tried[0])), tried)
         for reduction in _REDUCTIONS
-        if (tried := frequencies((1 - _SCALE_UNKNOWN) / reduction, (1 + _SCALE_UNKNOWN) / reduction, 0.3 / reach, 80)).size
+        if (tried := frequencies((1 - SCALE_UNKNOWN) / reduction, (1 + SCALE_UNKNOWN) / reduction, 0.3 / reach, MOST_SCALES)).size
     ]

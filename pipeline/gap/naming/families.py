@@ -19,6 +19,7 @@ from pipeline.gap.mean.candidates import (
     reach_of,
     repeated,
     surface_form,
+    twice_a_pixel,
 )
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.residuals.disparity_raster import spacing
@@ -61,7 +62,7 @@ def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | S
         named, free = _not_held(named, angles, measurement, part), [*free, *angles]
     first, second = part.planes
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
-    return [*named, *free, both, *_repeated(part), *places(part.at)]
+    return [*named, *free, *_twice_a_pixel(part), both, *_repeated(part), *places(part.at)]
 
 
 def _most_cycles(name: str, values: FloatArray) -> float:
@@ -109,6 +110,14 @@ def _repeated(part: Residuals) -> list[Candidate]:
         return []
     pixels = {name: found[name] for name in _IMAGE}
     return [form for name, values in pixels.items() for form in repeated(name, (values - values.min()) / step, step)]
+
+
+def _twice_a_pixel(part: Residuals) -> list[SineGrid]:
+    """Where disparities span as many pixels as locking to these has to."""
+    disparity = part.covariates.get("disparity")
+    if disparity is None or reach_of(disparity) < decided().locking.fewest_cycles:
+        return []
+    return twice_a_pixel("disparity", disparity)
 
 
 def _with_precision(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
