@@ -35,8 +35,8 @@ def _casts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_a_pair_that_stands_still_casts_one_ray_a_pixel(measurement: StereoMeasurement, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain, known = stereo_residuals(measurement), with_surroundings(measurement)
-    counts = _casts(monkeypatch)
+    plain, counts = stereo_residuals(measurement), _casts(monkeypatch)
+    known = with_surroundings(measurement, plain)
     found = stereo_residuals(known)
     assert counts == [len(measurement.cloud.points)]
     for name in ("value", "smooth", "even"):
@@ -50,7 +50,8 @@ def test_pixels_that_see_other_places_are_looked_at_again(
     measurement: StereoMeasurement, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Known of places a third of a pixel away it is taken over, whatever it says; of places five pixels away it is not."""
-    about, expected = with_surroundings(measurement).surroundings, stereo_residuals(measurement)
+    expected = stereo_residuals(measurement)
+    about = with_surroundings(measurement, expected).surroundings
     assert about is not None
     depth = float(np.nanmedian(np.linalg.norm(about.point - measurement.viewpoint, axis=1)))
     pixel_m = depth / float(measurement.cameras.left.f_px)

@@ -38,7 +38,7 @@ from pipeline.gap.residuals.changes import SceneChange, moved_share
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
-from pipeline.gap.residuals.stereo_residuals import with_surroundings
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surroundings
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.thinning import thinned
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
@@ -120,7 +120,8 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
     held_points |= _held_epoch(measurement.epochs)
     there, plain, surveyed = settled(measurement, first.index[~held_points[first.index]], first)
-    there = with_surroundings(there) if isinstance(there, StereoMeasurement) else there
+    if isinstance(there, StereoMeasurement) and isinstance(plain, StereoResiduals):
+        there = with_surroundings(there, plain)
     if isinstance(there, TlsMeasurement) and isinstance(plain, TlsResiduals):
         plain = replace(plain, missing=missing_returns(there, plain))
     clock.lap("residuals")

@@ -118,16 +118,16 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     return whole.part(hit)
 
 
-def with_surroundings(measurement: StereoMeasurement) -> StereoMeasurement:
+def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
     """With what lies about the places that the pixels see, which is not looked for again where these move little.
 
-    What the right camera does not see is taken over too, wherever it stands: a few points beside edges where it moves far.
+    found: its residuals, of which it is taken. What the right camera does not see is taken over too, wherever it stands: a few
+    points beside edges where it moves far.
     """
-    nominal = NominalPair.of(measurement)
-    real = real_pair(nominal, measurement.model.effects, measurement)
-    u, v, _ = _pixels(nominal, measurement)
-    geometry, depth = _reference(nominal, real, measurement.scene, u, v, np.zeros(len(u)))
-    return measurement.changed(surroundings=_surroundings(measurement, nominal, real, geometry, depth))
+    edge = found.covariates["edge_step"]
+    about = Surroundings(found.geometry.point, edge, ~found.even & (edge < _EDGE_PX))
+    everywhere = Surroundings.nowhere(len(measurement.cloud.points))
+    return measurement.changed(surroundings=everywhere.changed(found.index, about))
 
 
 def _recorded(measurement: StereoMeasurement) -> bool:
