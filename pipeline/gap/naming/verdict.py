@@ -33,6 +33,7 @@ STILL_WIDE = (
 STILL_REJECTED = (
     "Effects were named, but the model is rejected with them too, and the gap is too small to show that they close any of it."
 )
+UNSUPPORTED = "Effects were named, but with them the gap is no smaller, and what remains was not tested: nothing speaks for them."
 PARTLY = (
     "The model is rejected: effects of the catalogue explain a part of what is missing, and an empirical term describes more."
 )
@@ -95,6 +96,11 @@ class Evidence:
         return self.rejects and self.gap is not None and self.gap.closed is None
 
     @property
+    def supports_nothing(self) -> bool:
+        """Whether the gap is no smaller with the named effects, and what remains beside them was not drawn."""
+        return self.gap is not None and self.gap.after > self.gap.before and self.p_value is None
+
+    @property
     def closes_little(self) -> bool:
         """Whether the gap with the named effects is most of what it was, by more than its uncertainty, or not known at all."""
         gap = self.gap
@@ -117,7 +123,7 @@ def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
         if evidence.gap is None and not evidence.rejects:
             return "insufficient_data"
         return "no_gap" if evidence.agrees else "unknown"
-    unsaid = evidence.stays_open or evidence.stays_rejected or evidence.too_wide
+    unsaid = evidence.stays_open or evidence.supports_nothing or evidence.stays_rejected or evidence.too_wide
     if unsaid or any(item.kind == "empirical" for item in named):
         return "unknown"
     if len(named) > 1:
@@ -139,6 +145,8 @@ def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> s
             return NOT_DESCRIBED
         if evidence.stays_open:
             return STILL_OPEN
+        if evidence.supports_nothing:
+            return UNSUPPORTED
         return STILL_REJECTED if evidence.stays_rejected else STILL_WIDE
     return VERDICTS[verdict]
 

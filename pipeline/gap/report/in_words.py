@@ -55,6 +55,8 @@ def title(found: GapDiagnosis) -> str:
         case "unknown" if not any(effect.kind == "empirical" for effect in found.effects):
             if found.evidence.stays_open:
                 return f"{listed(names)} closes little of the gap: something else is missing"
+            if found.evidence.supports_nothing:
+                return f"{listed(names)} does not make the gap smaller: something else may be missing"
             if found.evidence.stays_rejected:
                 return f"{listed(names)} leaves more than chance would: something else is missing"
             return f"{listed(names)}, and something that makes the residuals spread"
