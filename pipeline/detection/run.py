@@ -49,6 +49,9 @@ def detector(model: str, *, unmirrored: bool = False) -> Detector:
         if unmirrored:
             raise InputError(f"goes with a network, not with '{BASELINE}'", where="--unmirrored", remedy="leave it out")
         return baseline.detect
+    from pipeline.detection.keras_backend import keras_ready
+
+    keras_ready()
     from pipeline.detection import inference, weights
 
     network = weights.load(detector_folder(model), unmirrored=unmirrored)

@@ -21,7 +21,7 @@ from pipeline.detection.config import DetectorConfig, NormalisationConfig, Train
 from pipeline.detection.data import CocoFolder, batches, mirrored, network_input
 from pipeline.detection.detections import Detection, cropped, without_doubles
 from pipeline.detection.inference import paste, tile_places
-from pipeline.detection.keras_backend import stderr_dropped
+from pipeline.detection.keras_backend import keras_ready, stderr_dropped
 from pipeline.detection.normalisation import denormalised, nmad, normalised
 from pipeline.detection.run import detect, find_inputs
 from pipeline.detection.schedule import has_settled, learning_rate
@@ -271,6 +271,17 @@ def test_what_libraries_write_is_dropped_unless_they_fail(capfd):
     with pytest.raises(ImportError), stderr_dropped():
         failing()
     assert capfd.readouterr().err == "between the reason"
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("0", "0")])
+def test_convolutions_are_onednns_unless_the_environment_says_otherwise(
+    given: str | None, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("TF_ENABLE_ONEDNN_OPTS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("TF_ENABLE_ONEDNN_OPTS", given)
+    keras_ready()
+    assert os.environ["TF_ENABLE_ONEDNN_OPTS"] == expected
 
 
 def test_maps_of_one_name_are_told_apart(tmp_path: Path) -> None:

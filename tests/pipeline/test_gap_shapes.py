@@ -25,7 +25,7 @@ from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.other.stereo_shapes import find_shapes
 from pipeline.gap.residuals import disparity_raster, stereo_residuals
 from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.disparity_raster import DisparityRaster
+from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import Residuals
@@ -260,10 +260,15 @@ def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
     assert feigned.effect.divergence_rad == pytest.approx(4 * there.model.noise.angle_sigma_rad, rel=0.15)
 
 
+@pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize(("kind", "seed"), [("parallax_noise", 2), ("regularization_noise", 9)])
-def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: str, seed: int) -> None:
+def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: str, seed: int, every: int) -> None:
+    """Also where rows lie twice as far apart as columns, as of a map of which every second row is compared."""
     there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
-    part = residuals.part(residuals.smooth)
+    row = residuals.geometry.plane[:, 1]
+    step = spacing(row)
+    assert step is not None
+    part = residuals.part(residuals.smooth & (np.rint((row - row.min()) / step) % every == 0))
     value = registered(part)[0]
     spread, _, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)

@@ -105,11 +105,8 @@ def _repeated(part: Residuals) -> list[Candidate]:
     if "line" in found and np.ptp(found["line"]) > 0:
         turn = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
         return repeated("azimuth", found["line"], turn)
-    step = spacing(found["image_x"]) if "image_x" in found else None
-    if step is None:
-        return []
-    pixels = {name: found[name] for name in _IMAGE}
-    return [form for name, values in pixels.items() for form in repeated(name, (values - values.min()) / step, step)]
+    steps = {name: step for name in _IMAGE if name in found and (step := spacing(found[name])) is not None}
+    return [form for name, step in steps.items() for form in repeated(name, (found[name] - found[name].min()) / step, step)]
 
 
 def _twice_a_pixel(part: Residuals) -> list[SineGrid]:

@@ -20,6 +20,7 @@ from pipeline.gap.decisions import decided
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_raster import spacing
+from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
@@ -27,7 +28,8 @@ from sensors.effects.regularization_noise import RegularizationNoise
 from sensors.model import StereoModel
 
 _LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-_LONGEST_PX = 256.0
+_LONGEST_PX = (256.0, 128.0, 64.0)
+"""Of a lag: the first that enough blocks of the wall have pairs of."""
 _STEPS_PX = tuple(8.0 * 2 ** (quarter / 4) for quarter in range(17))
 _POINTS_PER_BLOCK = 400.0
 _FEWEST_BLOCKS, _FEWEST_LAGS = 12, 3
@@ -39,9 +41,9 @@ _DRAWS = 1999
 
 @dataclass(frozen=True)
 class _Variogram:
-    """step: px of the raster; lag: (k, 2) px; blocks: (k, b) px^2 less what the model predicts, of each block of the wall times
-    its share of all points; root: (k, k) whitens their sum (root @ value has unit variance); most_smooth: px^2 of the reference's
-    error, at the longest lag, that there may be."""
+    """step: px of the raster, along its coarser axis; lag: (k, 2) px; blocks: (k, b) px^2 less what the model predicts, of each
+    block of the wall times its share of all points; root: (k, k) whitens their sum (root @ value has unit variance); most_smooth:
+    px^2 of the reference's error, at the longest lag, that there may be."""
 
     step: float
     lag: FloatArray
@@ -193,21 +195,23 @@ def _with_variance(found: SpreadFound, form: _Form, share: float) -> SpreadFound
 def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> _Variogram | None:
     """Along rows and columns, with its covariance by blocks of the wall; None where the pixels are on no raster."""
     g = part.geometry
-    step = spacing(g.u)
-    if step is None:
+    steps = [step for step in (spacing(g.v), spacing(g.u)) if step is not None]
+    if len(steps) < 2:
         return None
-    column, row = (np.rint((x - x.min()) / step).astype(np.int64) for x in (g.u, g.v))
+    row, column = (np.rint((x - x.min()) / step).astype(np.int64) for x, step in zip((g.v, g.u), steps, strict=True))
     bound = _CLIP * nmad(value)
     raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
     raster[row, column] = np.where(np.abs(value) < bound, value, np.nan)
     block = np.zeros(raster.shape, dtype=np.int64)
     block[row, column] = patches(part.at, _POINTS_PER_BLOCK)
     count = int(block.max()) + 1
-    lags = [each for each in _LAGS if each * step <= _LONGEST_PX]
-    found = [_by_block(raster, block, lag, axis, count) for axis in (0, 1) for lag in lags]
-    pairs, sums = (np.stack(each) for each in zip(*found, strict=True))
+    lags = [(axis, lag) for axis in (0, 1) for lag in _LAGS if lag * steps[axis] <= _LONGEST_PX[0]]
+    pairs, sums = np.stack([_by_block(raster, block, lag, axis, count) for axis, lag in lags], axis=1)
+    near = _near(pairs, np.array([lag * steps[axis] for axis, lag in lags]))
+    lags = [each for each, is_near in zip(lags, near, strict=True) if is_near]
+    pairs, sums = pairs[near], sums[near]
     full = (pairs > 0).all(axis=0)
-    if full.sum() < _FEWEST_BLOCKS or len(lags) < _FEWEST_LAGS:
+    if full.sum() < _FEWEST_BLOCKS or len(lags) < 2 * _FEWEST_LAGS:
         return None
     means = sums[:, full] / pairs[:, full]
     weight = pairs[:, full].sum(axis=0) / pairs[:, full].sum()
@@ -215,10 +219,19 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     left = (means - mean[:, None]) * np.sqrt(weight)
     covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
     covariance += (_RIDGE + _FEW * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
-    offsets = np.array([[lag * step * (axis == 1), lag * step * (axis == 0)] for axis in (0, 1) for lag in lags])
+    offsets = np.array([[lag * steps[axis] * (axis == 1), lag * steps[axis] * (axis == 0)] for axis, lag in lags])
     blocks = (means - model.semivariogram(offsets)[:, None]) * weight
     most = (decided().nodes.reference_error / float(np.median(part.unit_m))) ** 2
-    return _Variogram(step, offsets, blocks, np.linalg.inv(np.linalg.cholesky(covariance)), most)
+    return _Variogram(max(steps), offsets, blocks, np.linalg.inv(np.linalg.cholesky(covariance)), most)
+
+
+def _near(pairs: FloatArray, length: FloatArray) -> BoolArray:
+    """(k,) lags that are short enough for a dozen blocks of the wall to have pairs (k, b) of all of them. length: (k,) px."""
+    for longest in _LONGEST_PX[:-1]:
+        near = length <= longest
+        if (pairs[near] > 0).all(axis=0).sum() >= _FEWEST_BLOCKS:
+            return np.asarray(near)
+    return np.asarray(length <= _LONGEST_PX[-1])
 
 
 def _by_block(raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int) -> tuple[FloatArray, FloatArray]:

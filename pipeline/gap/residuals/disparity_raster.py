@@ -46,7 +46,7 @@ class DisparityRaster:
     @classmethod
     def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
         """None where the pixels are on no raster, or on one of more than 40 million cells."""
-        step = spacing(geometry.u)
+        step = cell_px(geometry.u, geometry.v)
         if step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
             return None
         nominal = NominalPair.of(measurement)
@@ -132,7 +132,7 @@ def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatAr
     They take the rock's relief off them, by which a move of the cameras changes each disparity. What moves outlines leaves them.
     Of thinned points the low-pass is that over their own cells.
     """
-    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], spacing(geometry.u)
+    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], cell_px(geometry.u, geometry.v)
     if not filters or step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
     row, column = _cell(geometry.v, step), _cell(geometry.u, step)
@@ -175,6 +175,12 @@ def _axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDArray[np
 def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
     """(n,) number of the row or column of each point, `step` px each, from the first."""
     return np.rint((x - x.min()) / step).astype(np.int64)
+
+
+def cell_px(u: FloatArray, v: FloatArray) -> float | None:
+    """Side of the cells of a raster of pixels (n,), px: the less of the distances of neighbouring columns and rows."""
+    steps = [step for step in (spacing(u), spacing(v)) if step is not None]
+    return min(steps, default=None)
 
 
 def spacing(u: FloatArray) -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.formats.measurement import StereoMeasurement
 from pipeline.formats.surroundings import Surroundings
-from pipeline.gap.residuals.disparity_raster import MOST_CELLS, DisparityRaster, cells_over, spacing, through
+from pipeline.gap.residuals.disparity_raster import MOST_CELLS, DisparityRaster, cell_px, cells_over, through
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
     PixelGeometry,
@@ -146,7 +146,7 @@ def _pixels(nominal: NominalPair, measurement: StereoMeasurement) -> tuple[Float
 
 def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
     """What cannot be looked into for want of a field. given: whether the pixels are recorded."""
-    step = spacing(u)
+    step = cell_px(u, v)
     large = step is not None and cells_over(u, v, step) > MOST_CELLS
     absent = {
         "no pixel_x, pixel_y: pixels were found by projecting the points": not given,
