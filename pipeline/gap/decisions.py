@@ -390,6 +390,12 @@ class HeldOutDecisions(_Group):
         "That an effect must gain beside others to be named, not only mentioned: where a gain is as large as its standard error.",
         "the gain of a true effect, half a difference of two chi^2, has twice its expectation as variance",
     )
+    sigmas_of_none: PositiveFloat = _by(
+        2.0,
+        "standard deviations",
+        "Within which of none the one value of an effect beside others lies that is only mentioned.",
+        _JUDGEMENT,
+    )
     left_over: PositiveFloat = _by(
         0.02,
         "share",

@@ -17,7 +17,7 @@ from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.selection import Choice, Members, Tried
 from pipeline.gap.naming.attempts import few
 from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.held_out import score_effects
+from pipeline.gap.naming.held_out import score_effects, weakness
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
@@ -48,6 +48,25 @@ def test_debris_on_blocks_that_were_held_out_does_not_speak_against_an_effect(tm
 
 def _bulging(scan: Scan) -> Array:
     return scan.R + 0.004 * (1 / scan.cos_i - 1)
+
+
+@pytest.mark.parametrize(("std", "weak"), [(0.0019, []), (0.0021, ["tls.range_incidence_bias"])])
+def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
+    tmp_path: Path, std: float, weak: list[str]
+) -> None:
+    """Whatever it gains: a kappa of -0.36 +- 0.63 mrad was named beside a skew of the other camera, which undoes it."""
+    write_scan(tmp_path, 8, step_rad=0.007, ranges=lambda scan: _bulging(scan) + 0.004 * np.sin(2 * np.pi * scan.R / 1.7))
+    there, found, _ = settled(read_measurement(tmp_path))
+    bias = {"name": "range_incidence_bias", "coefficient_m": 0.004}
+    sine = {"name": "range_cyclic", "amplitude_m": 0.004, "period_m": 1.7, "phase_rad": 0.0}
+    named = [
+        Named("tls.range_incidence_bias", "physical", bias, {"coefficient_m": std}, (), 0.001, 9.0),
+        Named("tls.range_cyclic", "physical", sine, {"amplitude_m": 0.01, "period_m": 1.0}, (), 0.001, 9.0),
+    ]
+    scored = score_effects(there, found, named, ~held_out_blocks(found.at, Cells.over(found.at).side_m), 0.0004)
+    assert [item.name for item in scored.weak] == weak
+    assert all("within its uncertainty of none" in weakness(item) for item in scored.weak)
+    assert not scored.failed
 
 
 @pytest.mark.parametrize(("length_m", "count"), [(0.0, 1), (1.2, 0)])

@@ -19,6 +19,7 @@ from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.shared_noise import SharedNoise
 from scene.mesh import FloatArray
+from sensors.effects.base import ShowsIn
 
 _POINTS_PER_PATCH = 30.0
 _LEAST_OWN = 0.02
@@ -71,8 +72,26 @@ def score_effects(
 
 
 def _is_weak(item: Named) -> bool:
-    """Whether an effect gains no more than its standard error: that of a gain g is the root of 2 g."""
-    return item.kind == "physical" and item.effect.scored() and item.gain <= decided().held_out.least_beside
+    """Whether an effect gains no more than its standard error, that of a gain g being the root of 2 g, or may be none."""
+    by = decided().held_out
+    return item.kind == "physical" and item.effect.scored() and (item.gain <= by.least_beside or _may_be_none(item))
+
+
+def weakness(item: Named) -> str:
+    """Words for why an effect beside others is only mentioned."""
+    if _may_be_none(item):
+        return "its value is within its uncertainty of none"
+    return f"it gains {item.gain:.1f} on new blocks"
+
+
+def _may_be_none(item: Named) -> bool:
+    """Whether the one value that an effect on the mean has lies within its uncertainty of none, so that others beside it do as
+    well without it."""
+    values = [(item.entry[key], std) for key, std in item.std.items() if std]
+    if item.effect.shows_in != ShowsIn.MEAN or len(values) != 1:
+        return False
+    ((value, std),) = values
+    return abs(value) < decided().held_out.sigmas_of_none * std
 
 
 def _least_of(item: Named, expected: float) -> float:

@@ -25,7 +25,7 @@ from pipeline.gap.naming.entries import (
     settled_with,
 )
 from pipeline.gap.naming.families import believes
-from pipeline.gap.naming.held_out import Scored, score_effects
+from pipeline.gap.naming.held_out import Scored, score_effects, weakness
 from pipeline.gap.naming.naming import FREE_FORMS, Naming
 from pipeline.gap.naming.splitting import with_splits
 from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, unexplained, verdict_of
@@ -241,7 +241,7 @@ def _held(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, bo
         again = _held(starts, random, left_out | {FREE_FORMS})
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])
-    words += [f"{item.name} only mentioned: beside the others it gains {item.gain:.1f} on new blocks" for item in scored.weak]
+    words += [f"{item.name} only mentioned: beside the others {weakness(item)}" for item in scored.weak]
     described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
     least = decided().held_out.left_over * max(described, default=0.0)
     left = [item for item in scored.named if item.spreads and item.gain < least]
