@@ -99,9 +99,21 @@ RESOLVED = (
     "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 4 --set training.start=more/best "
     "--set training.learning_rate=0.001 --set training.epochs=27 --set training.precision=bfloat16 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out still_more',
-    "scarpsim train sets/mixed --config configs/detectors/fine.yaml --seed 5 --set training.start=default "
-    "--set training.learning_rate=0.001 --set training.precision=bfloat16 "
+    "scarpsim dataset configs/datasets/detector.yaml --set parts.0.train=0 --out sets/one_val",
+    "scarpsim dataset configs/datasets/detector.yaml --seed 16 --set parts.0.val=0 "
+    '--set "parts.0.noise=[2.5cm,7.5cm]" --set name=detector5 --out sets/five',
+    "scarpsim dataset configs/datasets/detector.yaml --seed 17 --set parts.0.val=0 "
+    '--set "parts.0.noise=[2.5cm,5cm]" --set name=detector6 '
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/six",
+    "scarpsim dataset configs/datasets/detector.yaml --seed 18 --set parts.0.val=0 "
+    '--set "parts.0.noise=[8mm,5cm]" --set name=detector7 --out sets/seven',
+    "scarpsim train sets/further --config configs/detectors/fine.yaml --seed 5 --set training.start=still_more/best "
+    "--set training.learning_rate=0.0005 --set training.epochs=40 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out further_still',
+    "scarpsim train sets/further --config configs/detectors/fine.yaml --seed 6 --set training.start=default "
+    "--set training.learning_rate=0.0005 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out more_yet',
 )
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
@@ -113,6 +125,7 @@ PARSED = (
     "scarpsim dataset merge sets/a sets/b --out sets/ab",
     "scarpsim dataset merge sets/one sets/two --out sets/detector",
     "scarpsim dataset merge sets/one sets/three sets/four --out sets/mixed",
+    "scarpsim dataset merge sets/one_val sets/four sets/six sets/five sets/seven --out sets/further",
     "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
     "scarpsim detect detector/best runs/bulga",
     "scarpsim detect detector/best runs/bulga --out found",
