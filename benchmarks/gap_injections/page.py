@@ -76,7 +76,9 @@ after 9, 8 and none.
   every second row is compared, rows lie twice as far apart as columns, which the semivariogram of the noise did not know. It is
   named now (0.097 px every 27 px).
 - **Bands of columns** (69, S/N 428) are `unknown` with a curve that repeats, before three effects were named; the wave of S/N 120
-  (53) is missed, before a skew was named; 59 is `unknown` with what it names, since the gap grows with that.
+  (53) is missed, before a skew was named.
+- 66 was asked a second time, once mended. 59 was `several`, though the gap grew; by its numbers that is `unknown` since, which
+  was not asked again.
 
 Not mended:
 

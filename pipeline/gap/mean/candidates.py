@@ -32,7 +32,7 @@ _REPEATED = range(2, 9)
 SCALE_UNKNOWN = 0.03
 """By how much the principal distance in which disparities were found may be another than the nominal one."""
 MOST_SCALES = 80
-"""Of a searched sine of the fraction of a disparity."""
+"""Frequencies, at the most, that are tried of a sine along the disparity, as of `frequencies`."""
 _DIRECTIONS = (30, 60, 120, 150)
 """Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
 
