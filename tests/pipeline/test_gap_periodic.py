@@ -16,7 +16,7 @@ from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.signatures import _searched, mean_families
 from pipeline.gap.naming.entries import Estimate, from_mean
 from pipeline.gap.naming.families import families_of
-from pipeline.gap.residuals.disparity_raster import spacing
+from pipeline.gap.residuals.disparity_raster import cell_px, spacing
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.registration import residuals_of
 from pipeline.gap.residuals.residuals import Residuals
@@ -64,6 +64,13 @@ def test_periods_are_searched_as_far_as_the_rows_tell_them_apart(stride: float, 
         (grid,) = _searched(RowJitter, RowJitter.searched, nowhere, {"camera": camera})
         assert 1 / grid.frequencies[-1] == pytest.approx(shortest)
     assert np.sin(2 * np.pi * 27 / 26.2 * np.arange(9)) == pytest.approx(np.sin(2 * np.pi * 27 / 884.25 * np.arange(9)))
+
+
+@pytest.mark.parametrize(("across", "down", "side"), [(4.0, 4.0, 4.0), (4.0, 8.0, 4.0), (8.0, 4.0, 4.0)])
+def test_cells_are_as_fine_as_the_finer_of_columns_and_rows(across: float, down: float, side: float) -> None:
+    """Coarser ones would hold pixels of two rows."""
+    u, v = (PIXELS / STRIDE * [across, down]).T
+    assert cell_px(u, v) == side
 
 
 def square(x: FloatArray, period: float) -> FloatArray:
