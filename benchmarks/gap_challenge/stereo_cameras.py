@@ -51,7 +51,7 @@ class Frame:
 
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
         i, r2 = self.interior, x * x + y * y
-        radial = 1 + i["k1"] * r2 + i["k2"] * r2**2 + i["k3"] * r2**3 + i["k4"] * r2**4
+        radial = 1 + r2 * (i["k1"] + r2 * (i["k2"] + r2 * (i["k3"] + r2 * i["k4"])))
         return (
             x * radial + i["p1"] * (r2 + 2 * x * x) + 2 * i["p2"] * x * y,
             y * radial + i["p2"] * (r2 + 2 * y * y) + 2 * i["p1"] * x * y,
