@@ -105,6 +105,11 @@ class TriangleMesh:
         normal = area_normals(self.corners(faces))
         return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
+    @cached_property
+    def normals(self) -> FloatArray:
+        """(m, 3) `face_normals` of all faces, kept: for meshes of which many rays meet every face, again and again."""
+        return self.face_normals()
+
     def vertex_normals(self) -> FloatArray:
         """(n, 3) unit normals, outside: the sum of the adjacent faces' normals weighted by area; NaN for an unused vertex."""
         total = np.zeros((3, len(self.vertices)))

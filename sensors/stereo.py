@@ -189,7 +189,13 @@ def rectified_pixel(
     camera: Camera, rotation: FloatArray, u: mi.Float64, v: mi.Float64, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
     """Rectified pixel of the image pixel (u, v)."""
-    x, y = camera.on_device().tangents(u, v)
+    return rectified_tangents(*camera.on_device().tangents(u, v), rotation, f, u_0, v_0)
+
+
+def rectified_tangents(
+    x: mi.Float64, y: mi.Float64, rotation: FloatArray, f: float, u_0: float, v_0: float
+) -> tuple[mi.Float64, mi.Float64]:
+    """Rectified pixel of ideal image coordinates (tangents X/Z, Y/Z)."""
     ray = rotated(rotation, mi.Array3f64(x, y, 1.0))
     scale, centre_u, centre_v = opaque(f, u_0, v_0)
     return scale * ray.x / ray.z + centre_u, scale * ray.y / ray.z + centre_v

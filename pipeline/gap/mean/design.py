@@ -65,7 +65,8 @@ class Design:
     pose: (n, p) orthonormal columns of the pose over sigma, in the model's rows; turn: (p, p) from them to those of the
     residuals; pose_precision: (p,) inverse variance of its coefficients before there are data; value, fixed: the residuals and
     all fixed columns, pose first; place: columns of each candidate; waves: products of the searched sines; drawn: (k,
-    DRAWS) products of the fixed columns with draws of the noise within cells; equations: at every likely covariance.
+    DRAWS) products of the fixed columns with draws of the noise within cells; equations: at every likely covariance; sines: the
+    columns of those that others stand beside, which are numbered on from the fixed ones, None where there are none.
     """
 
     residuals: Residuals
@@ -78,6 +79,7 @@ class Design:
     grids: list[SineGrid]
     value: Projected
     fixed: Projected
+    sines: Projected | None
     place: Mapping[Candidate, list[int]]
     waves: Waves
     drawn: FloatArray
@@ -99,21 +101,20 @@ class Design:
         pose, turn = np.linalg.qr(residuals.pose[rows] * root)
         count = pose.shape[1]
         precision = np.zeros(count) if pose_precision is None else pose_precision
-        signatures = np.concatenate([each.columns[rows] * root for each in chosen.plain], axis=1)
-        fixed = model.project(np.concatenate([pose, _without(pose, signatures)], axis=1))
+        place = _places(chosen.plain, count)
+        fixed = model.project(_columns(model, pose, chosen.plain, place))
         value = model.project(residuals.value[rows, None] * root)
         model, covariances, bases = model.narrowed([fixed.some(list(range(count))), fixed], value)
         fixed, value = fixed.kept(bases), value.kept(bases)
         noise = NoiseDraws.of(model, DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]
-        place = _places(chosen.plain, count)
         asked = count + sum(len(place[each]) for each in chosen.plain if not each.empirical)  # of free forms few are
         waves = Waves.of(model, grids, fixed.weighed[:, :asked], value, noise)
         known = [np.zeros(count), *(precision_of(each, each.columns.shape[1]) for each in chosen.plain)]
         equations = assembled(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
         drawn = noise.products(fixed.within[noise.rows], model.noise.on_nodes(fixed.within))
         found = cls(
-            residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, place, waves, drawn, equations
+            residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, None, place, waves, drawn, equations
         )  # fmt: skip
         return found._crossed(found.base)
 
@@ -144,20 +145,29 @@ class Design:
 
     def _crossed(self, columns: list[int]) -> Design:
         """With the products of the sines with some of the fixed columns."""
+        held = self._some(columns)
         if max(columns) < self.waves.fixed.shape[1]:
             within = self.waves.fixed[:, columns]
         else:
-            within = wave_products(self.grids, self.fixed.weighed[:, columns], self.model.root)
-        products = self.waves.at(self.equations.at, within, [basis[:, columns] for basis in self.fixed.between])
+            within = wave_products(self.grids, held.weighed, self.model.root)
+        products = self.waves.at(self.equations.at, within, held.between)
         return replace(self, equations=self.equations.holding(columns, products))
+
+    def _some(self, columns: list[int]) -> Projected:
+        """Some of the fixed columns, or of those of sines, which stand behind them."""
+        behind = self.fixed.within.shape[1]
+        if self.sines is None or columns[0] < behind:
+            return self.fixed.some(columns)
+        return self.sines.some([column - behind for column in columns])
 
     def _with_sine(self, candidate: Candidate) -> Design:
         (found,) = self.refined([candidate])[0]
         added = self.model.project(_without(self.pose, self._matrix([found], None)))
-        equations = extended(self.equations, self.fixed, self.value, added)
-        start = self.fixed.within.shape[1]
+        had = [self.fixed] if self.sines is None else [self.fixed, self.sines]
+        equations = extended(self.equations, had, self.value, added)
+        start = sum(each.within.shape[1] for each in had)
         place = {**self.place, candidate: list(range(start, start + added.within.shape[1]))}
-        return replace(self, fixed=self.fixed.beside(added), equations=equations, place=place)
+        return replace(self, sines=Projected.of([*had[1:], added]), equations=equations, place=place)
 
     def columns(self, candidates: Sequence[Candidate]) -> list[int]:
         """Numbers of the pose's columns and of those of candidates that it holds."""
@@ -253,7 +263,7 @@ class Design:
         scale = np.maximum(size, 1e-12 * full)
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
 
-    @property
+    @cached_property
     def _pose_columns(self) -> Projected:
         return self.fixed.some(self.base)
 
@@ -268,10 +278,35 @@ class Design:
         return np.concatenate(matrices, axis=1)
 
 
+def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: Mapping[Candidate, list[int]]) -> FloatArray:
+    """(n, k) those of the pose, and of candidates without what the pose explains of them, over sigma, in the model's rows."""
+    count = pose.shape[1]
+    found = np.empty((len(pose), count + sum(len(each) for each in place.values())))
+    found[:, :count] = pose
+
+    def fill(candidate: Candidate) -> None:
+        columns = slice(place[candidate][0], place[candidate][-1] + 1)
+        np.multiply(candidate.columns[model.rows], model.root[:, None], out=found[:, columns])
+
+    side_by_side(fill, plain)
+    _take_off(pose, found[:, count:])
+    return found
+
+
 def _without(pose: FloatArray, columns: FloatArray) -> FloatArray:
     """A shift and a turn of a distant sensor are so much alike that the normal equations would lose what tells them apart."""
-    found = side_by_side(lambda part: part - pose @ (pose.T @ part), column_blocks(columns))
-    return np.concatenate(found, axis=1)
+    found = columns.copy()
+    _take_off(pose, found)
+    return found
+
+
+def _take_off(pose: FloatArray, columns: FloatArray) -> None:
+    """What the pose explains, of columns (n, k), in their place."""
+
+    def take(some: slice) -> None:
+        columns[:, some] -= pose @ (pose.T @ columns[:, some])
+
+    side_by_side(take, column_blocks(columns.shape[1]))
 
 
 def _places(plain: list[Candidate], start: int) -> dict[Candidate, list[int]]:

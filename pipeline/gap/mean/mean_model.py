@@ -182,12 +182,20 @@ class MeanModel:
 
     def project(self, weighted: FloatArray) -> Projected:
         """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
-        return Projected.of(side_by_side(self._projected, column_blocks(weighted)))
+        within = np.empty(weighted.shape)
+        weighed = within if self.noise.is_white else np.empty(weighted.shape)
+        between = [np.empty((self.cells, weighted.shape[1])) for _ in self._bases]
 
-    def _projected(self, weighted: FloatArray) -> Projected:
-        planes = self.planes(weighted)
-        within = self.within(weighted, planes)
-        return Projected(within, self._weighed(within), self.between(planes[: self.cells]))
+        def project(some: slice) -> None:
+            planes = self.planes(weighted[:, some])
+            within[:, some] = self.within(weighted[:, some], planes)
+            if weighed is not within:
+                weighed[:, some] = self._weighed(within[:, some])
+            for basis, means in zip(between, self.between(planes[: self.cells]), strict=True):
+                basis[:, some] = means
+
+        side_by_side(project, column_blocks(weighted.shape[1]))
+        return Projected(within, weighed, between)
 
     def _weighed(self, within: FloatArray) -> FloatArray:
         """Deviations within cells (n, k), multiplied with the inverse covariance of their noise."""
@@ -203,9 +211,9 @@ class MeanModel:
         return [draws if index == at.length else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
 
 
-def column_blocks(columns: FloatArray) -> list[FloatArray]:
-    """Some columns (n, k) at a time, for what is done to each of them."""
-    return [columns[:, start : start + _AT_ONCE] for start in range(0, max(columns.shape[1], 1), _AT_ONCE)]
+def column_blocks(count: int) -> list[slice]:
+    """Some of `count` columns at a time, for what is done to each of them."""
+    return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]
 
 
 def _rough(length: float, distance: FloatArray) -> FloatArray:

@@ -237,14 +237,14 @@ def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: P
     return Equations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
 
 
-def extended(equations: Equations, had: Projected, value: Projected, added: Projected) -> Equations:
+def extended(equations: Equations, had: list[Projected], value: Projected, added: Projected) -> Equations:
     """With further fixed columns. had: the fixed columns so far."""
-    cross, own = had.within.T @ added.weighed, added.within.T @ added.weighed
+    cross, own = np.concatenate([each.within.T @ added.weighed for each in had]), added.within.T @ added.weighed
     right = added.within.T @ value.weighed
     fixed, sides = [], []
     for row, each in enumerate(equations.at):
         weighted = added.between[each.length] * each.weight[:, None]
-        beside = cross + had.between[each.length].T @ weighted
+        beside = cross + np.concatenate([part.between[each.length].T @ weighted for part in had])
         fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.length].T @ weighted]]))
         sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.length]]))
     return replace(equations, fixed=np.stack(fixed), right=np.stack(sides))

@@ -14,11 +14,11 @@ from scene.keyed_random import KeyedRandom
 from scene.mesh import FloatArray
 from scene.raycast import RayCaster
 from scene.upload import on_device, vectors_on_device
-from sensors.camera import Camera, CameraPair
+from sensors.camera import INTERIOR, Camera, CameraPair
 from sensors.device import rotated, vector
 from sensors.effects.base import Effect, Stage
 from sensors.rectify import Rectification, rectify
-from sensors.stereo import rectified_pixel, row_tangent
+from sensors.stereo import rectified_pixel, rectified_tangents, row_tangent
 
 _HIDDEN_SHARE = 2e-4
 """A point is hidden where another surface stands before it by this share of its distance."""
@@ -103,6 +103,14 @@ class NominalPair:
         rect = self.geometry
         return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
 
+    def right_column_of(self, real: Camera, point: mi.Array3f64) -> mi.Float64:
+        """(n,) rectified column of the pixels at which the right camera, as it really is, sees points."""
+        x, y = _seen_tangents(real, point)
+        if _interior(real) != _interior(self.pair.right):  # else the pixel's tangents are these
+            x, y = self.pair.right.on_device().tangents(*real.on_device().pixel(x, y))
+        rect = self.geometry
+        return rectified_tangents(x, y, rect.right, rect.f, rect.u_right, rect.v)[0]
+
 
 def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pixels (u, v) of points (n, 3)."""
@@ -116,9 +124,17 @@ def rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def _pixel(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
-    local = rotated(camera.rotation.T, point - vector(camera.position))
-    u, v = camera.on_device().pixel(local.x / local.z, local.y / local.z)
+    u, v = camera.on_device().pixel(*_seen_tangents(camera, point))
     return u, v
+
+
+def _seen_tangents(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
+    local = rotated(camera.rotation.T, point - vector(camera.position))
+    return local.x / local.z, local.y / local.z
+
+
+def _interior(camera: Camera) -> tuple[float, ...]:
+    return tuple(float(getattr(camera, name)) for name in INTERIOR)
 
 
 def _ray(camera: Camera, u: mi.Float64, v: mi.Float64) -> mi.Array3f64:
@@ -143,11 +159,20 @@ def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry:
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
     column = nominal.left_column(u, v)
     dr.eval(column)
+    known: dict[tuple[float, ...], tuple[mi.Float64, mi.Float64]] = {}
+
+    def tangents(camera: Camera) -> tuple[mi.Float64, mi.Float64]:
+        interior = _interior(camera)
+        if interior not in known:  # most pairs differ in where they stand alone
+            known[interior] = camera.on_device().tangents(u, v)
+            dr.eval(*known[interior])
+        return known[interior]
 
     def seen(pair: CameraPair) -> mi.Float64:
-        origin, ray = vector(pair.left.position), _ray(pair.left, u, v)
+        origin = vector(pair.left.position)
+        ray = rotated(pair.left.rotation, mi.Array3f64(*tangents(pair.left), 1.0))
         met = origin + dr.dot(point - origin, normal) / dr.dot(ray, normal) * ray
-        disparity = column - nominal.right_column(*_pixel(pair.right, met))
+        disparity = column - nominal.right_column_of(pair.right, met)
         dr.eval(disparity)  # one kernel for all pairs, and no waiting for it
         return disparity
 

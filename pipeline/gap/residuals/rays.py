@@ -73,7 +73,7 @@ def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
     ray, scene, position = axes[0], measurement.scene, measurement.station[0]
     distance, face = scene.cast(position, ray)
     face = np.maximum(face, 0)
-    normal = scene.mesh.face_normals(face)
+    normal = scene.mesh.normals[face]
     curvature = np.zeros(len(ray))
     for axis in axes[1:]:
         flat = plane_slopes(normal, ray, axis, distance)

@@ -11,16 +11,19 @@ from numpy.typing import NDArray
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
 from pipeline.gap.residuals.several_scans import scans_residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
 from scene.mesh import FloatArray
+from scene.threads import side_by_side
 
 _ROUNDS = 6
 _AT_ONCE = 2048
 """Rows of a design together, whatever the number of threads: 100 kB of one set-up."""
+_BLOCKS = 64
+"""Such rows that a thread takes at a time."""
 _FEWEST = 100
 _FAR_M, _MOST_MOVES = 0.002, 3
 _FAR_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
@@ -31,9 +34,9 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     """(n,) residuals after a robust registration, the pose (6 k,) of k set-ups, and how many predicted sigmas their spread is (at
     least 1)."""
     kept, scale = residuals.smooth.copy(), 1.0
-    value, pose = residuals.value, np.zeros(residuals.pose.shape[1])
+    value, pose, design = residuals.value, np.zeros(residuals.pose.shape[1]), _weighed(residuals)
     for _ in range(_ROUNDS):
-        before, pose = kept, pose_of(residuals, kept)
+        before, pose = kept, _solved(design[kept])
         value = residuals.value - residuals.pose @ pose
         z = np.abs(value / residuals.sigma)
         scale = max(1.0, nmad(z[residuals.smooth], 0.0))
@@ -47,7 +50,19 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
 
 def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
     """(6,) shift (m) and turn (rad) by weighted least squares over some rows (a mask or indices)."""
-    design = np.concatenate([residuals.pose[rows], residuals.value[rows, None]], axis=1) / residuals.sigma[rows, None]
+    return _solved(_weighed(residuals, rows))
+
+
+def _weighed(residuals: Residuals, rows: Rows = slice(None)) -> FloatArray:
+    """(m, 7) pose and value of some rows over sigma."""
+    design = np.empty((len(residuals.sigma[rows]), residuals.pose.shape[1] + 1))
+    design[:, :-1], design[:, -1] = residuals.pose[rows], residuals.value[rows]
+    design /= residuals.sigma[rows, None]
+    return design
+
+
+def _solved(design: FloatArray) -> FloatArray:
+    """(6,) coefficients of the first columns of (n, 7), by least squares for the last."""
     triangle = _triangle(design)
     return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=np.finfo(float).eps * len(design))[0])
 
@@ -56,9 +71,15 @@ def _triangle(design: FloatArray) -> FloatArray:
     """(m, k) that has the same products of columns as (n, k), by QR of some rows at a time, which stay in the cache."""
     while len(design) > _AT_ONCE:
         whole = len(design) // _AT_ONCE * _AT_ONCE
-        triangles = np.asarray(np.linalg.qr(design[:whole].reshape(-1, _AT_ONCE, design.shape[1]), mode="r"))
-        design = np.concatenate([triangles.reshape(-1, design.shape[1]), design[whole:]])
+        blocks = design[:whole].reshape(-1, _AT_ONCE, design.shape[1])
+        triangles = side_by_side(_factors, [blocks[start : start + _BLOCKS] for start in range(0, len(blocks), _BLOCKS)])
+        design = np.concatenate([*triangles, design[whole:]])
     return design
+
+
+def _factors(blocks: FloatArray) -> FloatArray:
+    """(b k, k) the triangles of blocks (b, m, k)."""
+    return np.asarray(np.linalg.qr(blocks, mode="r")).reshape(-1, blocks.shape[2])
 
 
 def raw_residuals(measurement: Measurement) -> Residuals:

@@ -115,7 +115,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         shared_noise=SharedNoise.of(model, np.stack([u, v], axis=1)),
         notes=(*measurement.notes, *_notes(_recorded(measurement), u, v)),
     )
-    return whole.part(hit)
+    return whole if hit.all() else whole.part(hit)
 
 
 def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
@@ -174,7 +174,7 @@ def _reference(
         disparity=nominal.disparity((u, v), right),
         found=measured,
         point=point,
-        normal=scene.mesh.face_normals(np.maximum(face, 0)),
+        normal=scene.mesh.normals[np.maximum(face, 0)],
         radius=np.hypot(u - left.width / 2, v - left.height / 2),
         radius_right=np.hypot(right[0] - camera.width / 2, right[1] - camera.height / 2),
         tangent=nominal.tangent(u, v),
