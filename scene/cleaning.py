@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from scene.errors import InputError
 from scene.mesh import FloatArray, TriangleMesh
+from scene.threads import side_by_side
 
 Mended = tuple[TriangleMesh, str]
 Index = NDArray[np.int64]
@@ -23,7 +24,7 @@ WELD_M = 1e-6
 """Vertices nearer to one another than this are one, m."""
 _FLAT_M = 1e-9
 """A triangle of a smaller height than this has no area, m."""
-_FACES_AT_ONCE = 1 << 18
+_FACES_AT_ONCE = 1 << 14
 _DIRECTION = np.array([0.5377, 0.6349, 0.5548])
 
 
@@ -163,11 +164,14 @@ def areas(mesh: TriangleMesh) -> FloatArray:
 
 
 def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]], kind: type) -> NDArray[Any]:
-    """(m,) `evaluate` of the (k, 3, 3) corners of the triangles, some at a time to save memory."""
+    """(m,) `evaluate` of the (k, 3, 3) corners of the triangles, some at a time, which stay in the cache."""
     result: NDArray[Any] = np.empty(len(mesh.faces), kind)
-    for start in range(0, len(result), _FACES_AT_ONCE):
+
+    def fill(start: int) -> None:
         part = slice(start, start + _FACES_AT_ONCE)
         result[part] = evaluate(mesh.vertices[mesh.faces[part]])
+
+    side_by_side(fill, range(0, len(result), _FACES_AT_ONCE))
     return result
 
 
