@@ -29,9 +29,9 @@ _DEGREE = 4
 OVERTONES = 5, 11
 """Up to which there may be some beside a sine: what a smooth error has, and what an error that jumps has."""
 _REPEATED = range(2, 9)
-SCALE_UNKNOWN = 0.03
+_SCALE_UNKNOWN = 0.03
 """By how much the principal distance in which disparities were found may be another than the nominal one."""
-MOST_SCALES = 80
+_MOST_SCALES = 80
 """Frequencies, at the most, that are tried of a sine along the disparity, as of `frequencies`."""
 _DIRECTIONS = (30, 60, 120, 150)
 """Degrees on the wall, 0 along x, of covariates that mean nothing to a sensor."""
@@ -197,6 +197,11 @@ def frequencies(low: float, high: float, step: float, most: int = 200) -> FloatA
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
+def along_disparity(cycles: float, reach: float) -> FloatArray:
+    """Frequencies to try of a sine of so many cycles per pixel of the disparity, of unsure scale; reach: of the disparity, px."""
+    return frequencies(cycles * (1 - _SCALE_UNKNOWN), cycles * (1 + _SCALE_UNKNOWN), 0.3 / max(reach, 1.0), _MOST_SCALES)
+
+
 def free_forms(
     covariate: str, values: FloatArray, highest: float = np.inf, most_cycles: float = MOST_CYCLES
 ) -> list[Candidate | SineGrid]:
@@ -299,7 +304,7 @@ def twice_a_pixel(covariate: str, disparity: FloatArray) -> list[SineGrid]:
     One cycle per pixel is an effect of the catalogue.
     """
     x, reach, unit = _standardised(disparity), reach_of(disparity), float(disparity.std())
-    tried = unit * frequencies(2 * (1 - SCALE_UNKNOWN), 2 * (1 + SCALE_UNKNOWN), 0.3 / max(reach, 1.0), MOST_SCALES)
+    tried = unit * along_disparity(2.0, reach)
     return [SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True)] if unit else []
 
 

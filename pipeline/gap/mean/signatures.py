@@ -13,11 +13,10 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import (
-    MOST_SCALES,
-    SCALE_UNKNOWN,
     Candidate,
     SineGrid,
     Wave,
+    along_disparity,
     amplitude_and_phase,
     frequencies,
     variants,
@@ -151,10 +150,9 @@ def _locking(geometry: PixelGeometry) -> list[SineGrid]:
     The rectification in which the disparities were found is not part of a measurement: its principal distance (the period) is
     known to some percent, its offset (the phase) not at all. Locking that acts on the noise too leaves little of its mean.
     """
-    reach = max(float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99]))), 1.0)
+    reach = float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99])))
     one = np.ones_like(geometry.disparity)
     return [
         SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity, float(tried[0])), tried)
-        for reduction in _REDUCTIONS
-        if (tried := frequencies((1 - SCALE_UNKNOWN) / reduction, (1 + SCALE_UNKNOWN) / reduction, 0.3 / reach, MOST_SCALES)).size
+        for tried in (along_disparity(1 / reduction, reach) for reduction in _REDUCTIONS)
     ]
