@@ -277,7 +277,7 @@ def precision_of(candidate: Candidate, width: int) -> FloatArray:
     return np.zeros(width) if candidate.precision is None else candidate.precision
 
 
-def harmonics(covariate: str, sine: Candidate, last: int = OVERTONES[0]) -> Candidate:
+def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:
     """What a periodic error along a covariate has beside a sine that is named: its overtones, up to the last of them."""
     columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in range(2, last + 1)], axis=1)
     return replace(_free(covariate, HARMONICS, columns), period=sine.period, angle=sine.angle)

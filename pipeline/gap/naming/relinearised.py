@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.formats.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import HARMONICS, Candidate, Explanation, SineGrid, harmonics, precision_of
+from pipeline.gap.mean.candidates import HARMONICS, OVERTONES, Candidate, Explanation, SineGrid, harmonics, precision_of
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Chosen, Tried, class_margin
 from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, settled_with, typical_sizes
@@ -302,7 +302,8 @@ def _again(
     others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
     known = [replace(each, candidate=_renewed(each.candidate, renewed)) for each in had]
     columns = [_columns(each) for each in known]
-    others += [harmonics(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
+    periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
+    others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in OVERTONES]
     heavier = _weighed_at(points, at)
     precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
