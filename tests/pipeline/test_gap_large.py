@@ -67,7 +67,7 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Searche
     there, residuals, _ = settled(read_measurement(folder / "case"))
     part = residuals.part(residuals.smooth)
     there, part = there.part(part.index), replace(part, index=np.arange(residuals.smooth.sum()))
-    return SearchedPoints(there, part, families_of(there, part), [], (1.0, 0.0), KeyedRandom(1)), truth
+    return SearchedPoints(there, part, families_of(there, part), lambda _: [], 0.0, KeyedRandom(1)), truth
 
 
 def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(

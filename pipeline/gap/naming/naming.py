@@ -120,7 +120,14 @@ def name_effects(
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
     if not spread and nodes is not None:
         spread = [nodes]
-    points = SearchedPoints(measurement, part, families, spread, (scale, added), random)
+
+    def spread_at(at: Residuals) -> list[SpreadFound]:
+        there = _spread(measurement, at, Cells.over(at.at), registered(at)[0], random, left_out)[0]
+        if there or nodes is None:
+            return there
+        return [replace(nodes, variance=nodes.variance[np.isin(part.index, at.index)])]
+
+    points = SearchedPoints(measurement, part, families, spread_at, added, random)
     first = MeanSearch(weighed(part, spread, scale), families, random)
     found = followed_up(points, first)
     physical = any(not each.empirical for each in families)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,14 +30,14 @@ _MOST_FITS, _FITTED = 10, 0.005
 
 @dataclass(frozen=True)
 class SearchedPoints:
-    """What the searches for effects on the mean share. spread: effects on it that are known; noise: how many predicted sigmas the
-    residuals spread, and variance to add to the predicted one."""
+    """What the searches for effects on the mean share. spread_at: effects on the spread by residuals of these points with some
+    effects on the mean in the model; added: variance to add to the predicted one."""
 
     measurement: Measurement
     part: Residuals
     families: list[Candidate | SineGrid]
-    spread: list[SpreadFound]
-    noise: tuple[float, float]
+    spread_at: Callable[[Residuals], list[SpreadFound]]
+    added: float
     random: KeyedRandom
 
 
@@ -137,7 +137,8 @@ def searched_at_best_fit(points: SearchedPoints) -> Explained | None:
     allowed = {(family.name, family.empirical) for family in points.families}
     families = [each for each in families_of(there, at) if (each.name, each.empirical) in allowed]
     left = replace(at, value=at.value + explained)
-    search = MeanSearch(_weighed_at(points, left), families, points.random.child("best fit"))
+    heavier = replace(_weighed_at(points, at), value=left.value)
+    search = MeanSearch(heavier, families, points.random.child("best fit"))
     together, tried = search.select()
     return Explained(together, _estimates(search, together), search, left, together, tried)
 
@@ -159,7 +160,7 @@ def fitted_together(points: SearchedPoints, candidates: list[Candidate]) -> tupl
         if beyond(points.measurement, estimates, at):
             return None
         there, found, _ = _with(points, estimates)
-        at = noisier(at_points(found, points.part), points.noise[1])
+        at = noisier(at_points(found, points.part), points.added)
         if _has_lost(points, at):
             return None
         renewed = effects_of(there, at)
@@ -293,7 +294,7 @@ def _again(
     """
     part = points.part
     there, found, _ = _with(points, had)
-    at = noisier(at_points(found, part), points.noise[1])
+    at = noisier(at_points(found, part), points.added)
     if _has_lost(points, at):
         return None
     renewed = families_of(there, at)
@@ -323,9 +324,9 @@ def _again(
 
 
 def _weighed_at(points: SearchedPoints, at: Residuals) -> Residuals:
-    """Residuals of those of the points that are left, with the spread that they really have."""
-    kept = _kept(at, points.part)
-    return weighed(at, [replace(each, variance=each.variance[kept]) for each in points.spread], points.noise[0])
+    """Residuals with some effects on the mean in the model, with the spread that they have there: without those in the model what
+    they do looks like noise, beside which nothing small would be seen."""
+    return weighed(at, points.spread_at(at), registered(at)[2])
 
 
 def _with(points: SearchedPoints, effects: list[Estimate]) -> Settled:
