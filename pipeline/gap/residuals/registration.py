@@ -54,7 +54,7 @@ def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatA
 
 
 def _weighed(residuals: Residuals, rows: Rows = slice(None)) -> FloatArray:
-    """(m, 7) pose and value of some rows over sigma."""
+    """(m, 6 k + 1) pose of k set-ups and value of some rows, over sigma."""
     design = np.empty((len(residuals.sigma[rows]), residuals.pose.shape[1] + 1))
     design[:, :-1], design[:, -1] = residuals.pose[rows], residuals.value[rows]
     design /= residuals.sigma[rows, None]
@@ -62,7 +62,7 @@ def _weighed(residuals: Residuals, rows: Rows = slice(None)) -> FloatArray:
 
 
 def _solved(design: FloatArray) -> FloatArray:
-    """(6,) coefficients of the first columns of (n, 7), by least squares for the last."""
+    """(6 k,) coefficients of the first columns of (n, 6 k + 1), by least squares for the last."""
     triangle = _triangle(design)
     return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=np.finfo(float).eps * len(design))[0])
 
