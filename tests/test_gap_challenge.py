@@ -14,15 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from scipy.optimize import least_squares
 
-from benchmarks.gap_challenge import cases, tls_effects
+from benchmarks.gap_challenge import cases, stereo_cases, tls_effects
 from benchmarks.gap_challenge.casting import Surface
 from benchmarks.gap_challenge.run import run
 from benchmarks.gap_challenge.score import score
 from benchmarks.gap_challenge.stereo_cameras import INTERIOR, Frame, Pair, Rectified, looking_at
+from benchmarks.gap_challenge.stereo_effects import real_pair
 from benchmarks.gap_challenge.strength import Whitener, loss_distance, mean_strength, spread_distance
 from benchmarks.gap_challenge.table import markdown
 from benchmarks.gap_challenge.tls_effects import MEAN, SECOND, Rays
+from benchmarks.gap_challenge.walls import small_turn
 
 FOLDER = Path(__file__).parents[1] / "benchmarks/gap_challenge"
 SQUARE = Surface(np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]]), np.array([[0, 1, 2], [0, 2, 3]]))
@@ -164,6 +167,36 @@ def made(folder: Path, seed: int, stratum: str, sensor: str, kinds: tuple[str, .
     case = cases.Case(3, (seed, 0), stratum, sensor, kinds, 5000, 5000)
     cases.make(case, folder / "case", folder / "truth.json")
     return json.loads((folder / "truth.json").read_text())
+
+
+def test_what_a_pose_leaves_of_an_effect_is_what_the_best_pose_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A principal point 10 px off: scipy's trust region over the six parameters, from the middle, leaves within a tenth as much.
+
+    By slopes at the calibrated pose more than three times that stays, beside ledges.
+    """
+    asked: dict[str, Any] = {}
+
+    def left(*of: Any) -> Any:
+        asked["of"], asked["left"] = of, left_by_pose(*of)
+        return asked["left"]
+
+    left_by_pose = stereo_cases._left_by_pose
+    monkeypatch.setattr(stereo_cases, "_left_by_pose", left)
+    monkeypatch.setattr(stereo_cases.Target, "of", lambda *_: 1e-6)
+    made(tmp_path, 60, "one", "stereo", ("principal_point_y",))
+    scene, kind, p, part, base, whiten = asked["of"]
+    assert p["delta_px"] == pytest.approx(10)
+
+    def shown(pose: Any) -> Any:
+        pair = scene.nominal.pair.moved(pose[:3], small_turn(pose[3:]))
+        return whiten(stereo_cases._seen(scene, real_pair(pair, kind, p, scene.world), part))[:, 0]
+
+    scale = np.array([1, 1, 1, 1e-2, 1e-2, 1e-2])
+    best = least_squares(lambda units: shown(scale * units), np.zeros(6), diff_step=1e-3).fun
+    least = np.linalg.norm(best)
+    by_pose = mean_strength(kind, asked["left"], base, {}, whiten).snr
+    assert by_pose == pytest.approx(least, rel=0.1)
+    assert mean_strength(kind, stereo_cases._shown(scene, kind, p, part), base, {}, whiten).snr > 3 * by_pose
 
 
 @pytest.mark.parametrize(("sensor", "kind"), [("tls", "range_incidence_bias"), ("stereo", "focal_length")])

@@ -43,6 +43,7 @@ _SPREADING = {**effects.SPREAD, **effects.OFF_SPREAD}
 Drawn = list[tuple[str, Parameters, Strength]]
 _LOST = 0.02
 _STEP_PX = 32.0
+_POSES = 5
 _STEEP, _WEIGHTLESS = 6.0, 1e12
 """Differences of neighbours beyond so many typical ones are depth steps, where the surface as known is not known well enough to
 count towards an effect's strength; the variance, px^2, that says so."""
@@ -286,13 +287,14 @@ def _drawn(
         else:
             found.append((kind, *_raster(kind, scene, plain, chosen, white[0], random)))
     added = {kind: effects.variance(kind, p, part) for kind, p, _ in found}
-    shown = {kind: _shown(scene, kind, p, part)[:, None] for kind, p, _ in found if kind in _LINEAR}
     whole = sum(added.values(), white)
+    spread = {kind: _whitener(scene, whole + unknown, part, where, p) for kind, p, _ in found if kind in _LINEAR}
+    shown = {kind: _left_by_pose(scene, kind, p, part, base, spread[kind])[:, None] for kind, p, _ in found if kind in _LINEAR}
     strong = []
     for kind, p, strength in found:
         if kind in _LINEAR:
             beside = np.concatenate([base, *(column for other, column in shown.items() if other != kind)], axis=1)
-            strength = mean_strength(kind, shown[kind][:, 0], beside, families, _whitener(scene, whole + unknown, part, where, p))
+            strength = mean_strength(kind, shown[kind][:, 0], beside, families, spread[kind])
         elif strength is None:
             strength = spread_strength(kind, added[kind], whole - added[kind], {"parallax_noise": [np.ones_like(white)]})
         strong.append((kind, p, strength))
@@ -303,6 +305,28 @@ def _shown(scene: Set, kind: str, p: Parameters, part: Image) -> Array:
     """(n,) mean change of the disparity. Locking acts on the noisy disparity, which leaves less of its mean over the true one."""
     damping = float(np.exp(-2 * np.pi**2 * scene.noise[0] ** 2)) if kind == "pixel_locking" else 1.0
     return damping * _signature(scene, kind, p, part)
+
+
+def _left_by_pose(scene: Set, kind: str, p: Parameters, part: Image, base: Array, whiten: Whitener) -> Array:
+    """(n,) mean change of the disparity where both cameras stand so that least of it shows, by Gauss-Newton.
+
+    A principal point 10 px off is mostly a turn of both cameras. By slopes along the surface where the pixels were, much of it
+    stays beside ledges; with the turn itself they see the same places as before, and nothing does.
+    """
+    shown = _shown(scene, kind, p, part)
+    if kind not in effects.CAMERA:
+        return shown
+    fixed, pose, least = whiten(base), np.zeros(6), np.inf
+    for _ in range(_POSES):
+        pair = scene.nominal.pair.moved(pose[:3], small_turn(pose[3:]))
+        found = _seen(scene, effects.real_pair(pair, kind, p, scene.world), part)
+        columns = whiten(found)[:, 0]
+        step = np.linalg.lstsq(fixed, columns, rcond=None)[0]
+        size = float(np.linalg.norm(columns - fixed @ step))
+        if size < least:
+            shown, least = found, size
+        pose = pose - step
+    return shown
 
 
 def _whitener(scene: Set, variance: Array, part: Image, where: Array, p: Parameters) -> Whitener:

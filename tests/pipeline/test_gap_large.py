@@ -19,10 +19,18 @@ from pipeline.formats.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanModel, fitted
-from pipeline.gap.naming.entries import Named
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.naming import relinearised
+from pipeline.gap.naming.entries import Named, from_mean
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.naming.held_out import score_effects
-from pipeline.gap.naming.relinearised import SearchedPoints, fitted_together, searched_at_best_fit
+from pipeline.gap.naming.relinearised import (
+    SearchedPoints,
+    _largest_alone,
+    fitted_together,
+    searched_at_best_fit,
+    weighed,
+)
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.other.spread import SpreadFound, find_spread
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
@@ -110,6 +118,24 @@ def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
     assert noise_in(points.part)
     assert noise_in(at) == []
     assert nmad(registered(at)[0] / at.sigma) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
+    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is what the answer says: with any margin all that were taken exactly are in it, with none those alone that slopes put
+    there and that were not taken exactly."""
+    points, _ = turned_and_zoomed
+    first = MeanSearch(weighed(points.part, [], 1.0), points.families, KeyedRandom(1))
+    classes = {}
+    for margin in (0.0, 1e9):
+        monkeypatch.setattr(relinearised, "class_margin", lambda _, margin=margin: margin)
+        one = _largest_alone(points, first)
+        assert one is not None
+        classes[margin] = set(from_mean(one.estimate, points.part).alike)
+    exactly = classes[1e9] - classes[0.0]
+    assert len(exactly) == 2
+    assert f"stereo.{one.name}" not in classes[1e9]
 
 
 def test_two_large_effects_are_found_where_all_together_fit_best(

@@ -65,19 +65,23 @@ class Explained:
 class _Alone:
     """One effect in the model. at: residuals against that; log_likelihood: of all points."""
 
-    chosen: Chosen
     estimate: Estimate
     at: Residuals
     there: Measurement
     log_likelihood: float
 
     @property
+    def name(self) -> str:
+        """The effect's."""
+        return self.estimate.candidate.name
+
+    @property
     def score(self) -> float:
         """Of all points, less what the effect costs."""
-        return self.log_likelihood - (self.chosen.gain - self.chosen.score)
+        return self.log_likelihood - (self.estimate.chosen.gain - self.estimate.chosen.score)
 
     @classmethod
-    def of(cls, points: SearchedPoints, first: MeanSearch, chosen: Chosen, estimate: Estimate) -> _Alone | None:
+    def of(cls, points: SearchedPoints, first: MeanSearch, estimate: Estimate) -> _Alone | None:
         """None where it is beyond what can be, or where the rays of many points would miss the reference with it."""
         if beyond(points.measurement, [estimate], points.part):
             return None
@@ -89,14 +93,14 @@ class _Alone:
         if kept.mean() < decided().points.kept:
             return None
         value[kept] = np.where(found.smooth, np.clip(rough, -largest, largest), 0.0)
-        return cls(chosen, estimate, at_points(found, points.part), there, first.design.log_likelihood(value, estimate.candidate))
+        return cls(estimate, at_points(found, points.part), there, first.design.log_likelihood(value, estimate.candidate))
 
     def better(self, points: SearchedPoints, first: MeanSearch) -> _Alone | None:
         """With its values moved by the slopes here."""
         candidate = _renewed(self.estimate.candidate, families_of(self.there, self.at))
         width = candidate.columns.shape[1]
         step = _step(self.at, candidate.columns, precision_of(candidate, width), np.zeros(width))
-        return _Alone.of(points, first, self.chosen, replace(self.estimate, values=self.estimate.values + step))
+        return _Alone.of(points, first, replace(self.estimate, values=self.estimate.values + step))
 
 
 def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
@@ -110,7 +114,7 @@ def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     one = _largest_alone(points, first) if together else None
     if one is None:
         return _beside(points, plain) or plain
-    by_itself = _beside(points, replace(plain, chosen=[one.chosen], estimates=[one.estimate]))
+    by_itself = _beside(points, replace(plain, chosen=[one.estimate.chosen], estimates=[one.estimate]))
     if by_itself is not None and len(by_itself.estimates) == 1:
         return by_itself
     there = searched_at_best_fit(points)
@@ -199,9 +203,8 @@ def _largest_alone(points: SearchedPoints, first: MeanSearch) -> _Alone | None:
     """The effect that explains most by itself, of those that explain much; None where slopes say all."""
     found: list[_Alone] = []
     for candidate in first.leading():
-        chosen = first.alone(candidate)
-        (estimate,) = _estimates(first, [chosen])
-        alone = _Alone.of(points, first, chosen, estimate)
+        (estimate,) = _estimates(first, [first.alone(candidate)])
+        alone = _Alone.of(points, first, estimate)
         if alone is None:
             continue
         by_slopes = first.design.log_likelihood(points.part.value, candidate)
@@ -209,7 +212,7 @@ def _largest_alone(points: SearchedPoints, first: MeanSearch) -> _Alone | None:
             return None
         found.append(alone)
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
-    variants = {each.chosen.candidate.name: each for each in reversed(ranked)}
+    variants = {each.name: each for each in reversed(ranked)}
     likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
     converged = sorted((_converged(points, first, each) for each in likely), key=lambda each: -each.score)
     return _with_class(converged) if converged else None
@@ -218,10 +221,11 @@ def _largest_alone(points: SearchedPoints, first: MeanSearch) -> _Alone | None:
 def _with_class(converged: list[_Alone]) -> _Alone:
     """The best, with those that would do as well: slopes say so of effects that were not taken exactly only."""
     best, *others = converged
-    least = best.score - class_margin(best.chosen.gain)
-    near = {each.chosen.candidate.name for each in others if each.score > least}
-    slopes = set(best.chosen.alike) - {each.chosen.candidate.name for each in others}
-    return replace(best, chosen=replace(best.chosen, alike=tuple(sorted(near | slopes))))
+    chosen = best.estimate.chosen
+    least = best.score - class_margin(chosen.gain)
+    near = {each.name for each in others if each.score > least}
+    slopes = set(chosen.alike) - {each.name for each in others}
+    return replace(best, estimate=replace(best.estimate, chosen=replace(chosen, alike=tuple(sorted(near | slopes)))))
 
 
 def _converged(points: SearchedPoints, first: MeanSearch, alone: _Alone) -> _Alone:
