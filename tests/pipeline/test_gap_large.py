@@ -27,6 +27,7 @@ from pipeline.gap.naming.held_out import score_effects
 from pipeline.gap.naming.relinearised import (
     SearchedPoints,
     _largest_alone,
+    _with_class,
     fitted_together,
     searched_at_best_fit,
     weighed,
@@ -130,8 +131,7 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     classes = {}
     for margin in (0.0, 1e9):
         monkeypatch.setattr(relinearised, "class_margin", lambda _, margin=margin: margin)
-        one = _largest_alone(points, first)
-        assert one is not None
+        one = _with_class(_largest_alone(points, first))
         classes[margin] = set(from_mean(one.estimate, points.part).alike)
     exactly = classes[1e9] - classes[0.0]
     assert len(exactly) == 2

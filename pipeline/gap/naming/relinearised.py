@@ -22,7 +22,7 @@ from scene.mesh import FloatArray
 from sensors.effects import effect_of
 from sensors.effects.matching_noise import MatchingNoise
 
-_MOST_CONVERGED, _ROUNDS, _CONVERGED = 3, 4, 1.0
+_MOST_CONVERGED, _ROUNDS, _CONVERGED = 3, 8, 1.0
 """Effects whose values are sought exactly, by so many rounds, while the log-likelihood rises by so much."""
 _MOST_FITS, _FITTED = 10, 0.005
 """Rounds of a fit of all effects together, and the share by which its sum of squares falls at the least."""
@@ -111,10 +111,13 @@ def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     """
     together, tried = first.select()
     plain = Explained(together, _estimates(first, together), first, points.part, together, tried)
-    one = _largest_alone(points, first) if together else None
-    if one is None:
+    alone = _largest_alone(points, first) if together else []
+    if not alone:
         return _beside(points, plain) or plain
-    by_itself = _beside(points, replace(plain, chosen=[one.estimate.chosen], estimates=[one.estimate]))
+    by_itself = _beside_one(points, plain, alone)
+    if by_itself is not None and len(by_itself.estimates) > 1:
+        others = {each.candidate.name for each in by_itself.estimates if not each.candidate.empirical}
+        by_itself = _beside_one(points, plain, _with_others(points, first, alone, others)) or by_itself
     if by_itself is not None and len(by_itself.estimates) == 1:
         return by_itself
     there = searched_at_best_fit(points)
@@ -199,23 +202,50 @@ def _step(at: Residuals, columns: FloatArray, precision: FloatArray, values: Flo
     return np.asarray(found[start:])
 
 
-def _largest_alone(points: SearchedPoints, first: MeanSearch) -> _Alone | None:
-    """The effect that explains most by itself, of those that explain much; None where slopes say all."""
+def _largest_alone(points: SearchedPoints, first: MeanSearch) -> list[_Alone]:
+    """The effects that explain most by themselves, of those that explain much, best first; none where slopes say all."""
     found: list[_Alone] = []
     for candidate in first.leading():
-        (estimate,) = _estimates(first, [first.alone(candidate)])
-        alone = _Alone.of(points, first, estimate)
+        alone = _taken_exactly(points, first, candidate)
         if alone is None:
             continue
         by_slopes = first.design.log_likelihood(points.part.value, candidate)
         if not found and abs(alone.log_likelihood - by_slopes) < decided().mean.slopes_serve:
-            return None
+            return []
         found.append(alone)
+    likeliest = _likeliest(points, first, found)
+    return _with_others(points, first, likeliest, set(likeliest[0].estimate.chosen.alike)) if likeliest else []
+
+
+def _with_others(points: SearchedPoints, first: MeanSearch, alone: list[_Alone], names: set[str]) -> list[_Alone]:
+    """With more effects, of which slopes may miss nearly all, and those that slopes cannot tell from the best; best first."""
+    others = names - {each.name for each in alone}
+    variants = [each for each in first.design.families.plain if each.name in others and not each.empirical]
+    more = [each for each in (_taken_exactly(points, first, variant) for variant in variants) if each is not None]
+    if not more:
+        return alone
+    best, *rest = sorted([*alone, *_likeliest(points, first, more)], key=lambda each: -each.score)
+    return _with_others(points, first, [best, *rest], set(best.estimate.chosen.alike))
+
+
+def _taken_exactly(points: SearchedPoints, first: MeanSearch, candidate: Candidate) -> _Alone | None:
+    """One effect in the model, at the values that slopes give it."""
+    (estimate,) = _estimates(first, [first.alone(candidate)])
+    return _Alone.of(points, first, estimate)
+
+
+def _likeliest(points: SearchedPoints, first: MeanSearch, found: list[_Alone]) -> list[_Alone]:
+    """A variant of each of the likeliest effects, at the values that explain most, best first."""
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
     variants = {each.name: each for each in reversed(ranked)}
     likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
-    converged = sorted((_converged(points, first, each) for each in likely), key=lambda each: -each.score)
-    return _with_class(converged) if converged else None
+    return sorted((_converged(points, first, each) for each in likely), key=lambda each: -each.score)
+
+
+def _beside_one(points: SearchedPoints, plain: Explained, alone: list[_Alone]) -> Explained | None:
+    """With what a search finds beside the best of some effects alone."""
+    estimate = _with_class(alone).estimate
+    return _beside(points, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
 
 
 def _with_class(converged: list[_Alone]) -> _Alone:
