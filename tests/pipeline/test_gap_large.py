@@ -66,6 +66,18 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
     assert (found.gap.closed or 0.0) > 0.9
 
 
+def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """10 px, which turn the registered pair by some milliradians: by slopes it is the other camera's, beside which a focal length
+    makes up for the rest."""
+    monkeypatch.setattr(stereo_cases, "Target", _Strong)
+    make(Case(0, (77, 1), "one", "stereo", ("principal_point_x",), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
+    (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
+    (effect,) = diagnose(read_measurement(tmp_path / "case")).effects
+    assert effect.name == "stereo.principal_point_x"
+    assert effect.entry["camera"] == truth["parameters"]["camera"]
+    assert effect.entry["delta_px"] == pytest.approx(truth["parameters"]["delta_px"], abs=4 * effect.std["delta_px"])
+
+
 @pytest.fixture(scope="module")
 def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchedPoints, dict[str, dict[str, Any]]]:
     """What is measured by a pair with a turned camera (4 mrad) and another focal length (8 px), and both effects' parameters."""

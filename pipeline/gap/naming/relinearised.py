@@ -213,8 +213,10 @@ def _largest_alone(points: SearchedPoints, first: MeanSearch) -> list[_Alone]:
         if not found and abs(alone.log_likelihood - by_slopes) < decided().mean.slopes_serve:
             return []
         found.append(alone)
+    if not found:
+        return []
     likeliest = _likeliest(points, first, found)
-    return _with_others(points, first, likeliest, set(likeliest[0].estimate.chosen.alike)) if likeliest else []
+    return _with_others(points, first, likeliest, set(likeliest[0].estimate.chosen.alike))
 
 
 def _with_others(points: SearchedPoints, first: MeanSearch, alone: list[_Alone], names: set[str]) -> list[_Alone]:
@@ -235,11 +237,15 @@ def _taken_exactly(points: SearchedPoints, first: MeanSearch, candidate: Candida
 
 
 def _likeliest(points: SearchedPoints, first: MeanSearch, found: list[_Alone]) -> list[_Alone]:
-    """A variant of each of the likeliest effects, at the values that explain most, best first."""
+    """A variant of each of the likeliest effects, at the values that explain most, best first; of the best effect the best of the
+    likeliest variants: which camera it is may not show before."""
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
     variants = {each.name: each for each in reversed(ranked)}
     likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
-    return sorted((_converged(points, first, each) for each in likely), key=lambda each: -each.score)
+    best, *rest = sorted((_converged(points, first, each) for each in likely), key=lambda each: -each.score)
+    others = [each for each in ranked if each.name == best.name and each is not variants[best.name]][: _MOST_CONVERGED - 1]
+    best = max([best, *(_converged(points, first, each) for each in others)], key=lambda each: each.score)
+    return [best, *rest]
 
 
 def _beside_one(points: SearchedPoints, plain: Explained, alone: list[_Alone]) -> Explained | None:
