@@ -3,8 +3,8 @@
     python benchmarks/detector_curve.py --set runs/test [--set another] 38448=before 54468=later 70488=default [--write]
 
 Each detector is named with its windows, and its folder. Sets and detections as in detector_table.py, the detections kept in a
-folder beside each set's that is named by the windows. Means over the cells of both sensors at a score of 0.95, masks. --write
-puts the table into docs/detector.md.
+folder beside each set's that is named by the windows; maps are looked at as they are, whatever a detector's `head.mirrored` says.
+Means over the cells of both sensors at a score of 0.95, masks. --write puts the table into docs/detector.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def tested(folder: Path, model: str, windows: str) -> Tested:
     """A set and what a detector finds in it."""
     truth = json.loads((folder / "test" / "annotations.json").read_text(encoding="utf-8"))
     out = folder.with_name(f"{folder.name}_found_{windows}")
-    return Tested(placement_of(folder), truth, detections(model, folder / "test", out), [])
+    return Tested(placement_of(folder), truth, detections(model, folder / "test", out, unmirrored=True), [])
 
 
 def f1(test: Tested, bar: Bar, size: str) -> float:

@@ -90,11 +90,11 @@ def placement_of(folder: Path) -> str:
     return " and ".join(sorted(found))
 
 
-def detections(model: str, folder: Path, out: Path) -> list[dict[str, Any]]:
-    """What a detector finds in a set's tests, made once."""
+def detections(model: str, folder: Path, out: Path, *, unmirrored: bool = False) -> list[dict[str, Any]]:
+    """What a detector finds in a set's tests, made once. unmirrored: in maps as they are alone."""
     path = out / (BASELINE if model == BASELINE else "network") / "detections.json"
     if not path.exists():
-        detect(model, [folder], path.parent, confidences=(LOWEST_SCORE,), pictures=False)
+        detect(model, [folder], path.parent, confidences=(LOWEST_SCORE,), pictures=False, unmirrored=unmirrored)
     return list(json.loads(path.read_text(encoding="utf-8"))["annotations"])
 
 
