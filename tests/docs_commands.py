@@ -104,6 +104,9 @@ def check_override(config: Mapping[str, Any], override: Override) -> None:
         assert any(holds(found, model) for found in config["sensor"]), override.text
     elif override.path == ("sensor",):
         assert any(holds(found, override.value) for found in config["sensor"]), override.text
+    elif override.path[0] == "walls" and override.path[-1] == "set":  # of a site, whose config the wall resolves to
+        for text in override.value:
+            check_override(config["walls"][override.path[1]], read_override(text))
     else:
         place: Any = config
         for part in override.path:

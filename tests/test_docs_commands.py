@@ -38,6 +38,8 @@ TINY = [
     *("--set", "difference.gsd_m=0.1", "--set", "rockfall.count=2", "--quiet"),
 ]
 TINY_WALL = ["--set", "wall.width_m=6", "--set", "wall.height_m=4", "--set", "wall.resolution_m=0.2"]
+FAR = "reconstruction=vertices,noisy_reference=false,scanner.azimuth_step_rad=0.00038,scanner.zenith_step_rad=0.00038"
+NEAR = FAR.replace("0.00038", "0.0007")
 INIT = "scarpsim init --mesh wall.ply --cameras cameras.xml --scanner riegl_vz400i --out site.yaml"
 FIRST = "simulate --sensor tls --config site.yaml"
 MY_SITE = "scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml"
@@ -111,7 +113,20 @@ RESOLVED = (
     "scarpsim train sets/further --config configs/detectors/fine.yaml --seed 5 --set training.start=still_more/best "
     "--set training.learning_rate=0.0005 --set training.epochs=40 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out further_still',
-    "scarpsim train sets/further --config configs/detectors/fine.yaml --seed 6 --set training.start=default "
+    "scarpsim dataset configs/datasets/detector.yaml --seed 19 --set parts.0.val=0 --set name=detector8 "
+    f'--set "walls.glendale.set=[wall.height_m=30,wall.seed=21,{FAR}]" '
+    f'--set "walls.bulga.set=[wall.height_m=30,wall.seed=22,{FAR}]" '
+    f'--set "walls.near.set=[wall.style=glendale,wall.seed=23,{NEAR}]" --out sets/eight',
+    "scarpsim dataset configs/datasets/detector.yaml --seed 20 --set parts.0.val=0 --set name=detector9 "
+    f'--set "walls.glendale.set=[wall.height_m=30,wall.seed=24,{FAR}]" '
+    f'--set "walls.bulga.set=[wall.height_m=30,wall.seed=25,{FAR}]" '
+    f'--set "walls.near.set=[wall.style=bulga,wall.seed=26,{NEAR}]" '
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/nine",
+    "scarpsim train sets/other_rock --config configs/detectors/fine.yaml --seed 6 --set training.start=further_still/best "
+    "--set training.learning_rate=0.0005 --set training.epochs=6 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out other_rock',
+    "scarpsim train sets/other_rock --config configs/detectors/fine.yaml --seed 7 --set training.start=default "
     "--set training.learning_rate=0.0005 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out more_yet',
 )
@@ -126,6 +141,7 @@ PARSED = (
     "scarpsim dataset merge sets/one sets/two --out sets/detector",
     "scarpsim dataset merge sets/one sets/three sets/four --out sets/mixed",
     "scarpsim dataset merge sets/one_val sets/four sets/six sets/five sets/seven --out sets/further",
+    "scarpsim dataset merge sets/one_val sets/four sets/eight sets/nine --out sets/other_rock",
     "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
     "scarpsim detect detector/best runs/bulga",
     "scarpsim detect detector/best runs/bulga --out found",

@@ -117,7 +117,9 @@ def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     by_itself = _beside_one(points, plain, alone)
     if by_itself is not None and len(by_itself.estimates) > 1:
         others = {each.candidate.name for each in by_itself.estimates if not each.candidate.empirical}
-        by_itself = _beside_one(points, plain, _with_others(points, first, alone, others)) or by_itself
+        more = _with_others(points, first, alone, others)
+        if more[0] is not alone[0]:
+            by_itself = _beside_one(points, plain, more) or by_itself
     if by_itself is not None and len(by_itself.estimates) == 1:
         return by_itself
     there = searched_at_best_fit(points)
@@ -220,9 +222,15 @@ def _largest_alone(points: SearchedPoints, first: MeanSearch) -> list[_Alone]:
 
 
 def _with_others(points: SearchedPoints, first: MeanSearch, alone: list[_Alone], names: set[str]) -> list[_Alone]:
-    """With more effects, of which slopes may miss nearly all, and those that slopes cannot tell from the best; best first."""
-    others = names - {each.name for each in alone}
-    variants = [each for each in first.design.families.plain if each.name in others and not each.empirical]
+    """With more effects, of which slopes may miss nearly all, and those that slopes cannot tell from the best; best first.
+
+    Of each the parameters that slopes ask for, in every camera.
+    """
+    others = {item.name: item.candidate.names for item in first.tried(()) if not item.empirical and item.name in names}
+    for each in alone:
+        others.pop(each.name, None)
+    plain = (each for each in first.design.families.plain if not each.empirical)
+    variants = [each for each in plain if each.names == others.get(each.name)]
     more = [each for each in (_taken_exactly(points, first, variant) for variant in variants) if each is not None]
     if not more:
         return alone
