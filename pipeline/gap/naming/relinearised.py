@@ -234,8 +234,8 @@ def _with_others(points: SearchedPoints, first: MeanSearch, alone: list[_Alone],
     more = [each for each in (_taken_exactly(points, first, variant) for variant in variants) if each is not None]
     if not more:
         return alone
-    best, *rest = sorted([*alone, *_likeliest(points, first, more)], key=lambda each: -each.score)
-    return _with_others(points, first, [best, *rest], set(best.estimate.chosen.alike))
+    ranked = sorted([*alone, *_likeliest(points, first, more)], key=lambda each: -each.score)
+    return _with_others(points, first, ranked, set(ranked[0].estimate.chosen.alike))
 
 
 def _taken_exactly(points: SearchedPoints, first: MeanSearch, candidate: Candidate) -> _Alone | None:
