@@ -238,8 +238,17 @@ class NodesDecisions(_Group):
     reference_error: PositiveFloat = _by(
         0.02,
         "m",
-        "Of the reference, correlated over metres, that there may be: smaller noise on nodes cannot be told from it.",
+        "Of the reference, correlated over metres, that there may be; a wave that is no larger may be it.",
         _JUDGEMENT,
+    )
+    reference_length: PositiveFloat = _by(
+        0.45,
+        "m, standard deviation of a Gaussian correlation",
+        "From which on the reference may be wrong by that much: errors in waves of 1.5 m have this correlation (0.3 of a wave).",
+        _JUDGEMENT,
+    )
+    reference_relief: PositiveFloat = _by(
+        0.005, "m", "Of the reference, correlated over less: larger noise on nodes is not its error.", _JUDGEMENT
     )
 
 

@@ -297,7 +297,7 @@ def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_shoul
     there, residuals, truth = made(tmp_path, "stereo", ("regularization_noise",), 8)
     part = residuals.part(residuals.smooth)
     assert isinstance(there.model, StereoModel)
-    found = find_nodes(part, registered(part)[0], there.model, KeyedRandom(1))
+    found, _ = find_nodes(part, registered(part)[0], there.model, KeyedRandom(1))
     assert found is not None
     assert found.parameters["step_px"] == pytest.approx(truth["step_px"], rel=0.5)
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
@@ -335,4 +335,22 @@ def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, se
     there, residuals, _ = made(tmp_path, "stereo", (), seed)
     part = residuals.part(residuals.smooth)
     assert isinstance(there.model, StereoModel)
-    assert find_nodes(part, registered(part)[0], there.model, KeyedRandom(1)) is None
+    assert find_nodes(part, registered(part)[0], there.model, KeyedRandom(1))[0] is None
+
+
+@pytest.mark.parametrize(("off_m", "length_m", "found"), [(0.012, 0.8, False), (0.015, 0.3, True), (0.0, 0.3, False)])
+def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_may_be_so(
+    tmp_path: Path, off_m: float, length_m: float, found: bool
+) -> None:
+    """A reference is wrong by centimetres over metres, not over decimetres; an error of it that is let stand is spoken of."""
+    there, residuals, _ = made(tmp_path, "stereo", (), 1)
+    part = residuals.part(residuals.smooth)
+    random = np.random.default_rng(3)
+    k = random.normal(scale=1 / length_m, size=(400, 2))  # spectrum of a Gaussian correlation exp(-h^2 / 2 l^2)
+    phase = random.uniform(0, 2 * np.pi, 400)
+    field = np.sqrt(2 / 400) * np.cos(part.at @ k.T + phase).sum(axis=1)
+    part = replace(part, value=part.value + off_m * field / part.unit_m)
+    assert isinstance(there.model, StereoModel)
+    nodes, words = find_nodes(part, registered(part)[0], there.model, KeyedRandom(1))
+    assert (nodes is not None) == found
+    assert ("taken for its error" in words) == (off_m > 0 and not found)

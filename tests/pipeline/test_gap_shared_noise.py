@@ -66,6 +66,19 @@ def _planes(model: MeanModel, count: int) -> FloatArray:
     return whole - model.within(whole, model.planes(whole))
 
 
+@pytest.mark.parametrize("step_px", [16.0, 48.0])
+def test_noise_of_two_makers_is_that_of_both_on_one_grid_of_nodes(step_px: float) -> None:
+    """The finer grid carries the coarser noise too: root mean square of 4 % of the variance off, where one by itself is by 5."""
+    pixels = raster(32)
+    makers = NOISE, RegularizationNoise(sigma_px=0.2, step_px=step_px)
+    both = SharedNoise(makers, pixels).field(len(pixels))
+    assert both.weights.shape[1] == max(SharedNoise((each,), pixels).field(len(pixels)).weights.shape[1] for each in makers)
+    lag = (pixels[:, None] - pixels).reshape(-1, 2)
+    expected = sum(each.covariance(lag) for each in makers).reshape(len(pixels), -1)
+    total = sum(each.total_variance for each in makers)
+    assert np.sqrt(np.mean((dense(both) - expected) ** 2)) < 0.04 * total
+
+
 def test_draws_have_the_variance_of_the_products_that_they_stand_for() -> None:
     """4,000 draws: the variance scatters by 2.2 %; 10 %."""
     pixels = raster(24)

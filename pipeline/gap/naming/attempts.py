@@ -28,6 +28,8 @@ from scene.mesh import FloatArray
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.smoothing import Smoothing
 
+_LEAST = 0, 1
+"""One effect, the least complexity that an attempt can have where there is something."""
 _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
 
@@ -166,8 +168,9 @@ def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, 
 
     What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
     what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
-    does so beside it: where the sensor goes along and a term of no effect is left, it stays. Fewer effects are the explanation,
-    of those attempts that leave about as little spread: noise, if it is large enough, takes the place of any effect.
+    does so beside it: where the sensor goes along and a term of no effect is left, and no effect explains all by itself, it
+    stays. Fewer effects are the explanation, of those attempts that leave about as little spread: noise, if it is large enough,
+    takes the place of any effect.
     """
 
     def beside(found: Attempt) -> Attempt:
@@ -182,12 +185,13 @@ def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, 
 
     first = Attempt.of(starts.first, random, left_out)
     found = [beside(first)]
-    if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0):
-        found.append(beside(Attempt.of(starts.staying, random, left_out)))
-    if first.shapes and found[0].complexity > (0, 1):  # one effect is the least that there can be
+    if first.shapes and found[0].complexity > _LEAST:
         smooth = Attempt.of(starts.smooth, random, left_out)
         if smooth.named:
             found.append(beside(smooth))
+    simple = found[-1].complexity <= _LEAST and found[-1].naming.spreads <= found[0].naming.spreads
+    if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0) and not simple:
+        found.insert(1, beside(Attempt.of(starts.staying, random, left_out)))
     widest = decided().shapes.wider * min(each.naming.spreads for each in found)
     return min((each for each in found if each.naming.spreads <= widest), key=lambda each: each.complexity)
 

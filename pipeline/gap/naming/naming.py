@@ -143,14 +143,14 @@ def name_effects(
     if spread in ([], [nodes]) and (_NODES, False) not in left_out:
         match measurement, part, found.at:
             case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
-                nodes_left = find_nodes(found.at, left, model, random)
+                nodes_left, shared = find_nodes(found.at, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
                 if nodes_left is not None and nodes is None:
-                    nodes_in_all = find_nodes(part, registered(part)[0], model, random) if described else None
+                    nodes_in_all = find_nodes(part, registered(part)[0], model, random)[0] if described else None
                     found_nodes = nodes_in_all or nodes_left.everywhere(len(part))
                     return name_effects(measurement, whole, whole_scale, random, left_out, found_nodes)
                 kept = nodes_left or (None if described else nodes)
-                spread = [] if kept is None else [kept]
+                spread, words = ([], words or shared) if kept is None else ([kept], words)
     if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
         again, naming = name_effects(measurement, whole, whole_scale, random, left_out | wrong)
         return with_doubtful(again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong), naming

@@ -5,7 +5,8 @@ Half the mean squared difference of two pixels h apart (the semivariogram) is, b
     g(h) = w + r^2 (4/9 - B(hx / s) B(hy / s)) + c h^2
 
 w the variance of white noise, r and s the standard deviation and the step of a grid of nodes that is interpolated bilinearly, B
-the cubic B-spline (2/3 at 0, 0 from 2 on: two hat functions convolved), and c h^2 the reference's error, which is smooth.
+the cubic B-spline (2/3 at 0, 0 from 2 on: two hat functions convolved), and c h^2 the reference's error, which is smooth. That
+may also be a process of correlation exp(-h^2 / 2 l^2), small where its length l on the wall is short.
 """
 
 from __future__ import annotations
@@ -37,19 +38,22 @@ _CLIP = 4.5
 _RIDGE, _FEW = 0.02, 0.2
 """Share of the covariance of lags added to its diagonal: always, and times lags per block of the wall: few blocks mistake it."""
 _DRAWS = 1999
+_LENGTHS = tuple(2 ** (half / 2) for half in range(-4, 9))
+"""Of correlation that the reference's error is tried with, times the one from which on it may be large."""
 
 
 @dataclass(frozen=True)
 class _Variogram:
     """step: px of the raster, along its coarser axis; lag: (k, 2) px; blocks: (k, b) px^2 less what the model predicts, of each
-    block of the wall times its share of all points; root: (k, k) whitens their sum (root @ value has unit variance); most_smooth:
-    px^2 of the reference's error, at the longest lag, that there may be."""
+    block of the wall times its share of all points; root: (k, k) whitens their sum (root @ value has unit variance); distance_m:
+    (k,) of the lags on the wall; unit_m: metres of depth per px of disparity."""
 
     step: float
     lag: FloatArray
     blocks: FloatArray
     root: FloatArray
-    most_smooth: float
+    distance_m: FloatArray
+    unit_m: float
 
     @property
     def value(self) -> FloatArray:
@@ -61,8 +65,9 @@ class _Variogram:
         columns, value = self.root @ np.stack([form, self._smooth], axis=1), self.root @ self.value
         weights = np.linalg.pinv(columns)
         smooth = float(weights[1] @ value)
-        if not 0 <= smooth <= self.most_smooth:
-            value = value - np.clip(smooth, 0, self.most_smooth) * columns[:, 1]
+        most = self._variance(decided().nodes.reference_error)
+        if not 0 <= smooth <= most:
+            value = value - np.clip(smooth, 0, most) * columns[:, 1]
             columns = columns[:, :1]
             weights = np.linalg.pinv(columns)
         best = weights @ value
@@ -100,10 +105,29 @@ class _Variogram:
         return np.asarray(found / found.max())
 
     @property
-    def smooth_square(self) -> float:
-        """chi^2 of the reference's error alone."""
-        column, value = self.root @ self._smooth, self.root @ self.value
-        return float(np.sum((value - np.clip(column @ value / (column @ column), 0, self.most_smooth) * column) ** 2))
+    def plain_square(self) -> float:
+        """chi^2 of white noise, or of a smooth error of the reference."""
+        white = self.fitted(np.ones(len(self.lag))).square
+        return min(white, self._square_of(self._smooth, decided().nodes.reference_error))
+
+    @property
+    def reference_square(self) -> float:
+        """chi^2 of the best form without nodes: errors of the reference of all lengths too, small where they are short."""
+        by, square = decided().nodes, self.plain_square
+        for length in _LENGTHS:
+            form = 1 - np.exp(-0.5 * (self.distance_m / (length * by.reference_length)) ** 2)
+            most = by.reference_error if length >= 1 else by.reference_relief
+            square = min(square, self._square_of(form, most))
+        return square
+
+    def _square_of(self, form: FloatArray, most_m: float) -> float:
+        """chi^2 of an error of the reference (k,) alone, of a standard deviation of so much at the most."""
+        column, value = self.root @ form, self.root @ self.value
+        return float(np.sum((value - np.clip(column @ value / (column @ column), 0, self._variance(most_m)) * column) ** 2))
+
+    def _variance(self, error_m: float) -> float:
+        """px^2 of an error along the depth."""
+        return (error_m / self.unit_m) ** 2
 
     def best_nodes(self) -> tuple[_Form, float, list[float]] | None:
         """The grid of nodes in the middle of those that fit best, its step, px, and their steps; None where all are too fine."""
@@ -136,23 +160,38 @@ def told_apart(found: list[SpreadFound], part: StereoResiduals, value: FloatArra
     return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
 
 
-def find_nodes(part: StereoResiduals, value: FloatArray, model: StereoModel, random: KeyedRandom) -> SpreadFound | None:
-    """Noise on nodes so far apart that the points around one do not differ by it; larger than a reference may be wrong.
+def find_nodes(
+    part: StereoResiduals, value: FloatArray, model: StereoModel, random: KeyedRandom
+) -> tuple[SpreadFound | None, str]:
+    """Noise on nodes so far apart that the points around one do not differ by it; None and words where the reference may be wrong
+    by as much, None and "" where there is none.
 
     value: (n,) residuals without the mean effects found.
     """
     variogram = _variogram(part, value, model)
     best = None if variogram is None else variogram.best_nodes()
     if variogram is None or best is None:
-        return None
+        return None, ""
     form, step, near = best
-    without = min(variogram.smooth_square, variogram.fitted(np.ones(len(variogram.lag))).square)
-    certain = form.square < without - decided().nodes.least_gain and form.variance > decided().nodes.least_sigmas * form.error
-    if not certain or np.sqrt(form.variance) * float(np.median(part.unit_m)) < decided().nodes.reference_error:
-        return None
+    by = decided().nodes
+    if form.square >= variogram.plain_square - by.least_gain or form.variance <= by.least_sigmas * form.error:
+        return None, ""
+    without = variogram.reference_square
+    if form.square >= without - by.least_gain:
+        return None, _as_reference(form, step, variogram.unit_m)
     name, p_value = RegularizationNoise.tag(), variogram.p_value(random)
     found = SpreadFound(name, name, (), p_value, (without - form.square) / 2, {}, {}, False, np.zeros(len(part)))
-    return _on_nodes(found, form, step, near)
+    return _on_nodes(found, form, step, near), ""
+
+
+def _as_reference(form: _Form, step: float, unit_m: float) -> str:
+    """Words for an error that the reference may have."""
+    sigma = np.sqrt(RegularizationNoise(sigma_px=1.0).total_variance * form.variance)
+    return (
+        f"disparities share an error of {sigma:.2g} px over some {step:.0f} px ({form.variance / form.error:.2g} standard "
+        f"deviations): a reference that is wrong by {1e3 * sigma * unit_m:.2g} mm, alike over as much of the wall, would show "
+        "the same, so this is taken for its error; a better reference would tell"
+    )
 
 
 def _named(white: SpreadFound, part: StereoResiduals, value: FloatArray, model: StereoModel) -> SpreadFound:
@@ -221,8 +260,15 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     covariance += (_RIDGE + _FEW * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
     offsets = np.array([[lag * steps[axis] * (axis == 1), lag * steps[axis] * (axis == 0)] for axis, lag in lags])
     blocks = (means - model.semivariogram(offsets)[:, None]) * weight
-    most = (decided().nodes.reference_error / float(np.median(part.unit_m))) ** 2
-    return _Variogram(max(steps), offsets, blocks, np.linalg.inv(np.linalg.cholesky(covariance)), most)
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    on_wall = np.linalg.norm(offsets, axis=1) * _wall_per_px(part)
+    return _Variogram(max(steps), offsets, blocks, root, on_wall, float(np.median(part.unit_m)))
+
+
+def _wall_per_px(part: StereoResiduals) -> float:
+    """Metres on the wall per px of the image, along rows and columns together."""
+    g = part.geometry
+    return float(np.sqrt(np.prod(np.std(part.at, axis=0)) / (np.std(g.u) * np.std(g.v))))
 
 
 def _near(pairs: FloatArray, length: FloatArray) -> BoolArray:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.linalg import block_diag
 
 from scene.mesh import FloatArray
 from sensors.effects.matching_noise import MatchingNoise, NodeNoise
@@ -17,11 +16,11 @@ from sensors.model import StereoModel
 from sensors.node_grid import MEAN_VARIANCE
 
 _MOST_NODES = 2500
-"""Of one effect; what is finer is represented by nodes farther apart, of the same power at long wavelengths."""
+"""What is finer is represented by nodes farther apart, of the same power at long wavelengths."""
 _SAMPLE = 500
 _RIDGE = 1e-4
-_NEAR = np.arange(-5, 6)
-"""Nodes along either side whose covariance with one counts."""
+_REACH = 2.5
+"""Steps of an effect over which its nodes' noise is followed: disparities two steps apart share none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +62,11 @@ class SharedNoise:
 
         What is finer than the points' own spacing is as good as white, and left out.
         """
-        fields = [_none(count)]
-        if self.pixels is not None and count:
-            area = float(np.prod(np.maximum(np.ptp(self.pixels, axis=0), 1.0)))
-            fields += [_on_nodes(effect, self.pixels, area) for effect in self.effects if effect.step_px**2 > area / count]
-        weights = sparse.csr_array(sparse.hstack([each.weights for each in fields], format="csr"))
-        return NodeField(weights, block_diag(*(each.covariance for each in fields)))
+        if self.pixels is None or not count:
+            return _none(count)
+        area = float(np.prod(np.maximum(np.ptp(self.pixels, axis=0), 1.0)))
+        coarse = [effect for effect in self.effects if effect.step_px**2 > area / count]
+        return _on_nodes(coarse, self.pixels, area) if coarse else _none(count)
 
 
 NOT_SHARED = SharedNoise()
@@ -78,33 +76,41 @@ def _none(count: int) -> NodeField:
     return NodeField(sparse.csr_array((count, 0)), np.zeros((0, 0)))
 
 
-def _on_nodes(effect: NodeNoise, pixels: FloatArray, area: float) -> NodeField:
-    """The effect's covariance on nodes half as far apart as its own, where those lie not being known.
+def _on_nodes(effects: list[NodeNoise], pixels: FloatArray, area: float) -> NodeField:
+    """The covariance of all of them together on nodes half as far apart as those of the finest, where they lie not being known.
 
     Nodes so far apart that they miss some of it are given its power at long wavelengths, which is 9/4 of the variance times the
     square of the step (that of bilinear interpolation).
     """
-    step = max(effect.step_px / 2, float(np.sqrt(area / _MOST_NODES)))
+    step = max(min(effect.step_px for effect in effects) / 2, float(np.sqrt(area / _MOST_NODES)))
     weights, nodes = _bilinear(pixels, step)
-    around = step * np.stack(np.meshgrid(_NEAR, _NEAR, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float64)
-    table = effect.covariance(around).reshape(len(_NEAR), -1)
-    scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / (step**2 * float(table.sum()))
-    matrix = _stationary(np.rint(nodes / step).astype(np.int64), scale * table)
+    place = np.rint(nodes / step).astype(np.int64)
+    matrix = sum((_stationary(place, _table(effect, step)) for effect in effects), np.zeros((len(nodes), len(nodes))))
     return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
+
+
+def _table(effect: NodeNoise, step: float) -> FloatArray:
+    """(k, k) covariance of two nodes that are apart by up to (k - 1) / 2 steps along either axis."""
+    reach = int(np.ceil(_REACH * effect.step_px / step))
+    near = step * np.arange(-reach, reach + 1)
+    around = np.stack(np.meshgrid(near, near, indexing="ij"), axis=-1).reshape(-1, 2)
+    table = effect.covariance(around).reshape(len(near), -1)
+    scale = effect.total_variance / MEAN_VARIANCE * effect.step_px**2 / (step**2 * float(table.sum()))
+    return np.asarray(scale * table)
 
 
 def _stationary(place: NDArray[np.int64], table: FloatArray) -> FloatArray:
     """(q, q) covariance of nodes at `place` ((q, 2), in steps of their grid), which is 0 but for those near each other.
 
-    table: of two that are apart by `_NEAR` steps along either axis.
+    table: (k, k) of two that are apart by up to (k - 1) / 2 steps along either axis.
     """
-    corner, margin = place.min(axis=0), len(_NEAR) // 2
+    corner, margin = place.min(axis=0), len(table) // 2
     number = np.full(np.ptp(place, axis=0) + 1 + 2 * margin, -1)
     inside = place - corner + margin
     number[tuple(inside.T)] = np.arange(len(place))
     matrix = np.zeros((len(place), len(place)))
     for (row, column), covariance in np.ndenumerate(table):
-        other = number[inside[:, 0] - _NEAR[row], inside[:, 1] - _NEAR[column]]
+        other = number[inside[:, 0] + margin - row, inside[:, 1] + margin - column]
         there = other >= 0
         matrix[np.flatnonzero(there), other[there]] = covariance
     return matrix
