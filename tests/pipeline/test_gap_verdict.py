@@ -99,12 +99,13 @@ def _every() -> Iterator[tuple[Any, Evidence, str]]:
 
 
 def test_no_gap_needs_a_gap_at_the_floor_and_a_p_value_that_does_not_reject() -> None:
-    for found, evidence, _ in _every():
+    for found, evidence, said in _every():
         gap, p_value = evidence.gap, evidence.p_value
         near = gap is not None and gap.before - gap.floor <= 2 * ERROR
         agrees = not found.effects and near and p_value is not None and p_value > 0.01 and not evidence.far
         agrees = agrees and evidence.wide < 1.5
         assert (found.verdict == "no_gap") == agrees
+        assert not agrees or not found.remaining["note"] or f"note: {found.remaining['note']}" in said
 
 
 def test_nothing_is_said_to_agree_that_does_not() -> None:

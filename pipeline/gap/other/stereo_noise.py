@@ -113,7 +113,8 @@ class _Variogram:
     @property
     def reference_square(self) -> float:
         """chi^2 of the best form without nodes: errors of the reference of all lengths too, small where they are short."""
-        by, square = decided().nodes, self.plain_square
+        by = decided().nodes
+        square = self.plain_square
         for length in _LENGTHS:
             form = 1 - np.exp(-0.5 * (self.distance_m / (length * by.reference_length)) ** 2)
             most = by.reference_error if length >= 1 else by.reference_relief

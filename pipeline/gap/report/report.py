@@ -127,6 +127,8 @@ def _summary(found: GapDiagnosis) -> str:
         factor, unit = found.gap.shown
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
         lines.append(f"  gap {scores}: {closing(found.gap, found.mended)}")
+    if found.verdict == "no_gap" and found.remaining.get("note"):
+        lines.append(f"  note: {found.remaining['note']}")
     return "\n".join(lines)
 
 
