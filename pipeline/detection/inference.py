@@ -20,8 +20,17 @@ def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0
     """The blocks in a difference map (h, w), m, NaN where there are no data, best first.
 
     model: a MaskRCNN. Tiles overlap by a half of their side, so that every block of up to that size lies whole in one of them;
-    `seams` says what becomes of the blocks that a tile's inner border cuts.
+    `seams` says what becomes of the blocks that a tile's inner border cuts. Margins without data are not searched.
     """
+    known = np.isfinite(difference)
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return []
+    inner = difference[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return [item.moved(int(rows[0]), int(columns[0])) for item in _searched(model, inner, minimum_score)]
+
+
+def _searched(model: Any, difference: NDArray[np.float32], minimum_score: float) -> list[Detection]:
     size = model.size
     noise = nmad(difference)
     parts: list[BlockPart] = []

@@ -114,6 +114,22 @@ def test_every_mark_is_found_once_and_whole(shape, smaller_better):
     assert [item.score for item in found] == sorted((item.score for item in found), reverse=True)
 
 
+def test_margins_without_data_are_not_searched():
+    """As around a wall that does not fill its raster: the same answers, moved, from as many tiles."""
+    shape, margin = (150, 100), ((70, 300), (40, 130))
+    marks = scattered(shape)
+    alone, framed = MarkFinder(), MarkFinder()
+    expected = inference.detect(alone, map_of(shape, marks))
+    found = inference.detect(framed, np.pad(map_of(shape, marks), margin, constant_values=np.nan))
+    assert [(item.row - 70, item.column - 40, item.score) for item in found] == [
+        (item.row, item.column, item.score) for item in expected
+    ]
+    for one, other in zip(found, expected, strict=True):
+        assert_array_equal(one.mask, other.mask)
+    assert framed.calls == alone.calls
+    assert inference.detect(framed, np.full(shape, np.nan, np.float32)) == []
+
+
 def _u_shape(shape: tuple[int, int]) -> np.ndarray:
     mask = rectangle(shape, 40, 30, 120, 110)
     mask[40:130, 50:120] = False

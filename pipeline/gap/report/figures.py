@@ -61,6 +61,7 @@ def maps_figure(found: GapDiagnosis) -> bytes:
     _bar(figure, image, panels[1], "1: as predicted")
     for panel in panels.ravel():
         panel.set_facecolor("0.85")
+        panel.set_anchor("N")  # in the middle of its place the title of a low map may end above the figure
         dress_map(panel, pixels.extent[0], pixels.extent[2])
         panel.label_outer()
         for change in found.changes:

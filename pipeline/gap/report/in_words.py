@@ -104,10 +104,10 @@ def _asides(found: GapDiagnosis) -> list[str]:
     parts = []
     if found.changes:
         volume = sum(abs(change.volume_m3) for change in found.changes)
-        regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
+        regions, were = ("1 region", "was") if len(found.changes) == 1 else (f"{len(found.changes)} regions", "were")
         std = sum(change.volume_std_m3**2 for change in found.changes) ** 0.5
         moved = f"{volume:.2g} \N{PLUS-MINUS SIGN} {std:.1g} m\N{SUPERSCRIPT THREE} in all"
-        parts.append(f"{regions} where the rock itself moved ({moved}) were set aside.")
+        parts.append(f"{regions} where the rock itself moved ({moved}) {were} set aside.")
     if found.remaining.get("note"):
         parts.append(f"Note: {found.remaining['note']}.")
     return parts
