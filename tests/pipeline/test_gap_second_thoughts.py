@@ -162,6 +162,41 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
     assert attempt(starts, KeyedRandom(1), frozenset()).shapes == {"edge_fattening"}
 
 
+@pytest.mark.parametrize(
+    ("smooth", "spreads", "expected"),
+    [
+        ((0, 1), 1.0, {"first", "smooth"}),
+        ((0, 1), 2.0, {"first", "smooth", "staying"}),
+        ((1, 2), 1.0, {"first", "smooth", "staying"}),
+    ],
+)
+def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_all(
+    monkeypatch: pytest.MonkeyPatch, smooth: tuple[int, int], spreads: float, expected: set[str]
+) -> None:
+    """One effect by itself that leaves no more spread; the answer is the least complex of what was tried."""
+    asked: dict[str, tuple[tuple[int, int], float]] = {
+        "first": ((1, 3), 1.0),
+        "smooth": (smooth, spreads),
+        "staying": ((0, 2), 1.0),
+    }
+    tried = []
+
+    def named(_: Any, state: str, *_given: Any) -> Any:
+        tried.append(state)
+        complexity, wide = asked[state]
+        shapes = set() if state == "smooth" else {"smoothing"}
+        return SimpleNamespace(
+            named=["effect"], shapes=shapes, complexity=complexity, naming=SimpleNamespace(spreads=wide), state=state
+        )
+
+    monkeypatch.setattr(Attempt, "of", classmethod(named))
+    seen = [ShapeFound(Smoothing(sigma_px=2.0), {}, 50.0, np.zeros(1, dtype=bool))]
+    starts: Any = SimpleNamespace(**{name: name for name in asked}, seen_beside=lambda _: seen, beside=lambda _: None)
+    found = attempt(starts, KeyedRandom(1), frozenset())
+    assert set(tried) == expected
+    assert found.complexity == min(asked[name][0] for name in expected if asked[name][1] < 2)
+
+
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
     """A search has it of the whole raster, points that miss the reference included, and a trial in it takes that over."""
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
