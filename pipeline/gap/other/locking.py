@@ -29,6 +29,10 @@ _BINS_A_CYCLE, _STEPS_A_CYCLE = 8, 4
 _MOST_BINS = 4096
 _LARGEST = 0.6
 """Amplitude in matched pixels."""
+_AROUND = 0.06
+"""Of the best amplitude: what may be meant too."""
+_NOISE_UNSURE, _LEAST_LEFT = 0.1, 0.01
+"""Share by which the noise may be another than what is predicted and measured; of the measured variance, what is noise at least."""
 _MULTIPLES = np.arange(1, 5)
 _FOLDING, _FAR, _NO_SINE = 1 / (2 * np.pi), 0.3, 0.02
 _MOST_POINTS = 60_000
@@ -47,13 +51,36 @@ class Locking:
     gain: float
 
 
+@dataclass(frozen=True)
+class Spread:
+    """Standard deviations, px, of the noise that a model predicts, and of what was measured about the surface as known, noise and
+    locking together. Of small amplitudes the first multiple alone shows, whose size the noise changes as they do."""
+
+    predicted: float
+    measured: float
+
+    def in_pixels(self, frequency: float) -> Spread:
+        """In matched pixels, of so many a px."""
+        return Spread(self.predicted * frequency, self.measured * frequency)
+
+    def blurs(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """From and to which the noise may be beside each amplitude, px."""
+        left = np.sqrt(np.maximum(self.measured**2 - amplitude**2 / 2, _LEAST_LEFT * self.measured**2))
+        return (1 - _NOISE_UNSURE) * np.minimum(left, self.predicted), (1 + _NOISE_UNSURE) * np.maximum(left, self.predicted)
+
+
 def find_locking(
-    disparity: FloatArray, reference: FloatArray, tangent: FloatArray | float = 0.0, infinity: FloatArray | float = 0.0
+    disparity: FloatArray,
+    reference: FloatArray,
+    tangent: FloatArray | float = 0.0,
+    infinity: FloatArray | float = 0.0,
+    spread: Spread | None = None,
 ) -> Locking | None:
     """The locking that measured disparities (n,), px, show, if any: n |R|^2 is exponential where there is none (Rayleigh).
 
     reference: (n,) disparities of the surface as known; what crowds there too, by more than chance, is its shape; tangent: (n,)
-    of the angle between a point's rectified row and the axis; infinity: disparity of a point at infinity.
+    of the angle between a point's rectified row and the axis; infinity: disparity of a point at infinity; spread: None where the
+    noise may be anything.
     """
     thin = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
     far = np.broadcast_to(infinity, disparity.shape)[thin]
@@ -79,7 +106,8 @@ def find_locking(
     if by_chance > decided().locking.significance:
         return None
     pixels = frequency * (some / (1 + np.tan(tilt) * rows) + far)
-    share, error = _amplitude(np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES]), count)
+    strength = np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES])
+    share, error = _amplitude(strength, count, None if spread is None else spread.in_pixels(frequency))
     first = complex(np.exp(2j * np.pi * pixels).mean())
     phase = float(np.angle(-np.conj(first) * np.sign(j1(2 * np.pi * share))))
     return Locking(share / frequency, error / frequency, 1 / frequency, phase, tilt, float(gain))
@@ -129,15 +157,21 @@ def _refined(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt:
     return frequency + top[0] * unit[0], tilt + top[1] * unit[1]
 
 
-def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
+def _amplitude(strength: FloatArray, count: int, spread: Spread | None) -> tuple[float, float]:
     """Amplitude and its standard deviation, matched pixels, from the mean of each multiple: least squares over blur and it."""
 
     def square(share: FloatArray, blur: FloatArray) -> FloatArray:
         harmonics = np.abs(jv(_MULTIPLES, 2 * np.pi * _MULTIPLES * share[:, None, None]))
         predicted = harmonics * np.exp(-2 * (np.pi * _MULTIPLES * blur[None, :, None]) ** 2)
-        return np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
+        found = np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
+        if spread is None:
+            return found
+        least, most = spread.blurs(share)
+        beyond = np.maximum(least[:, None] - blur, 0) + np.maximum(blur - most[:, None], 0)
+        return np.asarray(found + (beyond / (_NOISE_UNSURE * spread.predicted)) ** 2)
 
-    shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, decided().locking.most_blur, 60)
+    largest = decided().locking.most_blur
+    shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, largest, 60)
     coarse = square(shares, blurs)
     row = _plausible(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)
     for width in (0.01, 0.002):
@@ -148,8 +182,8 @@ def _amplitude(strength: FloatArray, count: int) -> tuple[float, float]:
         row = int(np.argmin(coarse.min(axis=1)))
     best = float(coarse.min())
     # the spread by curvature, the blur free
-    around = shares[row] + np.linspace(-0.02, 0.02, 201)
-    profile = square(around, np.linspace(0.0, decided().locking.most_blur, 200)).min(axis=1)
+    around = np.maximum(shares[row] + np.linspace(-_AROUND, _AROUND, 201), 0.0)
+    profile = square(around, np.linspace(0.0, largest, 200)).min(axis=1)
     weight = np.exp(-0.5 * (profile - profile.min()) / max(best, 1.0))
     weight /= weight.sum()
     mean = float(weight @ around)

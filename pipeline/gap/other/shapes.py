@@ -51,11 +51,14 @@ class WallBlocks:
         """Gains (n,) by block."""
         return np.asarray(np.bincount(self.number, gains))
 
-    def tested(self, gains: FloatArray, least_sigmas: float | None = None) -> float | None:
-        """Total of gains (n,), None where they do not convince: blocks all over the wall have to agree."""
+    def tested(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
+        """Total of gains (n,), None where they do not convince: blocks all over the wall have to agree, by their sums, or by the
+        signs of these where few of them hold most of the points."""
         by = decided().shapes
         total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_of_a_point, by.most_of_a_point))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
+        if by_signs:
+            sigmas = max(sigmas, float(np.sign(sums).sum()) / np.sqrt(max(np.count_nonzero(sums), 1)))
         if total < by.least_gain or sigmas < (by.block_sigmas if least_sigmas is None else least_sigmas):
             return None
         return total

@@ -260,7 +260,8 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
     covariance += (_RIDGE + _FEW * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
     offsets = np.array([[lag * steps[axis] * (axis == 1), lag * steps[axis] * (axis == 0)] for axis, lag in lags])
-    blocks = (means - model.semivariogram(offsets)[:, None]) * weight
+    white = max(float(np.median(part.sigma**2)) - model.variance, 0.0)  # of what was found apart, such as a locking
+    blocks = (means - (model.semivariogram(offsets) + white)[:, None]) * weight
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     on_wall = np.linalg.norm(offsets, axis=1) * _wall_per_px(part)
     return _Variogram(max(steps), offsets, blocks, root, on_wall, float(np.median(part.unit_m)))

@@ -207,7 +207,7 @@ def _fattening(witnesses: _Witnesses) -> ShapeFound | None:
         far, best = min(zip(outlines, settled, strict=True), key=lambda each: each[1].times_predicted)
         if best.times_predicted < witnesses.times_predicted / decided().shapes.wide:
             (radius, height), there = far, best
-    gain = witnesses.blocks.tested(gains(radius))
+    gain = witnesses.blocks.tested(gains(radius), by_signs=True)  # outlines may stand in few places
     if gain is None:
         return None
     uneven = min(there.blocks.std(gains, radius, 1.0), float(radius))
