@@ -32,7 +32,7 @@ _LARGEST = 0.6
 _AROUND = 0.06
 """Of the best amplitude: what may be meant too."""
 _NOISE_UNSURE, _LEAST_LEFT = 0.1, 0.01
-"""Share by which the noise may be another than what is predicted and measured; of the measured variance, what is noise at least."""
+"""Share by which the noise may be another than predicted and measured; of the measured variance, what is noise at least."""
 _MULTIPLES = np.arange(1, 5)
 _FOLDING, _FAR, _NO_SINE = 1 / (2 * np.pi), 0.3, 0.02
 _MOST_POINTS = 60_000
