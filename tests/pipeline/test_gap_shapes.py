@@ -20,6 +20,7 @@ from pipeline.gap.naming import naming as steps
 from pipeline.gap.naming.entries import with_effects
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.other.mixed_pixels import find_footprint
+from pipeline.gap.other.shapes import WallBlocks
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
 from pipeline.gap.other.stereo_shapes import find_shapes
@@ -179,6 +180,34 @@ def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int]
     believed = raster.at_points(raster.disparity)
     for effect in (EdgeFattening(radius_px=6.5), Smoothing(sigma_px=8.0), OcclusionFill(reach_px=30.0)):
         np.testing.assert_allclose(part.moved([effect], believed[rows]), raster.moved([effect], believed)[rows], atol=1e-9)
+
+
+def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
+    """Runs of equal disparities, to a thousandth of the noise; neighbours in a column, and across a gap, are none."""
+    random = np.random.default_rng(7)
+    cells = random.normal(scale=0.3, size=(40, 60))
+    cells[5, 10:14] = cells[5, 9]
+    cells[20:23, 30] = cells[20, 30]
+    cells[30, 42] = cells[30, 40]
+    row, column = (place.ravel() for place in np.indices(cells.shape))
+    known = ~((row == 30) & (column == 41))
+    there = DisparityRaster(1.0, np.zeros(cells.shape), np.zeros(cells.shape, dtype=bool), row[known], column[known])
+    copies = np.zeros(cells.shape, dtype=bool)
+    copies[row[known], column[known]] = there.copies(cells.ravel()[known] + 1e-4 * random.uniform(size=int(known.sum())), 3e-4)
+    assert copies[5, 9:14].all()
+    assert not copies[20:23, 30].any()
+    assert not copies[30, [40, 42]].any()
+    assert copies.sum() < 10, "0.04 % of 2,399 pairs by chance"
+
+
+def test_outlines_in_few_places_agree_by_signs() -> None:
+    """A block of 60 points and 14 of two, all for it: 15 of 15 signs are 3.9 deviations, the sums, of which one is most, 1.5."""
+    number = np.repeat(np.arange(15), [60, *[2] * 14])
+    blocks, gains = WallBlocks(number), np.full(len(number), 2.0)
+    assert blocks.tested(gains) is None
+    assert blocks.tested(gains, by_signs=True) == pytest.approx(176)
+    against = np.where(number % 3 == 1, -2.0, 2.0)
+    assert blocks.tested(against, by_signs=True) is None
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("smoothing", 1), ("edge_fattening", 1), ("occlusion_fill", 6)])

@@ -58,7 +58,8 @@ class WallBlocks:
         total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_of_a_point, by.most_of_a_point))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
         if by_signs:
-            sigmas = max(sigmas, float(np.sign(sums).sum()) / np.sqrt(max(np.count_nonzero(sums), 1)))
+            signs = np.sign(sums[sums != 0])
+            sigmas = max(sigmas, float(signs.sum()) / max(float(np.linalg.norm(signs)), 1.0))
         if total < by.least_gain or sigmas < (by.block_sigmas if least_sigmas is None else least_sigmas):
             return None
         return total

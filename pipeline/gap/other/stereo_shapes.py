@@ -37,6 +37,8 @@ _FINER = (1.1, 1.03)
 _FILLED, _STRAY_FILLED = 0.9, 0.02
 """Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
 _NEAR_STEPS, _REGISTRATIONS = 2, 3
+_COPIED = 0.02
+"""Difference of neighbours, in standard deviations of the noise, up to which one is a copy of the other: of 1 % by chance."""
 _FILTERED = 0.02
 """Share by which a low-pass is off since the reference is filtered for the rock, at its own cells and up to its own borders."""
 
@@ -83,7 +85,7 @@ class _Witnesses:
 
     def found(self, effect: Effect, std: dict[str, float], gain: float) -> ShapeFound:
         """An effect that the points ask for beside the known ones."""
-        return ShapeFound(effect, std, gain, _touched(effect, self.beside, self.raster, self.disparity))
+        return ShapeFound(effect, std, gain, _touched(effect, self.beside, self.raster, self.residuals))
 
     @property
     def times_predicted(self) -> float:
@@ -164,7 +166,7 @@ def find_shapes(
     effects = [*believed, *(each.effect for each in found)]
     before = (effects[: len(believed) + count] for count in range(len(found)))
     return [
-        replace(each, touched=_touched(each.effect, others, raster, disparity))
+        replace(each, touched=_touched(each.effect, others, raster, residuals))
         for each, others in zip(found, before, strict=True)
     ]
 
@@ -173,15 +175,19 @@ def _asked(witnesses: _Witnesses, trial: _Trial) -> ShapeFound | None:
     return trial(witnesses)
 
 
-def _touched(effect: Effect, beside: list[Effect], raster: DisparityRaster, disparity: FloatArray) -> BoolArray:
-    """(n,) points where an effect beside others cannot be predicted to the noise. disparity: (n,) the reference's at them, px."""
+def _touched(effect: Effect, beside: list[Effect], raster: DisparityRaster, residuals: StereoResiduals) -> BoolArray:
+    """(n,) points where an effect beside others cannot be predicted to the noise.
+
+    What fills half-occluded strips fills other gaps too: of those filled points nothing but their neighbours is seen.
+    """
+    at = residuals.geometry
     match effect:
         case EdgeFattening():
             wider = effect.model_copy(update={"radius_px": effect.radius_px + _NEAR_STEPS * raster.step})
-            return np.asarray(raster.moved([wider], disparity) != 0)
+            return np.asarray(raster.moved([wider], at.disparity) != 0)
         case Smoothing():
             return raster.beside_border(effect.sigma_px)
-    return raster.filled(beside)
+    return raster.filled(beside) | raster.copies(at.found, _COPIED * float(np.median(residuals.sigma)))
 
 
 def _fattening(witnesses: _Witnesses) -> ShapeFound | None:

@@ -112,6 +112,13 @@ class DisparityRaster:
         """(n,) points in cells that the left camera alone sees, where no effect that looks at neighbours gives any."""
         return np.asarray(np.isnan(self.at_points(self.after(effects))) & self.at_points(self.hidden))
 
+    def copies(self, found: FloatArray, tolerance: float) -> BoolArray:
+        """(n,) points whose measured disparity (n,), px, is that of the cell beside them in the row, as fillings leave it."""
+        cells = np.full(self.disparity.shape, np.nan)
+        cells[self.row, self.column] = found
+        same = np.abs(np.diff(cells, axis=1)) < tolerance
+        return self.at_points(np.pad(same, ((0, 0), (1, 0))) | np.pad(same, ((0, 0), (0, 1))))
+
     def after(self, effects: Iterable[Effect]) -> FloatArray:
         """(rows, columns) disparities after those of the effects that look at neighbours, px, NaN where there is no match."""
         found = self.disparity
