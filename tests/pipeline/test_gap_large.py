@@ -16,6 +16,7 @@ from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_challenge.strength import Target
 from pipeline.change.robust import nmad
 from pipeline.formats.measurement import read_measurement
+from pipeline.gap.decisions import Decisions, deciding
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanModel, fitted
@@ -143,11 +144,30 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     classes = {}
     for margin in (0.0, 1e9):
         monkeypatch.setattr(relinearised, "class_margin", lambda _, margin=margin: margin)
-        one = _with_class(_largest_alone(points, first))
+        one = _with_class(_largest_alone(points, first, first.select()[0]))
         classes[margin] = set(from_mean(one.estimate, points.part).alike)
     exactly = classes[1e9] - classes[0.0]
     assert len(exactly) == 2
     assert f"stereo.{one.name}" not in classes[1e9]
+
+
+def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
+    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A weak second effect may be what the first one's slopes are wrong by: the first is taken exactly then, else not."""
+    points, _ = turned_and_zoomed
+    first = MeanSearch(weighed(points.part, [], 1.0), points.families, KeyedRandom(1))
+    chosen = first.select()[0]
+    (leading, *_) = _largest_alone(points, first, chosen)
+    wrong_by = abs(leading.log_likelihood - first.design.log_likelihood(points.part.value, leading.estimate.candidate))
+    monkeypatch.setattr(first, "leading", lambda: [leading.estimate.candidate])
+    monkeypatch.setattr(relinearised, "_taken_exactly", lambda *_: leading)
+    monkeypatch.setattr(relinearised, "_likeliest", lambda *_: [leading])
+    monkeypatch.setattr(relinearised, "_with_others", lambda _points, _first, alone, _names: alone)
+    by = Decisions().model_copy(update={"mean": Decisions().mean.model_copy(update={"slopes_serve": 2 * wrong_by})})
+    with deciding(by):
+        assert _largest_alone(points, first, [replace(chosen[0], gain=3 * wrong_by)]) == []
+        assert _largest_alone(points, first, [replace(chosen[0], gain=3 * wrong_by), replace(chosen[0], gain=1.5 * wrong_by)])
 
 
 def test_two_large_effects_are_found_where_all_together_fit_best(

@@ -27,7 +27,7 @@ from pipeline.gap.naming.entries import (
 )
 from pipeline.gap.naming.families import believes, families_of
 from pipeline.gap.naming.relinearised import Explained, SearchedPoints, at_points, beyond, followed_up, noisier, undone, weighed
-from pipeline.gap.other.locking import Spread, find_locking
+from pipeline.gap.other.locking import SpreadAllowed, find_locking
 from pipeline.gap.other.quantization import find_comb
 from pipeline.gap.other.spread import SpreadFound, SpreadTried, TimesPredicted, find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
@@ -102,8 +102,8 @@ def name_effects(
         comb = find_comb(part.geometry.measured_m)
     if isinstance(part, StereoResiduals) and not believes(measurement, PixelLocking.tag()):
         at = part.geometry
-        spread_px = Spread(float(np.median(part.sigma)), nmad(registered(part)[0]))
-        locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, spread_px)
+        allowed = SpreadAllowed(float(np.median(part.sigma)), nmad(registered(part)[0]))
+        locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
     if comb is not None:
         named.append(from_comb(comb, part))
         added, scale = comb.step_m**2 / 12, 1.0

@@ -24,6 +24,8 @@ from sensors.effects.matching_noise import MatchingNoise
 
 _MOST_CONVERGED, _ROUNDS, _CONVERGED = 3, 8, 1.0
 """Effects whose values are sought exactly, by so many rounds, while the log-likelihood rises by so much."""
+_MADE_UP = 0.5
+"""Share of what an effect gains that may be what slopes are wrong by."""
 _MOST_FITS, _FITTED = 10, 0.005
 """Rounds of a fit of all effects together, and the share by which its sum of squares falls at the least."""
 
@@ -111,7 +113,7 @@ def followed_up(points: SearchedPoints, first: MeanSearch) -> Explained:
     """
     together, tried = first.select()
     plain = Explained(together, _estimates(first, together), first, points.part, together, tried)
-    alone = _largest_alone(points, first) if together else []
+    alone = _largest_alone(points, first, together) if together else []
     if not alone:
         return _beside(points, plain) or plain
     by_itself = _beside_one(points, plain, alone)
@@ -204,15 +206,17 @@ def _step(at: Residuals, columns: FloatArray, precision: FloatArray, values: Flo
     return np.asarray(found[start:])
 
 
-def _largest_alone(points: SearchedPoints, first: MeanSearch) -> list[_Alone]:
-    """The effects that explain most by themselves, of those that explain much, best first; none where slopes say all."""
+def _largest_alone(points: SearchedPoints, first: MeanSearch, together: list[Chosen]) -> list[_Alone]:
+    """The effects that explain most by themselves, of those that explain much, best first; none where slopes say all: where they
+    are wrong by less than anything gains that was chosen."""
     found: list[_Alone] = []
+    serve = min([decided().mean.slopes_serve, *(_MADE_UP * each.gain for each in together)])
     for candidate in first.leading():
         alone = _taken_exactly(points, first, candidate)
         if alone is None:
             continue
         by_slopes = first.design.log_likelihood(points.part.value, candidate)
-        if not found and abs(alone.log_likelihood - by_slopes) < decided().mean.slopes_serve:
+        if not found and abs(alone.log_likelihood - by_slopes) < serve:
             return []
         found.append(alone)
     if not found:

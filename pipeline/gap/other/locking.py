@@ -52,16 +52,16 @@ class Locking:
 
 
 @dataclass(frozen=True)
-class Spread:
+class SpreadAllowed:
     """Standard deviations, px, of the noise that a model predicts, and of what was measured about the surface as known, noise and
     locking together. Of small amplitudes the first multiple alone shows, whose size the noise changes as they do."""
 
     predicted: float
     measured: float
 
-    def in_pixels(self, frequency: float) -> Spread:
+    def in_pixels(self, frequency: float) -> SpreadAllowed:
         """In matched pixels, of so many a px."""
-        return Spread(self.predicted * frequency, self.measured * frequency)
+        return SpreadAllowed(self.predicted * frequency, self.measured * frequency)
 
     def blurs(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
         """From and to which the noise may be beside each amplitude, px."""
@@ -74,7 +74,7 @@ def find_locking(
     reference: FloatArray,
     tangent: FloatArray | float = 0.0,
     infinity: FloatArray | float = 0.0,
-    spread: Spread | None = None,
+    spread: SpreadAllowed | None = None,
 ) -> Locking | None:
     """The locking that measured disparities (n,), px, show, if any: n |R|^2 is exponential where there is none (Rayleigh).
 
@@ -157,7 +157,7 @@ def _refined(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt:
     return frequency + top[0] * unit[0], tilt + top[1] * unit[1]
 
 
-def _amplitude(strength: FloatArray, count: int, spread: Spread | None) -> tuple[float, float]:
+def _amplitude(strength: FloatArray, count: int, spread: SpreadAllowed | None) -> tuple[float, float]:
     """Amplitude and its standard deviation, matched pixels, from the mean of each multiple: least squares over blur and it."""
 
     def square(share: FloatArray, blur: FloatArray) -> FloatArray:
