@@ -81,6 +81,16 @@ def test_a_shrub_before_the_wall_is_none() -> None:
     assert found(np.where(np.hypot(x - 8, y - 10) < 1.5, 1.0, 0.01)) is None
 
 
+def test_losses_in_a_sector_show_among_shrubs() -> None:
+    """Two shrubs, one of them in the sector's own strip of rock, take three times what the sector takes."""
+    x, y, covariates = pulses()
+    shrub = (np.hypot(x - 8, y - 10) < 1.5) | (np.hypot(x - 14, y - 5) < 1.2)
+    chance = np.where(np.abs(covariates["azimuth"] - 0.1) < 0.08, 0.12, 0.01)
+    effect = found(np.where(shrub, 0.9, chance))
+    assert effect is not None
+    assert effect.covariate == "azimuth"
+
+
 def test_lines_that_the_scanner_dropped_are_none() -> None:
     """Nine gaps of some lines and a fifth of their height, as often by chance in one sector; of 20 draws one may be taken for a
     sector's losses, two with a chance of 2 % where that of each is 1 %."""
