@@ -82,13 +82,14 @@ def test_a_shrub_before_the_wall_is_none() -> None:
 
 
 def test_losses_in_a_sector_show_among_shrubs() -> None:
-    """Two shrubs, one of them in the sector's own strip of rock, take three times what the sector takes."""
+    """Three shrubs, one of them before the sector, take more pulses than the sector does; they alone are none."""
     x, y, covariates = pulses()
-    shrub = (np.hypot(x - 8, y - 10) < 1.5) | (np.hypot(x - 14, y - 5) < 1.2)
-    chance = np.where(np.abs(covariates["azimuth"] - 0.1) < 0.08, 0.12, 0.01)
-    effect = found(np.where(shrub, 0.9, chance))
+    shrub = np.any([np.hypot(x - column, y - row) < 2.0 for column, row in ((8, 10), (14, 5), (-10, 22))], axis=0)
+    in_sector = np.abs(covariates["azimuth"] - 0.1) < 0.08
+    effect = found(np.where(shrub, 0.9, np.where(in_sector, 0.09, 0.01)))
     assert effect is not None
     assert effect.covariate == "azimuth"
+    assert found(np.where(shrub, 0.9, 0.01)) is None
 
 
 def test_lines_that_the_scanner_dropped_are_none() -> None:
