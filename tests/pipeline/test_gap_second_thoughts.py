@@ -13,11 +13,12 @@ from gap_cases import write_scan
 
 from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurement import StereoMeasurement, read_measurement
+from pipeline.gap.mean.candidates import PLACE
 from pipeline.gap.naming import workflow
 from pipeline.gap.naming.attempts import Attempt, Starts, State, attempt
 from pipeline.gap.naming.entries import Named, with_effects
 from pipeline.gap.naming.held_out import Scored
-from pipeline.gap.naming.naming import FREE_FORMS
+from pipeline.gap.naming.naming import FREE_FORMS, _most_like
 from pipeline.gap.naming.relinearised import at_points
 from pipeline.gap.naming.verify import simulated
 from pipeline.gap.other.shapes import ShapeFound
@@ -195,6 +196,22 @@ def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_a
     found = attempt(starts, KeyedRandom(1), frozenset())
     assert set(tried) == expected
     assert found.complexity == min(asked[name][0] for name in expected if asked[name][1] < 2)
+
+
+def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
+    """The largest of what was tried, but mere places, with its size; nothing where chance leaves as much, or one was found."""
+
+    def item(name: str, score: float, form: str) -> Any:
+        return SimpleNamespace(name=name, score=score, empirical=bool(form), candidate=SimpleNamespace(form=form))
+
+    tried = (item(f"{PLACE} 30", 9.0, "step"), item("azimuth", 8.0, "smooth"), item("row_jitter", 3.0, ""))
+    part: Any = SimpleNamespace(unit_m=np.full(3, 0.1))
+    for p_value, estimates, expected in ((0.004, [], 1), (0.02, [], 0), (None, [], 0), (0.004, ["effect"], 0)):
+        search = SimpleNamespace(p_of_rest=lambda _, p_value=p_value: p_value, size=lambda each: 0.01 * each.score)
+        found: Any = SimpleNamespace(search=search, tried=tried, estimates=estimates)
+        said = _most_like(found, part)
+        assert len(said) == expected
+        assert all("a change with azimuth (smooth), 8 mm" in words for words in said)
 
 
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:

@@ -181,6 +181,12 @@ class MeanSearch:
         error = min(float(np.sqrt(fit.at.ratio)) * design.model.typical_sigma, most)
         return float(np.std(candidates[0].columns @ values)) < decided().mean.wave_sigmas * error
 
+    def size(self, item: Tried) -> float:
+        """Standard deviation of what an explanation by itself says, in the observable's unit."""
+        (candidate,), fit = self.design.refined([item.candidate])
+        values = self.design.split(fit.coefficients, [candidate])[0][: candidate.columns.shape[1]]
+        return float(np.std(candidate.columns @ values))
+
     def leading(self) -> list[Candidate]:
         """Effects of the catalogue that are large and explain much by themselves, each variant for itself, best first."""
         plain, fixed, _ = self._profile(())

@@ -159,7 +159,8 @@ def name_effects(
     named += moving
     named += [from_spread(each, part.sensor) for each in spread]
     times = TimesPredicted(1.0, False) if spread else TimesPredicted.of(found.at, design.cells, left, random)
-    notes = (*part.notes, *_words(left_out), *filter(None, [words]), *_repeats(found.estimates), *_slanting(found))
+    said = (*_repeats(found.estimates), *_slanting(found), *_most_like(found, part))
+    notes = (*part.notes, *_words(left_out), *filter(None, [words]), *said)
     p_value = found.search.p_of_rest(found.tried)
     alone = first.tried(()) if moving else ()
     p_alone = first.p_of_rest(alone) if alone else p_value
@@ -224,6 +225,20 @@ def _repeats(estimates: list[Estimate]) -> list[str]:
     """Words for forms that repeat after a few lines."""
     lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(REPEATED)]
     return [f"what is described repeats every {each} lines exactly: facets of a mirror or a read-out in blocks" for each in lines]
+
+
+def _most_like(found: Explained, part: Residuals) -> list[str]:
+    """Words for what remains where it is more than chance leaves, and nothing was found that says it."""
+    p_value = found.search.p_of_rest(found.tried)
+    if found.estimates or p_value is None or p_value > decided().verdict.least_p:
+        return []
+    best = max((item for item in found.tried if not item.name.startswith(PLACE)), key=lambda item: item.score)
+    what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name
+    size = 1e3 * found.search.size(best) * float(np.median(part.unit_m))
+    return [
+        f"what remains is most like {what}, {size:.2g} mm (standard deviation): a reference that is wrong along whole lines or "
+        "columns, as in strips, looks so too, and points from another station would tell"
+    ]
 
 
 def _slanting(found: Explained) -> list[str]:
