@@ -79,6 +79,11 @@ RESOLVED = (
     "scarpsim dataset configs/datasets/detector.yaml --out sets/one",
     "scarpsim dataset configs/datasets/detector.yaml --seed 13 --set parts.0.val=0 --set name=detector2 --out sets/two",
     "scarpsim dataset configs/datasets/detector_test.yaml --out sets/detector_test",
+    'scarpsim dataset configs/datasets/detector_test.yaml --set "sensors=[tls]" --set "parts.0.sizes=[large]" '
+    "--set tiles.size_px=1560 --set tiles.minimum_valid_share=0.05 --set name=whole --out sets/whole",
+    'scarpsim dataset configs/datasets/detector_test.yaml --set "sensors=[tls]" --set "parts.0.sizes=[large]" '
+    "--set tiles.size_px=1560 --set tiles.minimum_valid_share=0.05 --set name=whole-mean --set parts.0.test=1 "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/whole_mean",
     "scarpsim train sets/small --out detector",
     "scarpsim train sets/small --config configs/detectors/fine.yaml --out detector",
     "scarpsim train sets/detector --config configs/detectors/fine.yaml --set training.epochs=24 --out detector",

@@ -20,14 +20,22 @@ def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0
     """The blocks in a difference map (h, w), m, NaN where there are no data, best first.
 
     model: a MaskRCNN. Tiles overlap by a half of their side, so that every block of up to that size lies whole in one of them;
-    `seams` says what becomes of the blocks that a tile's inner border cuts. Margins without data are not searched.
+    `seams` says what becomes of the blocks that a tile's inner border cuts. Margins without data are not searched where a map is
+    larger than a tile.
     """
     known = np.isfinite(difference)
-    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
+    if not known.any():
         return []
-    inner = difference[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return [item.moved(int(rows[0]), int(columns[0])) for item in _searched(model, inner, minimum_score)]
+    (top, bottom), (left, right) = (_searched_along(np.asarray(known.any(axis=axis)), model.size) for axis in (1, 0))
+    return [item.moved(top, left) for item in _searched(model, difference[top:bottom, left:right], minimum_score)]
+
+
+def _searched_along(known: NDArray[np.bool_], size: int) -> tuple[int, int]:
+    """From and to where the rows or columns (n,) that have data are searched, with tiles of side `size`."""
+    if len(known) <= size:
+        return 0, len(known)
+    there = np.flatnonzero(known)
+    return int(there[0]), int(there[-1]) + 1
 
 
 def _searched(model: Any, difference: NDArray[np.float32], minimum_score: float) -> list[Detection]:

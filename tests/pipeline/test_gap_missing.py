@@ -81,17 +81,6 @@ def test_a_shrub_before_the_wall_is_none() -> None:
     assert found(np.where(np.hypot(x - 8, y - 10) < 1.5, 1.0, 0.01)) is None
 
 
-def test_losses_in_a_sector_show_among_shrubs() -> None:
-    """Three shrubs, one of them before the sector, take more pulses than the sector does; they alone are none."""
-    x, y, covariates = pulses()
-    shrub = np.any([np.hypot(x - column, y - row) < 2.0 for column, row in ((8, 10), (14, 5), (-10, 22))], axis=0)
-    in_sector = np.abs(covariates["azimuth"] - 0.1) < 0.08
-    effect = found(np.where(shrub, 0.9, np.where(in_sector, 0.09, 0.01)))
-    assert effect is not None
-    assert effect.covariate == "azimuth"
-    assert found(np.where(shrub, 0.9, 0.01)) is None
-
-
 def test_lines_that_the_scanner_dropped_are_none() -> None:
     """Nine gaps of some lines and a fifth of their height, as often by chance in one sector; of 20 draws one may be taken for a
     sector's losses, two with a chance of 2 % where that of each is 1 %."""

@@ -23,8 +23,6 @@ LOSSES = tuple(effect.tag() for effect in catalogue("tls") if effect.shows_in ==
 _PULSES_PER_PATCH = 60.0
 _STRIPS = 8
 """Across a sector, that must agree on its losses."""
-_UNUSUAL = 4.0
-"""Standard deviations of a binomial count by which more are lost in one part of a strip than in the others."""
 _DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
 """What losses may depend on for no reason of the catalogue (range, incidence and power have theirs), and what goes across it."""
 _BINS = 16
@@ -134,21 +132,13 @@ def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
 
 def _strips_agree(missing: Missing, known: MissingFound, free: MissingFound, fit: BoolArray) -> bool:
     """Whether losses by one angle are common to all strips of the other: a shrub before the wall takes the pulses of a few, as do
-    lines that the scanner dropped. Each strip is asked what it gains by the median share of the others; parts of it in which far
-    more are lost than in those have no say, nor do they raise the known effect's chance."""
-    strip = _equal_parts(missing.covariates[_DIRECTIONS[free.covariate]][fit], _STRIPS)
-    group = _equal_parts(missing.covariates[free.covariate], _BINS)[fit]
-
-    def summed(each: FloatArray | None) -> FloatArray:
-        return np.bincount(strip * _BINS + group, each, _STRIPS * _BINS).reshape(_STRIPS, _BINS).astype(np.float64)
-
-    sent, gone, expected = summed(None), summed(missing.lost[fit].astype(np.float64)), summed(known.chance[fit])
-    share = (gone + 0.5) / (sent + 1.0)
-    q = np.stack([np.median(np.delete(share, row, axis=0), axis=0) for row in range(_STRIPS)])
-    usual = gone - sent * q < _UNUSUAL * np.sqrt(sent * q * (1 - q) + 0.25)
-    p = np.clip(expected / np.maximum(sent, 1) * gone[usual].sum() / expected[usual].sum(), 1e-9, 1 - 1e-9)
-    gains = gone * np.log(q / p) + (sent - gone) * (np.log1p(-q) - np.log1p(-p))
-    sums = np.sum(np.where(usual, gains, 0.0), axis=1)
+    lines that the scanner dropped. Each strip is asked what it gains by the losses of the others."""
+    lost, across = missing.lost[fit], missing.covariates[_DIRECTIONS[free.covariate]][fit]
+    strip, group = _equal_parts(across, _STRIPS), _equal_parts(missing.covariates[free.covariate], _BINS)[fit]
+    sent, gone = (np.bincount(strip * _BINS + group, each, _STRIPS * _BINS).reshape(_STRIPS, _BINS) for each in (None, lost))
+    others = (gone.sum(axis=0) - gone + 0.5) / (sent.sum(axis=0) - sent + 1.0)
+    p, q = np.clip(known.chance[fit], 1e-9, 1 - 1e-9), others[strip, group]
+    sums = np.bincount(strip, np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p)), _STRIPS)
     return float(sums.sum()) > decided().losses.agreement * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
 
 
