@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import FOLDED, OVERTONES, PLACE, REPEATED, Candidate, Explanation, SineGrid, harmonics
 from pipeline.gap.mean.design import Design
+from pipeline.gap.mean.mean_model import MeanFit
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
 from pipeline.gap.residuals.residuals import Residuals
@@ -174,18 +175,21 @@ class MeanSearch:
         """
         if form.candidate.form != "wave":
             return False
-        design = self.design
-        candidates, fit = design.refined([form.candidate, *(member.candidate for member in members)])
-        values = design.split(fit.coefficients, candidates)[0][:2]
-        most = decided().nodes.reference_error / float(np.median(design.residuals.unit_m))
-        error = min(float(np.sqrt(fit.at.ratio)) * design.model.typical_sigma, most)
-        return float(np.std(candidates[0].columns @ values)) < decided().mean.wave_sigmas * error
+        size, fit = self._said(form, members)
+        most = decided().nodes.reference_error / float(np.median(self.design.residuals.unit_m))
+        error = min(float(np.sqrt(fit.at.ratio)) * self.design.model.typical_sigma, most)
+        return size < decided().mean.wave_sigmas * error
 
     def size(self, item: Tried) -> float:
         """Standard deviation of what an explanation by itself says, in the observable's unit."""
-        (candidate,), fit = self.design.refined([item.candidate])
-        values = self.design.split(fit.coefficients, [candidate])[0][: candidate.columns.shape[1]]
-        return float(np.std(candidate.columns @ values))
+        return self._said(item, ())[0]
+
+    def _said(self, form: Tried, members: Members) -> tuple[float, MeanFit]:
+        """The same beside some effects, and the fit of all."""
+        candidates, fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
+        columns = candidates[0].columns
+        values = self.design.split(fit.coefficients, candidates)[0][: columns.shape[1]]
+        return float(np.std(columns @ values)), fit
 
     def leading(self) -> list[Candidate]:
         """Effects of the catalogue that are large and explain much by themselves, each variant for itself, best first."""

@@ -30,7 +30,7 @@ _MOST_BINS = 4096
 _LARGEST = 0.6
 """Amplitude in matched pixels."""
 _AROUND = 0.06
-"""Of the best amplitude: what may be meant too."""
+"""Matched pixels about the best amplitude over which its standard deviation is taken: twice that of one that noise nearly hides."""
 _NOISE_UNSURE, _LEAST_LEFT = 0.1, 0.01
 """Share by which the noise may be another than predicted and measured; of the measured variance, what is noise at least."""
 _MULTIPLES = np.arange(1, 5)
@@ -158,7 +158,10 @@ def _refined(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt:
 
 
 def _amplitude(strength: FloatArray, count: int, spread: SpreadAllowed | None) -> tuple[float, float]:
-    """Amplitude and its standard deviation, matched pixels, from the mean of each multiple: least squares over blur and it."""
+    """Amplitude and its standard deviation, matched pixels, from the mean of each multiple: least squares over blur and it.
+
+    spread: in matched pixels.
+    """
 
     def square(share: FloatArray, blur: FloatArray) -> FloatArray:
         harmonics = np.abs(jv(_MULTIPLES, 2 * np.pi * _MULTIPLES * share[:, None, None]))
@@ -181,7 +184,7 @@ def _amplitude(strength: FloatArray, count: int, spread: SpreadAllowed | None) -
         coarse = square(shares, blurs)
         row = int(np.argmin(coarse.min(axis=1)))
     best = float(coarse.min())
-    # the spread by curvature, the blur free
+    # its spread, the blur free within what is allowed
     around = np.maximum(shares[row] + np.linspace(-_AROUND, _AROUND, 201), 0.0)
     profile = square(around, np.linspace(0.0, largest, 200)).min(axis=1)
     weight = np.exp(-0.5 * (profile - profile.min()) / max(best, 1.0))
