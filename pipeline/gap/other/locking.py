@@ -30,7 +30,7 @@ _MOST_BINS = 4096
 _LARGEST = 0.6
 """Amplitude in matched pixels."""
 _AROUND = 0.06
-"""Matched pixels about the best amplitude over which its standard deviation is taken: twice that of one that noise nearly hides."""
+"""Matched pixels about the best amplitude over which its spread is taken: twice that of one that noise nearly hides."""
 _NOISE_UNSURE, _LEAST_LEFT = 0.1, 0.01
 """Share by which the noise may be another than predicted and measured; of the measured variance, what is noise at least."""
 _MULTIPLES = np.arange(1, 5)
