@@ -157,6 +157,11 @@ class TrainingConfig(Config):
     crop_px: int | None = Field(
         None, ge=64, multiple_of=64, description="train on random windows of this side (default: whole images)"
     )
+    data: Literal["streamed", "resident"] = Field(
+        "streamed",
+        description="streamed: tiles are read and windows cut while the network works on those before; resident: all tiles lie "
+        "in the accelerator's memory and windows are cut there, for graphics cards, with KERAS_BACKEND=jax alone",
+    )
     stop_window: int = Field(10, ge=2, le=100_000, description="epochs over which the slope of the validation loss is averaged")
     stop_slope: float = Field(0.0, ge=0, description="stop once the loss falls by less than this per epoch; 0: never")
     keep_epochs: int = Field(

@@ -20,7 +20,7 @@ from pipeline.formats.inside import inside
 from scene.errors import InputError
 
 Batch = dict[str, NDArray[Any]]
-_MIRRORED: dict[bool | str, tuple[int, ...]] = {True: (1, 0), "left_right": (1,), False: ()}
+MIRRORED: dict[bool | str, tuple[int, ...]] = {True: (1, 0), "left_right": (1,), False: ()}
 """Axes along which images are mirrored, by `training.flips`."""
 
 
@@ -112,7 +112,7 @@ def batches(
             random = np.random.default_rng((training.seed, epoch, 1 + int(index))) if learning else None
             labelled = window(folder.labelled(int(index)), size, random)
             if random is not None:
-                for axis in _MIRRORED[training.flips]:
+                for axis in MIRRORED[training.flips]:
                     labelled = mirrored(labelled, axis) if random.random() < 0.5 else labelled
             examples.append(network_input(labelled, detector))
         return {name: np.stack([example[name] for example in examples]) for name in examples[0]}

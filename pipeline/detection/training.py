@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import keras
 import numpy as np
@@ -72,16 +73,19 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
         model.compile(optimizer=_optimizer(config), jit_compile=False)
         model.optimizer.build(model.trainable_variables)
         history = _begun(out, config, model, resume=resume)
-    steps = -(-len(folders[0]) // training.batch)
+    with progress.stage("data"):
+        learner = _learner(model, folders, config, progress)
     logged = _EventLog(out / EVENTS)
     epochs = {f"epoch {number + 1}": 1.0 for number in range(len(history.training), training.epochs)}
     progress.plan({**epochs, "scores": 0.3})
+    steps = -(-len(folders[0]) // training.batch)
     for epoch in range(len(history.training), training.epochs):
         if has_settled(history.total, training):
             break
+        rates = [learning_rate(epoch * steps + step, training.epochs * steps, training) for step in range(steps)]
         with progress.stage(f"epoch {epoch + 1}"), computing_in(training.precision):
-            history.training.append(_learn(model, folders[0], config, epoch, steps, progress))
-            history.validation.append(_validate(model, folders[1], config))
+            history.training.append(_mean(learner.learn(epoch, rates), config))
+            history.validation.append(_mean(learner.validate(), config))
             logged.add(epoch, history)
             _save(out, config, model, history)
             write_loss_figure(history.training, history.validation, out / CURVES)
@@ -91,23 +95,56 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     return history
 
 
-def _learn(
-    model: MaskRCNN, folder: CocoFolder, config: TrainConfig, epoch: int, steps: int, progress: Progress
-) -> dict[str, float]:
-    found = []
-    for step, batch in enumerate(batches(folder, config.detector, config.training, epoch, learning=True)):
-        model.optimizer.learning_rate = learning_rate(epoch * steps + step, config.training.epochs * steps, config.training)
-        found.append(model.train_on_batch(batch, return_dict=True))
-        progress.advance((step + 1) / (steps + 1))
-    return _mean(found, config)
+class _Learner(Protocol):
+    """What an epoch is made of: both return losses by name, of steps or of batches."""
+
+    def learn(self, epoch: int, rates: Sequence[float]) -> list[dict[str, float]]:
+        """One step for each learning rate."""
+        ...
+
+    def validate(self) -> list[dict[str, float]]:
+        """Of what the training does not learn from."""
+        ...
 
 
-def _validate(model: MaskRCNN, folder: CocoFolder, config: TrainConfig) -> dict[str, float]:
-    found = []
-    for batch in batches(folder, config.detector, config.training, 0, learning=False):
-        model.reset_metrics()  # train_on_batch does so itself, test_on_batch does not
-        found.append(model.test_on_batch(batch, return_dict=True))
-    return _mean(found, config)
+@dataclass
+class _Streamed:
+    """Batches from the disk, read while the network works on those before."""
+
+    model: MaskRCNN
+    folders: tuple[CocoFolder, CocoFolder]
+    config: TrainConfig
+    progress: Progress
+
+    def learn(self, epoch: int, rates: Sequence[float]) -> list[dict[str, float]]:
+        found = []
+        coming = batches(self.folders[0], self.config.detector, self.config.training, epoch, learning=True)
+        for step, (batch, rate) in enumerate(zip(coming, rates, strict=True)):
+            self.model.optimizer.learning_rate = rate
+            found.append(self.model.train_on_batch(batch, return_dict=True))
+            self.progress.advance((step + 1) / (len(rates) + 1))
+        return found
+
+    def validate(self) -> list[dict[str, float]]:
+        found = []
+        for batch in batches(self.folders[1], self.config.detector, self.config.training, 0, learning=False):
+            self.model.reset_metrics()  # train_on_batch does so itself, test_on_batch does not
+            found.append(self.model.test_on_batch(batch, return_dict=True))
+        return found
+
+
+def _learner(model: MaskRCNN, folders: tuple[CocoFolder, CocoFolder], config: TrainConfig, progress: Progress) -> _Learner:
+    """As `training.data` says; raises InputError where that is not for the Keras backend in use."""
+    if config.training.data == "streamed":
+        return _Streamed(model, folders, config, progress)
+    backend = keras.backend.backend()
+    if backend != "jax":
+        where, remedy = "training.data", "set KERAS_BACKEND=jax, or training.data=streamed"
+        raise InputError(f"is resident with KERAS_BACKEND={backend}", where=where, allowed="resident on jax", remedy=remedy)
+    from pipeline.detection.resident import ResidentLearner, resident
+
+    sets = [resident(folder, config.detector, model.size) for folder in folders]
+    return ResidentLearner(model, sets[0], sets[1], config.training)
 
 
 def _mean(batch_losses: list[dict[str, Any]], config: TrainConfig) -> dict[str, float]:
