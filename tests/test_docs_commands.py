@@ -131,7 +131,50 @@ RESOLVED = (
     "scarpsim train sets/other_rock --config configs/detectors/fine.yaml --seed 6 --set training.start=further_still/best "
     "--set training.learning_rate=0.0005 --set training.epochs=6 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out other_rock',
-    "scarpsim train sets/other_rock --config configs/detectors/fine.yaml --seed 7 --set training.start=default "
+    "scarpsim dataset configs/datasets/detector.yaml --seed 21 --set parts.0.val=0 --set name=detector_ten "
+    f'--set "walls.glendale.set=[wall.height_m=30,wall.seed=31,{FAR}]" '
+    f'--set "walls.bulga.set=[wall.height_m=30,wall.seed=32,{FAR}]" '
+    f'--set "walls.near.set=[wall.style=bulga,wall.seed=33,{NEAR}]" '
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/ten",
+    "scarpsim dataset configs/datasets/detector.yaml --seed 22 --set parts.0.val=0 --set name=detector_eleven "
+    f'--set "walls.glendale.set=[wall.height_m=30,wall.seed=34,{FAR}]" '
+    f'--set "walls.bulga.set=[wall.height_m=30,wall.seed=35,{FAR}]" '
+    f'--set "walls.near.set=[wall.style=glendale,wall.seed=36,{NEAR}]" --out sets/eleven',
+    "scarpsim dataset configs/datasets/detector.yaml --seed 23 --set parts.0.val=0 --set name=detector_twelve "
+    f'--set "walls.glendale.set=[wall.height_m=30,wall.seed=37,{FAR}]" '
+    f'--set "walls.bulga.set=[wall.height_m=30,wall.seed=38,{FAR}]" '
+    f'--set "walls.near.set=[wall.style=glendale,wall.seed=39,{NEAR}]" '
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/twelve",
+    "scarpsim dataset configs/datasets/detector.yaml --seed 24 --set parts.0.val=0 --set name=detector_thirteen "
+    f'--set "walls.glendale.set=[wall.height_m=30,wall.seed=40,{FAR}]" '
+    f'--set "walls.bulga.set=[wall.height_m=30,wall.seed=41,{FAR}]" '
+    f'--set "walls.near.set=[wall.style=bulga,wall.seed=42,{NEAR}]" --out sets/thirteen',
+    "scarpsim train sets/more_rock --config configs/detectors/fine.yaml --set training.start=other_rock/best "
+    "--set training.data=resident --set training.batch=64 --set training.learning_rate=0.002 "
+    "--set training.warm_up_steps=500 --set training.epochs=169 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out on_a_card',
+    "scarpsim dataset configs/datasets/detector_test.yaml --set name=detector-test-direct "
+    '--set "sensors=[stereo]" --set "parts.0.walls=[glendale-b,bulga-b]" --set parts.0.test=1 '
+    '--set "walls.glendale-b.set=[wall.seed=8,wall.width_m=31,wall.height_m=21,'
+    'reconstruction=direct,depth_map=high,noisy_reference=false]" '
+    '--set "walls.bulga-b.set=[wall.seed=8,wall.width_m=31,wall.height_m=21,'
+    'reconstruction=direct,depth_map=high,noisy_reference=false]" '
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/direct",
+    "scarpsim train sets/small --config configs/detectors/fine.yaml --set training.data=resident --set training.batch=64 "
+    "--out detector",
+    "scarpsim train sets/more_rock --config configs/detectors/fine.yaml --set training.data=resident "
+    "--set detector.pyramid_channels=64 --set detector.head.hidden_units=256 --set training.batch=64 "
+    "--set training.learning_rate=0.003 --set training.warm_up_steps=500 --set training.epochs=153 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out wide',
+    "scarpsim train sets/more_rock --config configs/detectors/fine.yaml --set training.data=resident "
+    "--set detector.backbone=resnet50 --set detector.pyramid_channels=256 --set detector.head.hidden_units=1024 "
+    '--set "detector.proposal.anchor_sizes_px=[6,14,32,64,128]" --set detector.proposal.convolution_px=3 '
+    "--set training.batch=32 --set training.learning_rate=0.0005 --set training.warm_up_steps=300 --set training.epochs=17 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out resnet',
+    "scarpsim train sets/more_rock --config configs/detectors/fine.yaml --seed 7 --set training.start=default "
     "--set training.learning_rate=0.0005 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out more_yet',
 )
@@ -147,10 +190,14 @@ PARSED = (
     "scarpsim dataset merge sets/one sets/three sets/four --out sets/mixed",
     "scarpsim dataset merge sets/one_val sets/four sets/six sets/five sets/seven --out sets/further",
     "scarpsim dataset merge sets/one_val sets/four sets/eight sets/nine --out sets/other_rock",
+    "scarpsim dataset merge sets/one_val sets/four sets/eight sets/nine sets/ten sets/eleven sets/twelve sets/thirteen "
+    "--out sets/more_rock",
     "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
     "scarpsim detect detector/best runs/bulga",
     "scarpsim detect detector/best runs/bulga --out found",
     "scarpsim detect default runs/bulga --unmirrored",
+    "scarpsim detect default sets/direct/test --out found",
+    "scarpsim evaluate sets/direct/test found/detections.json --by size_class --confidence 0.95",
     "scarpsim detect baseline runs/bulga --out found_by_threshold",
     "scarpsim evaluate sets/small/test found/detections.json --by noise --confidence 0.5 --confidence 0.95",
     "scarpsim view runs/my_run --detections found",

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 
 from pipeline.detection.boxes import Axes
 from pipeline.detection.config import DetectorConfig, TrainingConfig
-from pipeline.detection.data import MIRRORED, Batch, CocoFolder, network_input
+from pipeline.detection.data import MIRRORED, CocoFolder, network_input
 from pipeline.detection.model import MaskRCNN, total_loss
 from scene.errors import InputError
 
 Array = Any
 """Of JAX."""
+Batch = dict[str, Array]
+"""As `data.Batch`, on the device."""
 
 
 @jax.tree_util.register_dataclass

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pipeline.change.annotate import run_length_encoding
 from pipeline.detection import weights
 from pipeline.detection.backbone import feature_pyramid
-from pipeline.detection.config import DetectorConfig, HeadConfig, TrainConfig, TrainingConfig, load_train_config
+from pipeline.detection.config import DetectorConfig, HeadConfig, ProposalConfig, TrainConfig, TrainingConfig, load_train_config
 from pipeline.detection.data import CocoFolder, network_input, window
 from pipeline.detection.evaluate import evaluate
 from pipeline.detection.inference import detect
@@ -26,7 +26,13 @@ from scene.errors import InputError
 from scene.grid import Grid
 
 SIDE = 128
-SMALL = DetectorConfig(image_px=SIDE, pyramid_channels=32, most_blocks=8, head=HeadConfig(mask_size_px=28, hidden_units=64))
+SMALL = DetectorConfig(
+    image_px=SIDE,
+    pyramid_channels=32,
+    most_blocks=8,
+    proposal=ProposalConfig(candidates=200, proposals=64, sampled_anchors=64),
+    head=HeadConfig(mask_size_px=28, hidden_units=64, sampled_proposals=24, detections=32),
+)
 
 
 def make_set(folder: Path, count: int, seed: int, side: int = SIDE, blocks: int = 3) -> Path:
@@ -88,16 +94,16 @@ def _compiled(seed: int = 1) -> MaskRCNN:
 
 @pytest.mark.slow
 def test_two_tiles_are_learned_by_heart(data_set, tmp_path):
-    """Every block of both tiles is found with a mask that overlaps it by more than 0.85 (the least was 0.899 on one processor and
-    above 0.9 on others: kernels sum in another order), and nothing else; also from a score of 0.95 on, once the scores of a
-    network that is made too modest are shifted. Masks have no margin: learned by heart, they are known in the boxes of the
+    """Every block of both tiles is found with a mask that overlaps it by more than 0.85 (the least is 0.91 here, and may be less
+    on another processor, whose kernels sum in another order), and nothing else; also from a score of 0.95 on, once the scores of
+    a network that is made too modest are shifted. Masks have no margin: learned by heart, they are known in the boxes of the
     training alone."""
     folder, model = CocoFolder(data_set / "train"), _compiled()
     exact = SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"mask_margin_px": 0.0})})
     model.config = exact
     batch = _batch(data_set / "train")
-    for step in range(160):
-        model.optimizer.learning_rate = 2e-3 * min(1, (step + 1) / 20) * (0.1 if step > 120 else 1)
+    for step in range(120):
+        model.optimizer.learning_rate = 2e-3 * min(1, (step + 1) / 20) * (0.1 if step > 90 else 1)
         model.train_on_batch(batch)
     for index in range(2):
         truth = folder.labelled(index)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.cells import patches
+from pipeline.gap.residuals.residuals import Missing, Residuals
 from scene.mesh import FloatArray
 
 _BINS = 12
@@ -18,6 +20,8 @@ _EFFECTIVE = 60
 """Points of one bin that count as independent of each other: those of one block share the reference's error."""
 _TAIL, _TAIL_SHARE = 3.0, 0.0027
 _LEAST_P = 1e-3
+_PATCHES, _LEAST_PULSES = 150, 60
+"""Of the wall, by which losses are counted, and the fewest pulses of one: a shrub takes few patches, a bin has a dozen."""
 _MARGIN_M = 0.3
 """Points this near to the box of a scene change count as part of it."""
 
@@ -30,7 +34,8 @@ def where(found: GapDiagnosis) -> list[dict[str, Any]]:
     residuals = found.residuals
     rows = [row for name, x, z in standardised(found) for row in _rows(name, x, z, residuals)]
     if residuals.missing is not None and residuals.missing.lost.any():
-        rows += [_lost(name, x, residuals.missing.lost) for name, x in residuals.missing.covariates.items()]
+        patch = patches(residuals.missing.at, max(len(residuals.missing.lost) / _PATCHES, _LEAST_PULSES))
+        rows += [_lost(name, x, residuals.missing, patch) for name, x in residuals.missing.covariates.items()]
     return sorted(rows, key=lambda row: (row["p_value"], -abs(row["size_m"])))[:_MOST_ROWS]
 
 
@@ -82,15 +87,23 @@ def _rows(name: str, x: FloatArray, z: FloatArray, residuals: Residuals) -> list
     return found
 
 
-def _lost(name: str, x: FloatArray, lost: Any) -> dict[str, Any]:
+def _lost(name: str, x: FloatArray, missing: Missing, patch: NDArray[np.int64]) -> dict[str, Any]:
+    """Losses come many at a time, behind a shrub say. So a bin's deviate by as much as the patches within it do from their mean,
+    and by as much as all patches do from the means of their bins, whichever is more."""
     edges, group = bins(x, _BINS)
     size = max(len(edges) - 1, 1)
-    count = np.maximum(np.bincount(group, minlength=size), 1)
-    share, all_of_them = np.bincount(group, lost, size) / count, float(lost.mean())
-    sigmas = np.abs(share - all_of_them) * np.sqrt(count / max(all_of_them * (1 - all_of_them), 1e-9))
+    share, count = float(missing.lost.mean()), np.maximum(np.bincount(group, minlength=size), 1)
+    own = np.bincount(group, missing.lost, size) / count
+    part, of_part = np.unique(patch * size + group, return_inverse=True)
+    parts = np.bincount(part % size, minlength=size)
+    squares = np.bincount(part % size, np.bincount(of_part, missing.lost - own[group]) ** 2, size)
+    scatter = squares * (parts / np.maximum(parts - 1, 1))
+    independent = max(share * (1 - share), 1e-9)
+    clustering = max(float(scatter.sum()) / (independent * len(group)), 1.0)
+    sigmas = np.abs(own - share) * count / np.sqrt(np.maximum(scatter, clustering * independent * count))
     worst = int(np.argmax(sigmas))
     row = _row(name, "missing", edges if len(edges) > 1 else np.repeat(edges, 2), worst, float(sigmas[worst]), 0.0)
-    return {**row, "share_lost": float(share[worst]), "share_lost_overall": all_of_them}
+    return {**row, "share_lost": float(own[worst]), "share_lost_overall": share}
 
 
 def _row(name: str, statistic: str, edges: FloatArray, worst: int, sigmas: float, size_m: float) -> dict[str, Any]:
