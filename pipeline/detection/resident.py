@@ -124,7 +124,7 @@ class ResidentLearner:
         """model: compiled and built."""
         self._model, self._learning, self._judging, self._training = model, learning, judging, training
         optimizer = model.optimizer
-        self._rate = next(n for n, variable in enumerate(optimizer.variables) if variable is optimizer._learning_rate)
+        self._rate = next(n for n, variable in enumerate(optimizer.variables) if variable is optimizer.learning_rate)
         self._epoch: Callable[..., Any] = jax.jit(self._steps)
         self._judged: Callable[..., Any] = jax.jit(self._losses_of_middles)
 
