@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from detector_table import DOCS, DRAWN, FOUND, SENSORS, SIZES, Bar, Tested, detections, placement_of
-from documents import write_between
+from documents import printed, write_between
 
 MARKS = "<!-- curve -->", "<!-- end of curve -->"
 BARS = Bar(FOUND, "segm"), Bar(DRAWN, "segm")
@@ -50,12 +50,9 @@ def main() -> None:
     parser.add_argument("--set", type=Path, required=True, action="append", dest="folders", help="what detector_test.yaml makes")
     parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
     arguments = parser.parse_args()
-    table = []
-    for row in rows(arguments.folders, arguments.detectors):
-        print(row, flush=True)
-        table.append(row)
+    table = printed(rows(arguments.folders, arguments.detectors))
     if arguments.write:
-        write_between(DOCS / "detector.md", MARKS, "\n".join(table))
+        write_between(DOCS / "detector.md", MARKS, table)
 
 
 if __name__ == "__main__":

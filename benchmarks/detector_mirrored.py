@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from documents import write_between
+from documents import printed, write_between
 
 from pipeline.detection import inference, weights
 from pipeline.detection.config import Mirroring
@@ -91,12 +91,9 @@ def main() -> None:
     tiles = CocoFolder(arguments.folder / arguments.split)
     tiles.images = tiles.images[:: arguments.every]
     tiles.annotations = [each for each in tiles.annotations if each["image_id"] in {image["id"] for image in tiles.images}]
-    table = []
-    for row in rows(tiles, detector_folder(arguments.model)):
-        print(row, flush=True)
-        table.append(row)
+    table = printed(rows(tiles, detector_folder(arguments.model)))
     if arguments.write:
-        write_between(DOCUMENT, MARKS, "\n".join(table))
+        write_between(DOCUMENT, MARKS, table)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.formats.atomic import write_text
@@ -13,3 +14,12 @@ def write_between(path: Path, marks: tuple[str, str], text: str) -> None:
     first, last = marks
     document = path.read_text(encoding="utf-8")
     write_text(path, re.sub(f"{first}.*{last}", lambda _: f"{first}\n{text}\n{last}", document, flags=re.DOTALL))
+
+
+def printed(rows: Iterable[str]) -> str:
+    """The rows of a table, each printed as it comes, as one text."""
+    table = []
+    for row in rows:
+        print(row, flush=True)
+        table.append(row)
+    return "\n".join(table)

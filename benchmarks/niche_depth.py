@@ -14,7 +14,7 @@ import argparse
 from collections.abc import Iterator
 
 import numpy as np
-from documents import write_between
+from documents import printed, write_between
 from scipy import ndimage
 from upper_bound import DOCUMENT, WALL, Niches, observed
 
@@ -95,12 +95,9 @@ def main() -> None:
     parser.add_argument("--maps", type=int, default=2, help="at each level of noise")
     parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
     arguments = parser.parse_args()
-    table = []
-    for row in rows({"width_m": arguments.width, "height_m": arguments.height}, arguments.maps):
-        print(row, flush=True)
-        table.append(row)
+    table = printed(rows({"width_m": arguments.width, "height_m": arguments.height}, arguments.maps))
     if arguments.write:
-        write_between(DOCUMENT, MARKS, "\n".join(table))
+        write_between(DOCUMENT, MARKS, table)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from detector_table import DOCS, SENSORS
-from documents import write_between
+from documents import printed, write_between
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -73,12 +73,9 @@ def main() -> None:
     parser.add_argument("--set", type=Path, required=True, action="append", dest="folders", help="a data set with a test part")
     parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
     arguments = parser.parse_args()
-    table = []
-    for row in rows(arguments.folders):
-        print(row, flush=True)
-        table.append(row)
+    table = printed(rows(arguments.folders))
     if arguments.write:
-        write_between(DOCS / "detector.md", MARKS, "\n".join(table))
+        write_between(DOCS / "detector.md", MARKS, table)
 
 
 if __name__ == "__main__":

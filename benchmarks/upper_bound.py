@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from documents import write_between
+from documents import printed, write_between
 
 from pipeline.change.annotate import STANDS_OUT, AnnotationConfig, block_annotations
 from pipeline.config.bundled import bundled_config
@@ -94,12 +94,9 @@ def main() -> None:
     parser.add_argument("--height", type=float, default=14.0)
     parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
     arguments = parser.parse_args()
-    table = []
-    for row in rows(arguments.width, arguments.height):
-        print(row, flush=True)
-        table.append(row)
+    table = printed(rows(arguments.width, arguments.height))
     if arguments.write:
-        write_between(DOCUMENT, MARKS, "\n".join(table))
+        write_between(DOCUMENT, MARKS, table)
 
 
 if __name__ == "__main__":

@@ -63,7 +63,8 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     At the end the scores of the best one, and of those that `keep_epochs` keeps, are shifted as `set_operating_point` says.
 
     With `resume` it goes on after the last whole epoch in `out`, to the same losses as without the interruption. Raises
-    InputError for a data set without these folders and for an `out` that holds another training.
+    InputError for a data set without these folders, for an `out` that holds another training, and for resident data on another
+    backend than JAX or of tiles that are not squares of one size.
     """
     progress = progress or Progress()
     folders = CocoFolder(data_set / "train"), CocoFolder(data_set / "val")

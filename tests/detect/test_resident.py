@@ -130,7 +130,6 @@ assert all(np.array_equal(variable, value) for variable, value in zip(variables,
 still = [keras.ops.convert_to_numpy(variable) for variable in model.trainable_variables]
 learner.learn(4, [0.0] * 8)
 assert all(np.array_equal(variable, value) for variable, value in zip(model.trainable_variables, still, strict=True))
-print(means)
 """
 
 
