@@ -30,7 +30,7 @@ test: setup-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 docs: setup-all
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

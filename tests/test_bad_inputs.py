@@ -33,8 +33,12 @@ LONG = (
     "cal: run.json sigma",
     "cal: run.json block",
     "cal: run.json wall",
+    "ev: 2000 of one place",
+    "ev: 20000 of one place",
+    "ev: 20000 images",
+    "view: run products of a million",
 )
-"""With these a calibration runs, as it does not look at what is wrong."""
+"""With these a calibration runs, as it does not look at what is wrong, or seconds of work precede the answer: the benchmark's."""
 
 
 @pytest.fixture(scope="module")

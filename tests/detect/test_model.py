@@ -76,8 +76,8 @@ def make_set(folder: Path, count: int, seed: int, side: int = SIDE, blocks: int 
 @pytest.fixture(scope="module")
 def data_set(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data_set")
-    make_set(folder / "train", 4, 1)
-    make_set(folder / "val", 2, 2)
+    make_set(folder / "train", 2, 1)
+    make_set(folder / "val", 1, 2)
     return folder
 
 
@@ -117,8 +117,6 @@ def test_two_tiles_are_learned_by_heart(data_set, tmp_path):
                 mask[item.row : item.row + item.mask.shape[0], item.column : item.column + item.mask.shape[1]] = item.mask
                 best = max(best, float((mask & wanted).sum() / (mask | wanted).sum()))
             assert best > 0.85
-    folder.images = folder.images[:2]
-    folder.annotations = [each for each in folder.annotations if each["image_id"] <= 2]
     model.config = exact.model_copy(update={"head": exact.head.model_copy(update={"score_shift": -4.0})})
     weights.save(model, tmp_path)
     assert set_operating_point(tmp_path, folder) > -4

@@ -28,7 +28,7 @@ from sensors.effects.surface_empirical import SurfaceEmpirical
 
 KEYS = ("schema", "verdict", "effects", "where", "scene_changes", "sensor", "registration", "identifiability", "gap", "remaining",
         "seconds")  # fmt: skip
-NULLS = 4
+NULLS = 3
 BOWL = 0.02
 
 
