@@ -309,17 +309,16 @@ def test_greedy_meets_the_standard_deviation_and_not_the_pattern() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_known_noise_of_another_wall_and_seed_comes_back(seed: int) -> None:
+def test_known_noise_of_another_wall_and_seed_comes_back() -> None:
     """Within twice the interval of 95 %, four standard deviations: false failure below 1 %, as 60 sets give the scatter.
 
     How often the intervals themselves hold is for benchmarks/calibrate_recovery.py.
     """
-    config, site = small("tls", f"wall.seed={20 + seed}", "calibration.simulations=60", f"seed={seed}")
-    truth = np.array([[0.004, 8e-5], [0.0015, 2e-4]][seed - 1])
+    config, site = small("tls", "wall.seed=22", "calibration.simulations=60", "seed=2")
+    truth = np.array([0.0015, 2e-4])
     whole: Any = site.sensor
     real = replace(site, sensor=replace(whole, model=parameters(whole.model, ()).model(truth)))
-    material = replace(seen_by(config, real, 2, 100 + seed), site=site)
+    material = replace(seen_by(config, real, 2, 102), site=site)
     found = calibrate_material(config, "tls", material, Progress(), with_greedy=False).found
     off = (found.x - np.log(truth)) / ((found.high - found.low) / 2)
     assert np.abs(off).max() < 2
