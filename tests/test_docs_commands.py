@@ -40,6 +40,7 @@ TINY = [
 TINY_WALL = ["--set", "wall.width_m=6", "--set", "wall.height_m=4", "--set", "wall.resolution_m=0.2"]
 FAR = "reconstruction=vertices,noisy_reference=false,scanner.azimuth_step_rad=0.00038,scanner.zenith_step_rad=0.00038"
 NEAR = FAR.replace("0.00038", "0.0007")
+DIRECT = "reconstruction=direct,depth_map=high,noisy_reference=false"
 INIT = "scarpsim init --mesh wall.ply --cameras cameras.xml --scanner riegl_vz400i --out site.yaml"
 FIRST = "simulate --sensor tls --config site.yaml"
 MY_SITE = "scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml"
@@ -155,12 +156,19 @@ RESOLVED = (
     "--set training.data=resident --set training.batch=64 --set training.learning_rate=0.002 "
     "--set training.warm_up_steps=500 --set training.epochs=169 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out on_a_card',
+    'scarpsim dataset configs/datasets/detector.yaml --seed 25 --set name=detector_fourteen --set "sensors=[stereo]" '
+    f'--set "walls.glendale.set=[wall.height_m=30,wall.seed=43,{DIRECT}]" '
+    f'--set "walls.bulga.set=[wall.height_m=30,wall.seed=44,{DIRECT}]" '
+    f'--set "walls.near.set=[wall.style=glendale,wall.seed=45,{DIRECT}]" '
+    "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
+    "--set sizes.large.rockfall.placement=mean_surface --out sets/fourteen",
+    "scarpsim train sets/both --config configs/detectors/fine.yaml --seed 8 --set training.start=on_a_card/best "
+    "--set training.learning_rate=0.0005 --set training.epochs=10 "
+    '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out both',
     "scarpsim dataset configs/datasets/detector_test.yaml --set name=detector-test-direct "
     '--set "sensors=[stereo]" --set "parts.0.walls=[glendale-b,bulga-b]" --set parts.0.test=1 '
-    '--set "walls.glendale-b.set=[wall.seed=8,wall.width_m=31,wall.height_m=21,'
-    'reconstruction=direct,depth_map=high,noisy_reference=false]" '
-    '--set "walls.bulga-b.set=[wall.seed=8,wall.width_m=31,wall.height_m=21,'
-    'reconstruction=direct,depth_map=high,noisy_reference=false]" '
+    f'--set "walls.glendale-b.set=[wall.seed=8,wall.width_m=31,wall.height_m=21,{DIRECT}]" '
+    f'--set "walls.bulga-b.set=[wall.seed=8,wall.width_m=31,wall.height_m=21,{DIRECT}]" '
     "--set sizes.small.rockfall.placement=mean_surface --set sizes.medium.rockfall.placement=mean_surface "
     "--set sizes.large.rockfall.placement=mean_surface --out sets/direct",
     "scarpsim train sets/small --config configs/detectors/fine.yaml --set training.data=resident --set training.batch=64 "
@@ -174,7 +182,7 @@ RESOLVED = (
     '--set "detector.proposal.anchor_sizes_px=[6,14,32,64,128]" --set detector.proposal.convolution_px=3 '
     "--set training.batch=32 --set training.learning_rate=0.0005 --set training.warm_up_steps=300 --set training.epochs=17 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out resnet',
-    "scarpsim train sets/more_rock --config configs/detectors/fine.yaml --seed 7 --set training.start=default "
+    "scarpsim train sets/both --config configs/detectors/fine.yaml --seed 9 --set training.start=default "
     "--set training.learning_rate=0.0005 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out more_yet',
 )
@@ -192,7 +200,10 @@ PARSED = (
     "scarpsim dataset merge sets/one_val sets/four sets/eight sets/nine --out sets/other_rock",
     "scarpsim dataset merge sets/one_val sets/four sets/eight sets/nine sets/ten sets/eleven sets/twelve sets/thirteen "
     "--out sets/more_rock",
+    "scarpsim dataset merge sets/fourteen sets/four sets/twelve_by/tls sets/thirteen_by/stereo --out sets/both",
     "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
+    "scarpsim dataset split sets/twelve --by sensor --out sets/twelve_by",
+    "scarpsim dataset split sets/thirteen --by sensor --out sets/thirteen_by",
     "scarpsim detect detector/best runs/bulga",
     "scarpsim detect detector/best runs/bulga --out found",
     "scarpsim detect default runs/bulga --unmirrored",
