@@ -31,9 +31,9 @@ from pipeline.config.simulation import load_config
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import look, reconstruct
 from pipeline.run.site import prepare_site
-from scene.backend import dr
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
+from scene.common.backend import dr
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "calibrate.md"
 EPOCHS = 2

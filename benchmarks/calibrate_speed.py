@@ -19,9 +19,9 @@ from pipeline.change.difference import raster_grid
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import load_config
 from pipeline.run.site import prepare_site
-from scene.backend import mi
-from scene.keyed_random import KeyedRandom
-from scene.upload import on_device, vectors_on_device
+from scene.common.backend import mi
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.upload import on_device, vectors_on_device
 
 
 def main() -> None:

@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 from manifold3d import Manifold, Mesh64
 
-from scene.blocks import Blocks, RockfallConfig, place_blocks
-from scene.carve import carve
-from scene.distributions import Gaussian
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.solid import close
+from scene.blocks.block import Blocks, RockfallConfig, place_blocks
+from scene.blocks.carve import carve
+from scene.blocks.distributions import Gaussian
+from scene.blocks.solid import close
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
 
 WIDTH_M, HEIGHT_M = 70.0, 45.0
 CELLS_M = {False: 0.05, True: 0.02}

@@ -21,8 +21,8 @@ from pipeline.config.simulation import SensorName
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs, simulation_of
 from pipeline.run.site import SensorSite, prepare_site
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
 
 
 def stds_mm(config: DatasetConfig, epochs: list[PlannedEpoch], maps: int) -> dict[str, list[float]]:

@@ -14,13 +14,13 @@ from measure import peak_memory_gb
 
 from pipeline.planning.trials import Trials, detection_trials
 from pipeline.precision.detectability import PlanningConfig
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from sensors.model import StereoModel, TlsModel
-from sensors.placement import RigConfig, Target
-from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner, ScannerConfig
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import TriangleMesh
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.stereo.stereo_pair import StereoPair
 
 ROUNDS, BLOCKS = 8, 150
 WIDTH_M, HEIGHT_M = 16.0, 12.0

@@ -39,7 +39,7 @@ def processor_seconds(*works: Callable[[], object]) -> list[float]:
 
 
 def examples(count: int, size: int, most_blocks: int, channels: int) -> dict[str, np.ndarray]:
-    """A batch as `pipeline.detection.data.batches` makes it."""
+    """A batch as `pipeline.detection.network.data.batches` makes it."""
     random = np.random.default_rng(1)
     image = random.normal(0, 0.3, (count, size, size, channels)).astype(np.float32)
     boxes, valid = np.zeros((count, most_blocks, 4), np.float32), np.zeros((count, most_blocks), np.float32)
@@ -75,16 +75,16 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", str(arguments.threads))
-    from pipeline.detection.keras_backend import computing_in, keras_ready
+    from pipeline.detection.network.keras_backend import computing_in, keras_ready
 
     keras_ready()
     import keras
     import tensorflow as tf
 
-    from pipeline.detection.config import load_train_config
-    from pipeline.detection.mirrored import network
-    from pipeline.detection.model import MaskRCNN
-    from pipeline.detection.weights import with_head
+    from pipeline.detection.inference.mirrored import network
+    from pipeline.detection.inference.weights import with_head
+    from pipeline.detection.network.config import load_train_config
+    from pipeline.detection.network.model import MaskRCNN
 
     tf.config.threading.set_intra_op_parallelism_threads(arguments.threads)
     tf.config.threading.set_inter_op_parallelism_threads(1)

@@ -23,12 +23,12 @@ import numpy as np
 from documents import write_between
 
 from pipeline.config.bundled import bundled_config
-from pipeline.detection.config import BEST, load_train_config
-from pipeline.detection.data import CocoFolder
-from pipeline.detection.evaluate import evaluate
-from pipeline.detection.operating_point import set_operating_point
-from pipeline.detection.run import LOWEST_SCORE, detect
-from pipeline.detection.training import train
+from pipeline.detection.evaluation.evaluate import evaluate
+from pipeline.detection.inference.operating_point import set_operating_point
+from pipeline.detection.network.config import BEST, load_train_config
+from pipeline.detection.network.data import CocoFolder
+from pipeline.detection.products.run import LOWEST_SCORE, detect
+from pipeline.detection.training.training import train
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- ablation -->", "<!-- end of ablation -->"

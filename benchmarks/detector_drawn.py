@@ -22,13 +22,13 @@ from documents import write_between
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
-from pipeline.detection import weights
-from pipeline.detection.boxes import widened
-from pipeline.detection.data import CocoFolder
-from pipeline.detection.evaluate import matches
-from pipeline.detection.inference import paste
-from pipeline.detection.normalisation import normalised
-from pipeline.detection.run import detector_folder
+from pipeline.detection.evaluation.evaluate import matches
+from pipeline.detection.inference import weights
+from pipeline.detection.inference.inference import paste
+from pipeline.detection.network.boxes import widened
+from pipeline.detection.network.data import CocoFolder
+from pipeline.detection.network.normalisation import normalised
+from pipeline.detection.products.run import detector_folder
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- drawn -->", "<!-- end of drawn -->"

@@ -2,8 +2,9 @@
 
     python benchmarks/detector_mirrored.py --set sets/mixed [--split val] [--every 3] [--model default] [--write]
 
-The views are those of pipeline/detection/mirrored.py. F1 of masks by size at a score of 0.95, once the scores of each way of
-looking are set on the same tiles (`operating_point.best_shifts`), so the gain is rather too large than too small. Tiles of the
+The views are those of pipeline/detection/inference/mirrored.py. F1 of masks by size at a score of 0.95, once the scores of each
+way of looking are set on the same tiles (`operating_point.best_shifts`), so the
+gain is rather too large than too small. Tiles of the
 detector's own size. --write puts the table into docs/detector.md.
 """
 
@@ -19,14 +20,14 @@ from typing import Any
 import numpy as np
 from documents import printed, write_between
 
-from pipeline.detection import inference, weights
-from pipeline.detection.config import Mirroring
-from pipeline.detection.data import CocoFolder
-from pipeline.detection.evaluate import evaluate
-from pipeline.detection.mirrored import network
-from pipeline.detection.model import MaskRCNN
-from pipeline.detection.operating_point import best_shifts
-from pipeline.detection.run import detector_folder
+from pipeline.detection.evaluation.evaluate import evaluate
+from pipeline.detection.inference import inference, weights
+from pipeline.detection.inference.mirrored import network
+from pipeline.detection.inference.operating_point import best_shifts
+from pipeline.detection.network.config import Mirroring
+from pipeline.detection.network.data import CocoFolder
+from pipeline.detection.network.model import MaskRCNN
+from pipeline.detection.products.run import detector_folder
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- mirrored -->", "<!-- end of mirrored -->"

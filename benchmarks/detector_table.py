@@ -24,8 +24,8 @@ from typing import Any
 
 from documents import write_between
 
-from pipeline.detection.evaluate import Overlap, Score, evaluate
-from pipeline.detection.run import BASELINE, LOWEST_SCORE, detect
+from pipeline.detection.evaluation.evaluate import Overlap, Score, evaluate
+from pipeline.detection.products.run import BASELINE, LOWEST_SCORE, detect
 
 DOCS = Path(__file__).parents[1] / "docs"
 MARKS = "<!-- table -->", "<!-- end of table -->"

@@ -18,7 +18,7 @@ from pathlib import Path
 from detector_table import BARS, DOCS, SENSORS, Cells, Tested, mean_f1
 from documents import write_between
 
-from pipeline.detection.evaluate import Score
+from pipeline.detection.evaluation.evaluate import Score
 
 MARKS = "<!-- whole -->", "<!-- end of whole -->"
 

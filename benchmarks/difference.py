@@ -8,11 +8,11 @@ from measure import bare_cast, medians, peak_memory_gb, seconds
 from pipeline.change.annotate import AnnotationConfig, LabelledImage, coco
 from pipeline.change.difference import cast_raster, surface_raster
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
-from scene.backend import VARIANT, mi
-from scene.grid import Grid
-from scene.raycast import RayCaster
-from scene.upload import on_device
-from sensors.observation import Observation
+from scene.common.backend import VARIANT, mi
+from scene.geometry.grid import Grid
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import on_device
+from sensors.signal_chain.observation import Observation
 
 PIXELS = (3500, 1500)
 SAMPLES = (900, 1500)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from pipeline.formats.atomic import write_text
+from pipeline.formats.files.atomic import write_text
 
 
 def write_between(path: Path, marks: tuple[str, str], text: str) -> None:

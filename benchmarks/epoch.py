@@ -24,15 +24,15 @@ from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.products import write_epoch, write_reference
 from pipeline.run.site import SensorSite, prepare_site
-from scene.backend import VARIANT, dr, mi
-from scene.blocks import place_blocks
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
-from sensors.device import rotated, vector
-from sensors.pulses import direction
-from sensors.stereo import SHADOW_MARGIN, StereoPair
-from sensors.tls import LaserScanner
+from scene.blocks.block import place_blocks
+from scene.common.backend import VARIANT, dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.tls import LaserScanner
+from sensors.numerics.device import rotated, vector
+from sensors.signal_chain.pulses import direction
+from sensors.stereo.stereo_pair import SHADOW_MARGIN, StereoPair
 
 
 def observation_casts(site: SensorSite, caster: RayCaster) -> float:

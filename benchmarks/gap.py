@@ -23,10 +23,10 @@ from typing import Any
 from documents import write_between
 from measure import bare_cast, empty_kernel_cache, medians, peak_memory_gb
 
-from pipeline.formats.measurement import Measurement, TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
-from scene.upload import vectors_on_device
-from sensors.device import vector
+from scene.ray_casting.upload import vectors_on_device
+from sensors.numerics.device import vector
 
 CASES = {"tls": ("vertical_index", (1, 1)), "stereo": ("focal_length", (1, 6))}
 """The effect and the seed, by sensor; every second pixel of the pair that this seed makes is a million."""

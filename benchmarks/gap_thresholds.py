@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from benchmarks.gap_challenge.cases import Case, make, plan
 from benchmarks.gap_challenge.score import score
 from benchmarks.varied import Setting, Varied
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.decisions import Decisions
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict

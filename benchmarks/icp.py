@@ -16,8 +16,8 @@ import open3d as o3d
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, Registration, fit, register
 from pipeline.registration.rigid import RigidTransform
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 COLUMNS, ROWS, WIDTH, HEIGHT = 1250, 800, 70.0, 45.0
 SIGMA, DISTANCE = 0.02, 0.1

@@ -20,12 +20,12 @@ from pipeline.report.progress import Progress
 from pipeline.run.displacement import displacement
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.site import prepare_site
-from scene.backend import dr
-from scene.blocks import Blocks
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh
-from scene.raycast import RayCaster
+from scene.blocks.block import Blocks
+from scene.common.backend import dr
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
 
 SIZES = {
     "small": ("{kind: uniform, low: 0.075, high: 0.15}", 0.191),

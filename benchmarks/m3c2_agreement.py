@@ -17,7 +17,7 @@ from pipeline.change.difference import statistics
 from pipeline.change.m3c2 import core_grid
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import load_config
-from pipeline.formats.geotiff import read_geotiff
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.run.simulation import simulate
 
 COLUMNS = (

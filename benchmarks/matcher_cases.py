@@ -12,24 +12,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.backend import dr, mi
-from scene.frame import WallFrame
-from scene.illumination import IlluminationConfig
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from scene.texture import TextureConfig
+from scene.appearance.illumination import IlluminationConfig
+from scene.appearance.texture import TextureConfig
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.cameras.rectification import rectify
 from sensors.effects.base import Stage, apply_stage
-from sensors.exposure import ExposureConfig
-from sensors.matches import Matches
-from sensors.matching import MatchingConfig, SearchRange, match, without_speckles
-from sensors.model import StereoModel
-from sensors.observation import Observation
-from sensors.placement import RigConfig, Target
-from sensors.rectify import rectify
-from sensors.refinement import RefinementConfig, refine
-from sensors.stereo import REDUCTION, StereoPair
-from sensors.stereo_matched import MatchedStereoPair
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.matches import Matches
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.exposure import ExposureConfig
+from sensors.stereo.matching import MatchingConfig, SearchRange, match, without_speckles
+from sensors.stereo.refinement import RefinementConfig, refine
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 Raster = NDArray[np.float64]
 QUIET = StereoModel(noise={"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0})

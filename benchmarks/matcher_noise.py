@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from matcher_cases import MATCHERS, SGBM, Case, Raster, motorcycle, rendered
 
-from sensors.model import StereoModel
+from sensors.models.sensor_model import StereoModel
 
 FITTED_ON = (("glendale", 7), ("bulga", 7))
 VALIDATED_ON = (("glendale", 11), ("bismantova", 3))

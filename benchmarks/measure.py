@@ -16,8 +16,8 @@ from typing import Any
 
 import drjit
 
-from scene.backend import dr, mi
-from scene.raycast import RayCaster
+from scene.common.backend import dr, mi
+from scene.ray_casting.raycast import RayCaster
 
 ROUNDS = 7
 _SET_TARGET = "_Z19jit_llvm_set_targetPKcS0_j"

@@ -22,10 +22,10 @@ from pipeline.change.annotate import STANDS_OUT
 from pipeline.config.bundled import bundled_config
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import planned_epochs, simulation_of
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.procedural import ProceduralWall
-from scene.wall import Wall
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.walls.procedural import ProceduralWall
+from scene.walls.wall import Wall
 
 MARKS = "<!-- niches -->", "<!-- end of niches -->"
 SIZE, FINE_M = "small", 0.01

@@ -20,7 +20,7 @@ from documents import printed, write_between
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.detection.data import CocoFolder, Labelled
+from pipeline.detection.network.data import CocoFolder, Labelled
 
 MARKS = "<!-- texture -->", "<!-- end of texture -->"
 EROSION_PX, RING_PX, FEWEST = 4, 14, 30

@@ -27,10 +27,10 @@ from pipeline.change.difference import statistics
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.run.site import SensorSite, prepare_site
-from scene.config import load_yaml, parse
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
-from sensors.model import StereoModel, StereoNoise
+from scene.common.config import load_yaml, parse
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.sensor_model import StereoModel, StereoNoise
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "noise.md"
 LEVELS = ("high", "medium", "low")

@@ -9,15 +9,15 @@ from pipeline.change.difference import DifferenceConfig, cast_raster, difference
 from pipeline.surface.depth_maps import DepthMap
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from pipeline.surface.reconstruct import FusionConfig, colmap_surface
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from sensors.exchanged import depth_cameras, observe_right
-from sensors.model import StereoModel, StereoNoise
-from sensors.placement import RigConfig, Target
-from sensors.stereo import StereoPair
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel, StereoNoise
+from sensors.stereo.exchanged import depth_cameras, observe_right
+from sensors.stereo.stereo_pair import StereoPair
 
 GSD_M = 0.05
 NOISE = {

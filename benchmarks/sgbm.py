@@ -8,21 +8,21 @@ from __future__ import annotations
 import numpy as np
 from measure import medians, peak_memory_gb
 
-from scene.backend import VARIANT, dr
-from scene.frame import WallFrame
-from scene.illumination import IlluminationConfig
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from scene.texture import TextureConfig
-from sensors.exposure import ExposureConfig, Studio
-from sensors.matching import MatchingConfig, SearchRange, match
-from sensors.model import StereoModel
-from sensors.placement import RigConfig, Target
-from sensors.rectified import RectifiedGrid
-from sensors.rectify import rectify
-from sensors.stereo import REDUCTION, StereoPair
-from sensors.stereo_matched import MatchedStereoPair
+from scene.appearance.illumination import IlluminationConfig
+from scene.appearance.texture import TextureConfig
+from scene.common.backend import VARIANT, dr
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.cameras.rectification import rectify
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.stereo.exposure import ExposureConfig, Studio
+from sensors.stereo.matching import MatchingConfig, SearchRange, match
+from sensors.stereo.rectified import RectifiedGrid
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 
 def main() -> None:

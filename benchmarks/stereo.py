@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from measure import bare_cast, bare_test, medians, peak_memory_gb
 
-from scene.backend import VARIANT, dr, mi
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from sensors.device import rotated, vector
-from sensors.model import StereoModel
-from sensors.placement import RigConfig, Target
-from sensors.stereo import SHADOW_MARGIN, StereoPair
+from scene.common.backend import VARIANT, dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.numerics.device import rotated, vector
+from sensors.stereo.stereo_pair import SHADOW_MARGIN, StereoPair
 
 NOISE = {
     "parallax_sigma_px": 0.6,

@@ -14,16 +14,16 @@ import numpy as np
 import open3d as o3d
 from measure import bare_cast, empty_kernel_cache, medians, narrow_vectors, peak_memory_gb, seconds
 
-from scene.backend import VARIANT, dr, mi
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from sensors.device import rotated, vector
-from sensors.model import TlsModel
-from sensors.placement import StationConfig, Target
-from sensors.pulses import direction
-from sensors.tls import LaserScanner, ScannerConfig
+from scene.common.backend import VARIANT, dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.placement import StationConfig, Target
+from sensors.models.sensor_model import TlsModel
+from sensors.numerics.device import rotated, vector
+from sensors.signal_chain.pulses import direction
 
 PULSES = 5_000_000
 

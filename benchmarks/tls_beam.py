@@ -17,17 +17,17 @@ from __future__ import annotations
 import numpy as np
 from measure import bare_cast, medians, narrow_vectors, peak_memory_gb, seconds
 
-from scene.backend import VARIANT, dr, mi
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from sensors.beam import Beam
-from sensors.device import rotated, vector
-from sensors.model import TlsModel
-from sensors.placement import StationConfig, Target
-from sensors.pulses import direction, tangents
-from sensors.tls import LaserScanner, ScannerConfig
+from scene.common.backend import VARIANT, dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.placement import StationConfig, Target
+from sensors.models.sensor_model import TlsModel
+from sensors.numerics.device import rotated, vector
+from sensors.signal_chain.beam import Beam
+from sensors.signal_chain.pulses import direction, tangents
 
 PULSES, SUB_RAYS, DIVERGENCE_RAD, EDGE_MM, AT_ONCE = 1_000_000, 19, 3.5e-4, 20, 1 << 18
 

@@ -31,9 +31,9 @@ EPOCHS = 100
 
 
 def main() -> None:
-    from pipeline.formats.ply import write_ply
-    from scene.keyed_random import KeyedRandom
-    from scene.procedural import ProceduralWall
+    from pipeline.formats.meshes.ply import write_ply
+    from scene.common.keyed_random import KeyedRandom
+    from scene.walls.procedural import ProceduralWall
 
     with tempfile.TemporaryDirectory() as folder:
         wall = Path(folder) / "wall.ply"
@@ -74,14 +74,14 @@ def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     """One process: mesh file to LAS; or, in another, the rate of the observation and the bias of the beam, as JSON."""
     marks = [("start", psutil.Process().create_time()), ("import", 0.0)]
     from pipeline.config.simulation import SimulationConfig
-    from pipeline.formats.laz import PulseChannels, write_laz
     from pipeline.formats.point_cloud import PointCloud
+    from pipeline.formats.points.laz import PulseChannels, write_laz
     from pipeline.run.recorded_points import recorded_points
     from pipeline.run.site import prepare_site
-    from scene.backend import dr
-    from scene.config import parse
-    from scene.keyed_random import KeyedRandom
-    from scene.raycast import RayCaster
+    from scene.common.backend import dr
+    from scene.common.config import parse
+    from scene.common.keyed_random import KeyedRandom
+    from scene.ray_casting.raycast import RayCaster
 
     marks[1] = "import", time.time()
     beam = {"name": "beam_divergence", "divergence_rad": 3e-4, "sub_rays": sub_rays}
@@ -138,7 +138,7 @@ def bias(scanner, caster, random) -> dict[str, float]:
     """Mean range of the beam's mean return less that of its axis, without noise, mm, over the rough wall."""
     from dataclasses import replace
 
-    from sensors.model import TlsModel
+    from sensors.models.sensor_model import TlsModel
 
     quiet = {"range_sigma_m": 0.0, "angle_sigma_rad": 0.0}
     beam = {**scanner.model.effects[0].model_dump(), "mode": "strongest"}
@@ -156,8 +156,8 @@ def soak() -> None:
     from pipeline.report.progress import Progress
     from pipeline.run.epoch import observe_epoch, observe_reference
     from pipeline.run.site import prepare_site
-    from scene.config import parse
-    from scene.keyed_random import KeyedRandom
+    from scene.common.config import parse
+    from scene.common.keyed_random import KeyedRandom
 
     values = {
         "wall": {"style": "glendale", "width_m": 16.0, "height_m": 10.0, "resolution_m": 0.05},

@@ -26,9 +26,9 @@ from pipeline.dataset.plan import planned_epochs, simulation_of
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.site import prepare_site
-from scene.contour import median_under
-from scene.keyed_random import KeyedRandom
-from scene.wall import Wall
+from scene.common.keyed_random import KeyedRandom
+from scene.walls.contour import median_under
+from scene.walls.wall import Wall
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- bound -->", "<!-- end of bound -->"

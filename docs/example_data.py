@@ -13,20 +13,20 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.formats.laz import write_laz
-from pipeline.formats.metashape import write_metashape
-from pipeline.formats.ply import write_ply
+from pipeline.formats.cameras.metashape import write_metashape
+from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from sensors.camera import axis_rotation
+from pipeline.formats.points.laz import write_laz
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.cameras.camera import axis_rotation
 from sensors.effects.base import Effect
 from sensors.effects.range_incidence_bias import RangeIncidenceBias
-from sensors.model import TlsModel
-from sensors.placement import PoseSigma, RigConfig, StationConfig, Target
-from sensors.tls import LaserScanner, ScannerConfig
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.placement import PoseSigma, RigConfig, StationConfig, Target
+from sensors.models.sensor_model import TlsModel
 
 ORIGIN = np.array([345200.0, 6389450.0, 120.0])
 """Where the example stands: easting, northing, height, m."""

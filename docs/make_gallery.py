@@ -24,22 +24,22 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from PIL import Image
 
-from scene.config import parse
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from scene.yaml_text import parse_yaml
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.common.yaml_text import parse_yaml
+from scene.geometry.frame import WallFrame
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
 from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS
 from sensors.effects.base import Effect
-from sensors.model import StereoModel, TlsModel, TlsNoise
-from sensors.observation import Observation
-from sensors.placement import RigConfig, StationConfig, Target
-from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner, ScannerConfig
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.placement import RigConfig, StationConfig, Target
+from sensors.models.sensor_model import StereoModel, TlsModel, TlsNoise
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.stereo_pair import StereoPair
 
 FOLDER = Path(__file__).parent / "effects"
 GSD_M = 0.25

@@ -22,29 +22,29 @@ import numpy as np
 import yaml
 from make_gap_pages import FOLDER, small_png
 
-from pipeline.formats.cameras import write_cameras_yaml
-from pipeline.formats.measurement import read_measurement
-from pipeline.formats.ply import write_ply, write_ply_points
+from pipeline.formats.cameras.cameras import write_cameras_yaml
+from pipeline.formats.measurements.measurement import read_measurement
+from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.in_words import paragraph
 from pipeline.gap.report.report import summary, write
-from scene.frame import WallFrame
-from scene.illumination import IlluminationConfig
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from scene.texture import TextureConfig
-from sensors.camera import Camera, CameraPair
-from sensors.exposure import ExposureConfig
-from sensors.matching import MatchingConfig, SearchRange, match, without_speckles
-from sensors.model import StereoModel
-from sensors.placement import RigConfig, Target
-from sensors.refinement import refine
-from sensors.stereo import REDUCTION, StereoPair
-from sensors.stereo_matched import MatchedStereoPair
+from scene.appearance.illumination import IlluminationConfig
+from scene.appearance.texture import TextureConfig
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.stereo.exposure import ExposureConfig
+from sensors.stereo.matching import MatchingConfig, SearchRange, match, without_speckles
+from sensors.stereo.refinement import refine
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 F_PX, BASE_M, CX, CY, OFFSET_PX = 994.978, 0.193001, 311.193, 254.877, 31.086
 """Middlebury's calibration of the motorcycle at this size, principal point from the centre of the top-left pixel."""

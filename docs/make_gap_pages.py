@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
@@ -37,14 +37,14 @@ from pipeline.gap.residuals.registration import residuals_of
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
 from pipeline.gap.survey.planned import planned_survey
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.procedural import ProceduralWall
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.walls.procedural import ProceduralWall
 from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
 from sensors.effects.base import Effect
-from sensors.model import StereoModel, TlsModel
-from sensors.placement import RigConfig, StationConfig, Target
-from sensors.stereo import REDUCTION
+from sensors.models.placement import RigConfig, StationConfig, Target
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.stereo.stereo_pair import REDUCTION
 
 FOLDER = Path(__file__).parent / "gap"
 _BINS = 24

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene.lazy import lazily
+from scene.common.lazy import lazily
 
 if TYPE_CHECKING:
     from pipeline.api.building import carve as carve

@@ -9,9 +9,9 @@ from typing import Any
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import load_config
 from pipeline.dataset.config import load_dataset_config
-from pipeline.detection.config import load_train_config
-from pipeline.formats.measurement_config import MeasurementConfig
-from scene.config import load_yaml, parse
+from pipeline.detection.network.config import load_train_config
+from pipeline.formats.measurements.config import MeasurementConfig
+from scene.common.config import load_yaml, parse
 
 LOADERS: dict[str, Callable[[Path], Any]] = {
     "simulation": lambda path: load_config(path, [], None, None),

@@ -16,8 +16,8 @@ from pipeline.config.overrides import Override, read_override
 from pipeline.config.presets import model_file, read_preset
 from pipeline.config.simulation import load_config
 from pipeline.dataset.config import load_dataset_config
-from pipeline.detection.config import load_train_config
-from scene.config import load_yaml
+from pipeline.detection.network.config import load_train_config
+from scene.common.config import load_yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

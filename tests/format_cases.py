@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.formats.point_cloud import PointCloud
-from scene.grid import Grid
-from scene.mesh import TriangleMesh
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
 
 UTM = np.array([331_245.0, 6_270_118.0, 412.0])
 GRID = Grid(x_min=1.25, y_max=9.5, gsd=0.02, width=70, height=40)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from scene.backend import dr
+from scene.common.backend import dr
 
 
 def kernels(work: Callable[[], object]) -> dict[str, int]:

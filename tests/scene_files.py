@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from surfaces import heightfield
 
-from scene.mesh import TriangleMesh
+from scene.geometry.mesh import TriangleMesh
 
 UTM = np.array([500_000.0, 5_000_000.0, 800.0])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from scene.mesh import FloatArray, TriangleMesh
+from scene.geometry.mesh import FloatArray, TriangleMesh
 
 
 def plane(normal: FloatArray, point: FloatArray, half_side: float = 40.0) -> TriangleMesh:

@@ -18,26 +18,26 @@ from pipeline.cli.main import main
 from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.sensors_compared import Contestant
 from pipeline.config.simulation import SimulationConfig
-from pipeline.detection.run import detector_folder
-from pipeline.detection.score_files import assess
-from pipeline.detection.weights import check_detector
-from pipeline.formats.atomic import write_text
-from pipeline.formats.camera_files import read_lens
-from pipeline.formats.coco import read_coco
-from pipeline.formats.colmap import read_colmap
-from pipeline.formats.geotiff import read_tiff
-from pipeline.formats.measurement_checks import check_pixels
+from pipeline.detection.inference.weights import check_detector
+from pipeline.detection.products.run import detector_folder
+from pipeline.detection.products.score_files import assess
+from pipeline.formats.cameras.camera_files import read_lens
+from pipeline.formats.cameras.colmap import read_colmap
+from pipeline.formats.files.atomic import write_text
+from pipeline.formats.measurements.checks import check_pixels
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.result_records import read_run
+from pipeline.formats.rasters.geotiff import read_tiff
+from pipeline.formats.records.coco import read_coco
+from pipeline.formats.records.result_records import read_run
 from pipeline.measurement.units import check_same_unit
 from pipeline.report.pictures import png
 from pipeline.surface.mesh import SurfaceConfig, mesh_cloud
-from scene.config import parse
-from scene.errors import InputError
-from scene.imported import ImportedWall
-from sensors.camera import Camera
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.walls.imported import ImportedWall
+from sensors.cameras.camera import Camera
 from sensors.effects.range_intensity_bias import RangeIntensityBias
-from sensors.placement import RigConfig, StationConfig
+from sensors.models.placement import RigConfig, StationConfig
 
 CAMERA = Camera(1000, 800, 1000.0, *[0.0] * 10, position=np.zeros(3), rotation=np.eye(3))
 

@@ -19,9 +19,9 @@ import pytest
 import yaml
 from nbclient import NotebookClient
 
-from pipeline.formats.laz import read_laz
-from scene.config import load_yaml, parse
-from sensors.model import TlsModel
+from pipeline.formats.points.laz import read_laz
+from scene.common.config import load_yaml, parse
+from sensors.models.sensor_model import TlsModel
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))

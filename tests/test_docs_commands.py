@@ -26,12 +26,12 @@ from pipeline.cli.main import COMMANDS, main, simulate
 from pipeline.config.bundled import configs_folder
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import load_config
-from pipeline.formats.metashape import write_metashape
-from pipeline.formats.ply import write_ply
+from pipeline.formats.cameras.metashape import write_metashape
+from pipeline.formats.meshes.ply import write_ply
 from pipeline.view.server import open_results
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
-from sensors.placement import RigConfig, Target
+from scene.common.keyed_random import KeyedRandom
+from scene.walls.procedural import ProceduralWall
+from sensors.models.placement import RigConfig, Target
 
 TINY = [
     *("--set", "scanner.azimuth_step_rad=0.002", "--set", "scanner.zenith_step_rad=0.002"),

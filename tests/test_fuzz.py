@@ -20,23 +20,23 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from pipeline.config.overrides import apply_overrides
-from pipeline.formats.camera_files import read_lens, read_oriented
-from pipeline.formats.cameras import read_cameras_yaml, write_cameras_yaml
-from pipeline.formats.colmap import read_map, write_map
-from pipeline.formats.e57 import E57Scan, read_e57, write_e57
-from pipeline.formats.geotiff import read_geotiff, write_geotiff
-from pipeline.formats.laz import read_laz, write_laz
-from pipeline.formats.metashape import write_calibration, write_metashape
-from pipeline.formats.opencv import write_opencv
-from pipeline.formats.ply import read_ply, read_ply_points, write_ply, write_ply_points
+from pipeline.formats.cameras.camera_files import read_lens, read_oriented
+from pipeline.formats.cameras.cameras import read_cameras_yaml, write_cameras_yaml
+from pipeline.formats.cameras.colmap import read_map, write_map
+from pipeline.formats.cameras.metashape import write_calibration, write_metashape
+from pipeline.formats.cameras.opencv import write_opencv
+from pipeline.formats.meshes.ply import read_ply, read_ply_points, write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.xyz import read_xyz, write_xyz
-from scene.config import load_yaml
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.imported import ImportedWall
-from scene.mesh import TriangleMesh
-from sensors.camera import Camera, CameraPair
+from pipeline.formats.points.e57 import E57Scan, read_e57, write_e57
+from pipeline.formats.points.laz import read_laz, write_laz
+from pipeline.formats.points.xyz import read_xyz, write_xyz
+from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
+from scene.common.config import load_yaml
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
+from scene.walls.imported import ImportedWall
+from sensors.cameras.camera import Camera, CameraPair
 
 CONFIGS = Path(__file__).parent / "configs_of_versions" / "0.1"
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "25"))

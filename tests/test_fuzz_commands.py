@@ -22,7 +22,7 @@ from benchmarks.bad_inputs.drawn_cases import SET_UPS, drawn
 from benchmarks.bad_inputs.materials import make_small
 from benchmarks.bad_inputs.run import said
 from pipeline.cli.main import COMMANDS
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 DOORS = (
     "pipeline.run.simulation:_observe",
@@ -35,7 +35,7 @@ DOORS = (
     "pipeline.dataset.combine:_finish",
     "pipeline.gap.naming.workflow:diagnose",
     "pipeline.gap.survey.identifiability:identifiability",
-    "pipeline.detection.run:_write",
+    "pipeline.detection.products.run:_write",
     "pipeline.export.pictures:save_picture",
     "pipeline.surface.from_cloud:surface_of_cloud",
     "pipeline.view.server:make_server",

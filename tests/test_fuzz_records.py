@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from test_fuzz import ODD, QUICK, answered, places
 
 from pipeline.dataset.records import _digest, _text, read_dataset_file
-from pipeline.detection.weights import CONFIG, load_config
-from pipeline.formats.measurement import read_measurement
-from pipeline.formats.result_records import read_gap, read_run
+from pipeline.detection.inference.weights import CONFIG, load_config
+from pipeline.formats.measurements.measurement import read_measurement
+from pipeline.formats.records.result_records import read_gap, read_run
 
 BLOCK = {
     "label": 1,

@@ -13,21 +13,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LONGEST_FILE = 500
-OF_SCENE_FOR_SENSORS = {
-    "backend",
-    "config",
-    "errors",
-    "frame",
-    "grid",
-    "illumination",
-    "lazy",
-    "keyed_random",
-    "mesh",
-    "raycast",
-    "texture",
-    "upload",
-}
-"""The modules of `scene` that a sensor may know: what it looks at, not how walls and blocks are made."""
+OF_SCENE_FOR_SENSORS = ("common", "geometry", "ray_casting", "appearance")
+"""The folders of `scene` that a sensor may import: what it looks at, not how walls and blocks are made."""
 HEAVY = ("numpy", "scipy", "mitsuba", "drjit", "pydantic", "matplotlib", "open3d", "cv2", "rich")
 
 Imports = set[tuple[str, ...]]
@@ -73,7 +60,7 @@ def test_layers_import_downwards_only(folder: str) -> None:
         ("scene", "import pipeline.run.simulation"),
         ("scene", "def late():\n    from pipeline import run"),
         ("sensors", "from pipeline.run.simulation import simulate"),
-        ("sensors", "from scene.carve import carve"),
+        ("sensors", "from scene.blocks.carve import carve"),
         ("sensors", "from scene import blocks"),
     ],
 )
@@ -83,7 +70,7 @@ def test_the_rule_sees_a_violation(folder: str, line: str) -> None:
 
 @pytest.mark.parametrize("folder", ["scene", "sensors", "pipeline"])
 def test_mitsuba_comes_through_the_backend_only(folder: str) -> None:
-    allowed = {ROOT / "scene/backend.py", ROOT / "pipeline/cli/doctor.py"}  # doctor looks where there may be no backend
+    allowed = {ROOT / "scene/common/backend.py", ROOT / "pipeline/cli/doctor.py"}  # doctor looks where there may be no backend
     direct = [file for file in sources(folder) if {path[0] for path in imports_of(file.read_text())} & {"mitsuba", "drjit"}]
     assert set(direct) <= allowed
 
@@ -121,8 +108,8 @@ def test_reading_a_config_loads_none_of_the_slow_libraries() -> None:
 
 
 def folder_of(module: tuple[str, ...]) -> str:
-    """The room of a module: `pipeline.gap.mean` of pipeline.gap.mean.selection, `sensors` of sensors.effects.wobble."""
-    return ".".join(module[:-1]) if module[0] == "pipeline" else module[0]
+    """The folder of a module: `pipeline.gap.mean` for pipeline.gap.mean.selection."""
+    return ".".join(module[:-1])
 
 
 def room_edges(imports: dict[tuple[str, ...], Imports]) -> dict[str, set[str]]:
@@ -148,7 +135,7 @@ def modules() -> dict[tuple[str, ...], Imports]:
 def test_no_rooms_need_each_other() -> None:
     """Raises CycleError, which names the rooms, where one does."""
     order = list(TopologicalSorter(room_edges(modules())).static_order())
-    assert order.index("scene") < order.index("sensors") < order.index("pipeline.run") < order.index("pipeline.cli")
+    assert order.index("scene.common") < order.index("sensors.laser") < order.index("pipeline.run") < order.index("pipeline.cli")
 
 
 def test_the_rule_sees_rooms_that_need_each_other() -> None:
@@ -161,8 +148,22 @@ def test_the_rule_sees_rooms_that_need_each_other() -> None:
         list(TopologicalSorter(room_edges(imports)).static_order())
 
 
-def test_no_file_of_the_pipeline_lies_outside_a_room() -> None:
-    assert [file.name for file in (ROOT / "pipeline").glob("*.py")] == ["__init__.py"]
+def test_every_module_lies_in_a_folder() -> None:
+    beside = {
+        file.relative_to(ROOT).as_posix() for folder in ("scene", "sensors", "pipeline") for file in (ROOT / folder).glob("*.py")
+    }
+    assert beside == {"scene/__init__.py", "sensors/__init__.py", "sensors/subset.py", "pipeline/__init__.py"}
+
+
+def test_every_folder_says_what_it_holds() -> None:
+    """The docstring of a folder: what lives here, what does not, where to start."""
+    described = {
+        file.relative_to(ROOT).as_posix(): ast.get_docstring(ast.parse(file.read_text())) or ""
+        for folder in ("scene", "sensors", "pipeline")
+        for file in sources(folder)
+        if file.name == "__init__.py"
+    }
+    assert [file for file, text in described.items() if text.count(".") < 2] == []
 
 
 @pytest.mark.parametrize("file", sources("pipeline"), ids=lambda file: str(file.relative_to(ROOT)))

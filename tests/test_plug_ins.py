@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from scene.errors import InputError
-from scene.plug_ins import plugged
+from scene.common.errors import InputError
+from scene.common.plug_ins import plugged
 
 ROOT = Path(__file__).parents[1]
 MODULE = """
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.formats.point_cloud import PointCloud
-from scene.procedural import OWN_SITES
+from scene.walls.procedural import OWN_SITES
 
 SCANNER = Path(__file__).with_name("toy_scanner.yaml")
 quarry = replace(OWN_SITES["pilkington"], width_m=6.0, height_m=4.0, albedo=0.31)
@@ -51,7 +51,7 @@ from pathlib import Path
 from pipeline import configure, make_wall
 from pipeline.cli.json_schema import json_schema
 from pipeline.comparison.sensors_compared import contestants
-from pipeline.formats.points import read_points
+from pipeline.formats.points.points import read_points
 from scene import InputError
 
 config = configure(scanner="toy_one", wall={"style": "quarry"})

@@ -48,10 +48,10 @@ from pipeline.gap.residuals.residuals import NOT_SHARED
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.other.spread import spread_candidates
 from pipeline.cli.json_schema import json_schema
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects import TLS_EFFECTS, catalogue
-from sensors.model import TlsModel
-from sensors.pulses import PulseGeometry
+from sensors.models.sensor_model import TlsModel
+from sensors.signal_chain.pulses import PulseGeometry
 
 at = PulseGeometry(*np.random.default_rng(1).uniform(0.4, 0.9, (9, 50)))
 residuals = SimpleNamespace(sensor="tls", geometry=at, candidates=catalogue("tls"))

@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.dataset.config import DatasetConfig
 from pipeline.dataset.run import make_dataset
-from scene.config import parse
+from scene.common.config import parse
 
 COMMAND = "scarpsim dataset tiny.yaml --out DIR"
 ROOT = Path(__file__).parents[1]

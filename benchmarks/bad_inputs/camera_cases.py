@@ -11,11 +11,11 @@ import yaml
 from benchmarks.bad_inputs.case import Case
 from benchmarks.bad_inputs.exchange_cases import sparse
 from benchmarks.bad_inputs.spoil import Change, both, instead, link, pipe, put, text
-from pipeline.formats.cameras import read_cameras_yaml
-from pipeline.formats.colmap import write_colmap
-from pipeline.formats.metashape import write_metashape
-from pipeline.formats.opencv import write_opencv
-from sensors.camera import Camera
+from pipeline.formats.cameras.cameras import read_cameras_yaml
+from pipeline.formats.cameras.colmap import write_colmap
+from pipeline.formats.cameras.metashape import write_metashape
+from pipeline.formats.cameras.opencv import write_opencv
+from sensors.cameras.camera import Camera
 
 
 def _camera_files(write: Callable[[Path], object], *changes: Change) -> Change:

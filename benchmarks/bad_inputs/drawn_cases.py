@@ -24,9 +24,9 @@ from hypothesis import strategies as st
 from benchmarks.bad_inputs.case import PORT_IN_USE, Case
 from benchmarks.bad_inputs.spoil import Change, both, instead, link, pipe, text, write_mesh
 from pipeline.dataset.records import _digest, _text
-from pipeline.formats.ply import read_ply
-from pipeline.formats.points import read_points
-from scene.errors import InputError
+from pipeline.formats.meshes.ply import read_ply
+from pipeline.formats.points.points import read_points
+from scene.common.errors import InputError
 
 Draw = Callable[[st.SearchStrategy[Any]], Any]
 SITE, SET, RUN = "site.yaml", "set.yaml", "run/run.json"
@@ -311,8 +311,8 @@ def _odd_coordinates(draw: Draw, name: str) -> Change:
 
 
 def _odd_map(draw: Draw, name: str) -> Change:
-    from pipeline.formats.geotiff import read_geotiff, write_geotiff
-    from scene.grid import Grid
+    from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
+    from scene.geometry.grid import Grid
 
     kind, factor = draw(st.sampled_from(["scale", "some", "all", "cut"])), draw(st.sampled_from(_FACTORS))
     step = draw(st.integers(1, 60))

@@ -31,10 +31,10 @@ from benchmarks.bad_inputs.spoil import (
     text,
     whole,
 )
-from pipeline.formats.laz import read_laz, write_laz
-from pipeline.formats.ply import read_ply, write_ply
+from pipeline.formats.meshes.ply import read_ply, write_ply
 from pipeline.formats.point_cloud import PointCloud
-from scene.mesh import TriangleMesh
+from pipeline.formats.points.laz import read_laz, write_laz
+from scene.geometry.mesh import TriangleMesh
 
 RUN, MAP, TILES = "run/run.json", "run/difference_001.tif", "set/train/annotations.json"
 BEFORE, AFTER, POINTS = "run/epoch_000/surface.ply", "run/epoch_001/surface.ply", "run/epoch_001/points.laz"

@@ -14,13 +14,13 @@ from benchmarks.gap_challenge.cases import Case, make
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
 from pipeline.config.bundled import configs_folder
-from pipeline.detection.events import Event, write_events
-from pipeline.formats.atomic import write_json
-from pipeline.formats.laz import write_laz
-from pipeline.formats.ply import read_ply, write_ply
+from pipeline.detection.products.events import Event, write_events
+from pipeline.formats.files.atomic import write_json
+from pipeline.formats.meshes.ply import read_ply, write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
-from scene.mesh import FloatArray, TriangleMesh
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
+from scene.geometry.mesh import FloatArray, TriangleMesh
 
 SITE: dict[str, Any] = {
     "seed": 3,

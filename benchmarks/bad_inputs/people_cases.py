@@ -13,9 +13,9 @@ import yaml
 
 from benchmarks.bad_inputs.case import PORT_IN_USE, Case
 from benchmarks.bad_inputs.spoil import GONE, NAN, Change, both, instead, link, pipe, put, text, whole
-from pipeline.formats.laz import write_laz
-from pipeline.formats.ply import read_ply
+from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import write_laz
 
 SITE, YAML, RUN, MAP = "site.yaml", "measurement/measurement.yaml", "run/run.json", "run/difference_001.tif"
 _OUT = ("--out", "out", "--quiet")
@@ -259,7 +259,7 @@ def _clouds(*moves: Any) -> Change:
 
 
 def _scan(folder: Path) -> Any:
-    from pipeline.formats.points import read_points
+    from pipeline.formats.points.points import read_points
 
     return read_points(folder / "measurement/scan.ply").points
 
@@ -284,8 +284,8 @@ def _measured() -> dict[str, Change]:
 
 
 def _scaled(folder: Path, factor: float) -> None:
-    from pipeline.formats.ply import write_ply
-    from scene.mesh import TriangleMesh
+    from pipeline.formats.meshes.ply import write_ply
+    from scene.geometry.mesh import TriangleMesh
 
     wall = read_ply(folder / "measurement/wall.ply")
     middle = wall.vertices.mean(axis=0)
@@ -293,8 +293,8 @@ def _scaled(folder: Path, factor: float) -> None:
 
 
 def _heap(folder: Path) -> None:
-    from pipeline.formats.ply import write_ply
-    from scene.mesh import TriangleMesh
+    from pipeline.formats.meshes.ply import write_ply
+    from scene.geometry.mesh import TriangleMesh
 
     wall = read_ply(folder / "measurement/wall.ply")
     write_ply(folder / "measurement/wall.ply", TriangleMesh(wall.vertices, np.tile(wall.faces[:1], (1_000_000, 1))))

@@ -32,7 +32,7 @@ LIBRARIES = (
 ROOMS = (
     *("pipeline.run.simulation", "pipeline.run.report", "pipeline.gap.naming.workflow", "pipeline.gap.report.report"),
     *("pipeline.measurement.build", "pipeline.comparison.report", "pipeline.calibration.calibrate", "pipeline.icp_study.report"),
-    *("pipeline.planning.report", "pipeline.dataset.run", "pipeline.detection.score_files"),
+    *("pipeline.planning.report", "pipeline.dataset.run", "pipeline.detection.products.score_files"),
 )
 
 

@@ -28,10 +28,10 @@ from benchmarks.bad_inputs.spoil import (
     text,
     whole,
 )
-from pipeline.formats.e57 import E57Scan, write_e57
-from pipeline.formats.laz import write_laz
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
 
 SCAN, WALL = "raw/scan.ply", "raw/wall.ply"
 FACTOR, OFFSET = 131, 155

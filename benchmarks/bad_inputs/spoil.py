@@ -15,10 +15,10 @@ import numpy as np
 import tifffile
 import yaml
 
-from pipeline.formats.laz import write_laz
-from pipeline.formats.ply import read_ply
+from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
 
 Change = Callable[[Path], object]
 Array = np.ndarray[Any, np.dtype[np.float64]]
@@ -172,8 +172,8 @@ def claiming_tiff(path: Path, height: int = 30000, width: int = 30000) -> None:
 
 def map_of(values: Any) -> Callable[[Path], object]:
     """A GeoTIFF of 0.05 m with these values (h, w)."""
-    from pipeline.formats.geotiff import write_geotiff
-    from scene.grid import Grid
+    from pipeline.formats.rasters.geotiff import write_geotiff
+    from scene.geometry.grid import Grid
 
     raster = np.asarray(values, np.float32)
     return lambda path: write_geotiff(path, raster, Grid(0.0, 2.0, 0.05, raster.shape[1], raster.shape[0]))

@@ -13,15 +13,15 @@ import numpy as np
 import yaml
 
 from benchmarks.gap_injections.formulas import IN_RASTER, Array, Matched, Optics, Scan, Values, in_raster, matched, scanned
-from pipeline.formats.cameras import write_cameras_yaml
-from pipeline.formats.laz import read_laz, write_laz
-from pipeline.formats.ply import read_ply, write_ply, write_ply_points
+from pipeline.formats.cameras.cameras import write_cameras_yaml
+from pipeline.formats.meshes.ply import read_ply, write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import read_laz, write_laz
 from pipeline.measurement.build import Request, build
-from scene.mesh import TriangleMesh
-from sensors.camera import Camera, CameraPair
-from sensors.matching import MatchingConfig, SearchRange, match, without_speckles
-from sensors.refinement import refine
+from scene.geometry.mesh import TriangleMesh
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.stereo.matching import MatchingConfig, SearchRange, match, without_speckles
+from sensors.stereo.refinement import refine
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data"
 F_PX, BASE_M, OPTICS = 994.978, 0.193001, Optics(994.978, 311.193, 254.877, 31.086)

@@ -29,11 +29,11 @@ from benchmarks.gap_injections.cases import CASES, Case
 from benchmarks.gap_injections.judge import Json, judged
 from benchmarks.gap_injections.page import page
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.residuals.registration import registered, residuals_of
 from pipeline.gap.residuals.residuals import Residuals
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 _ROUNDS = 3
 _NOISES = {

@@ -21,17 +21,17 @@ from pipeline.registration import register as icp
 from pipeline.run.site import SensorSite, prepare_site
 from pipeline.surface.from_cloud import surface_of_cloud
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
-from scene import blocks as solids
-from scene import carve as carving
-from scene.config import parse
-from scene.errors import InputError
-from scene.imported import ImportedWall
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from scene.wall import Wall
-from sensors.observation import Observation, Sensor
+from scene.blocks import block as solids
+from scene.blocks import carve as carving
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.imported import ImportedWall
+from scene.walls.procedural import ProceduralWall
+from scene.walls.wall import Wall
+from sensors.signal_chain.observation import Observation, Sensor
 
 if TYPE_CHECKING:
     import xarray

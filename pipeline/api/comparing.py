@@ -18,7 +18,7 @@ from pipeline.comparison.report import answer, pictures, summary, write_comparis
 from pipeline.comparison.sensors_compared import Given, contestants
 from pipeline.config.simulation import SimulationConfig
 from pipeline.report.notebook_progress import python_progress
-from scene.errors import InputError, nearest
+from scene.common.errors import InputError, nearest
 
 if TYPE_CHECKING:
     import pandas

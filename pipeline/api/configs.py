@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from pipeline.config.bundled import bundled_config, config_path
 from pipeline.config.overrides import Override
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config, resolved
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 ConfigLike = SimulationConfig | Mapping[str, Any] | str | os.PathLike[str] | None
 """A config, its values, a file, a bundled site's name, or a run's folder; None: the demo."""

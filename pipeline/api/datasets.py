@@ -17,7 +17,7 @@ from pipeline.dataset.config import DatasetConfig, dataset_config, load_dataset_
 from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.plan import SPLITS
 from pipeline.dataset.records import read_dataset_file
-from pipeline.formats.coco import read_coco
+from pipeline.formats.records.coco import read_coco
 from pipeline.report.notebook_progress import python_progress
 
 if TYPE_CHECKING:

@@ -14,12 +14,12 @@ from pipeline.api.configs import Show
 from pipeline.api.maps import raster_of
 from pipeline.api.pictures import Picture, html_table, pick
 from pipeline.api.tables import boxes
-from pipeline.detection import run
-from pipeline.detection.events import Event, read_events
-from pipeline.formats.atomic import empty_folder
-from pipeline.formats.geotiff import write_geotiff
+from pipeline.detection.products import run
+from pipeline.detection.products.events import Event, read_events
+from pipeline.formats.files.atomic import empty_folder
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.notebook_progress import python_progress
-from scene.errors import InputError, OutsideError
+from scene.common.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
     import geopandas

@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from scene.errors import InputError
-from scene.extras import how_to_install
+from scene.common.errors import InputError
+from scene.common.extras import how_to_install
 
 EXTRAS = {"open3d": "poisson"}
 """The extra of a library; of all others it is `notebook`."""

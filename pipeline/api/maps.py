@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.api.extras import library
-from pipeline.formats.geotiff import wall_frame_wkt
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.grid import Grid
+from pipeline.formats.rasters.geotiff import wall_frame_wkt
+from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
+from scene.geometry.grid import Grid
 
 if TYPE_CHECKING:
     import xarray

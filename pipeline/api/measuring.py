@@ -18,7 +18,8 @@ from pipeline.api.points import Points, scatter
 from pipeline.api.runs import Run
 from pipeline.api.tables import boxes, frame, spread_out
 from pipeline.config.presets import model_file
-from pipeline.formats.measurement import (
+from pipeline.formats.measurements.config import MeasurementConfig
+from pipeline.formats.measurements.measurement import (
     Material,
     assembled,
     nominal_pair,
@@ -26,22 +27,21 @@ from pipeline.formats.measurement import (
     read_model,
     sensor_model,
 )
-from pipeline.formats.measurement import Measurement as Measured
-from pipeline.formats.measurement_config import MeasurementConfig
+from pipeline.formats.measurements.measurement import Measurement as Measured
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
+from pipeline.formats.points.points import read_points
 from pipeline.gap.naming import workflow
 from pipeline.gap.report import figures, report
 from pipeline.report.notebook_progress import python_progress
 from pipeline.run.site import prepare_site
-from scene.config import parse
-from scene.errors import InputError
-from scene.imported import read_reference
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from sensors.camera import CameraPair
-from sensors.exchanged import pair_of
-from sensors.tls import LaserScanner
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.walls.imported import read_reference
+from sensors.cameras.camera import CameraPair
+from sensors.laser.tls import LaserScanner
+from sensors.stereo.exchanged import pair_of
 
 if TYPE_CHECKING:
     import geopandas
@@ -86,7 +86,7 @@ def measure(
 
 @dataclass(frozen=True, repr=False)
 class Measurement:
-    """What was measured, with what predicts it. held: everything, as `pipeline.formats.measurement` has it."""
+    """What was measured, with what predicts it. held: everything, as `pipeline.formats.measurements.measurement` has it."""
 
     held: Measured
 

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from pipeline.api.extras import library
 from pipeline.api.pictures import Picture, html_table
-from pipeline.formats.ply import read_ply, write_ply
-from scene.errors import InputError
-from scene.mesh import TriangleMesh
+from pipeline.formats.meshes.ply import read_ply, write_ply
+from scene.common.errors import InputError
+from scene.geometry.mesh import TriangleMesh
 
 
 class Mesh(TriangleMesh):
@@ -73,9 +73,9 @@ class Mesh(TriangleMesh):
         """A hillshade, looked at along the normal of the mean plane; gsd_m: side of a pixel, none: for 100,000 of them."""
         from pipeline.precision.surface import wall_raster
         from pipeline.report.figures import hillshade_figure
-        from scene.frame import WallFrame
-        from scene.mesh import area_normals
-        from scene.raycast import RayCaster
+        from scene.geometry.frame import WallFrame
+        from scene.geometry.mesh import area_normals
+        from scene.ray_casting.raycast import RayCaster
 
         outward = area_normals(self.corners()).sum(axis=0)
         frame = WallFrame.fit(self.vertices, self.vertices.mean(axis=0) + outward)

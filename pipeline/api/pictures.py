@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.formats.atomic import write_bytes
+from pipeline.formats.files.atomic import write_bytes
 from pipeline.report.page import picture_source
-from scene.errors import InputError, nearest
+from scene.common.errors import InputError, nearest
 
 _THUMBNAIL_PX = 640
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from pipeline.api.extras import library
 from pipeline.api.pictures import Picture, html_table
-from pipeline.formats.laz import EXACT_INTENSITY
-from pipeline.formats.pcd import write_pcd
-from pipeline.formats.ply import write_ply_points
+from pipeline.formats.meshes.ply import write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.xyz import write_xyz
+from pipeline.formats.points.laz import EXACT_INTENSITY
+from pipeline.formats.points.pcd import write_pcd
+from pipeline.formats.points.xyz import write_xyz
 from pipeline.run.products import write_cloud
-from scene.errors import InputError
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 
 _MOST_DRAWN = 100_000
 _AXES = ("x", "y", "z")

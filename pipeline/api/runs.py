@@ -16,14 +16,14 @@ from pipeline.api.pictures import Picture, html_table, pick
 from pipeline.api.points import Points
 from pipeline.api.tables import boxes, frame, spread_out
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
-from pipeline.formats.atomic import new_folder
-from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.result_records import RUN_FILE, read_annotations
-from pipeline.formats.run_files import RunFiles, epoch_folder
+from pipeline.formats.files.atomic import new_folder
+from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.formats.records.result_records import RUN_FILE, read_annotations
+from pipeline.formats.records.run_files import RunFiles, epoch_folder
 from pipeline.report.notebook_progress import python_progress
 from pipeline.report.page import millimetres
-from scene.errors import InputError
-from scene.frame import WallFrame
+from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
 
 if TYPE_CHECKING:
     import geopandas

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pipeline.api.extras import library
-from pipeline.formats.geotiff import wall_frame_wkt
+from pipeline.formats.rasters.geotiff import wall_frame_wkt
 
 if TYPE_CHECKING:
     import geopandas

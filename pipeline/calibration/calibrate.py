@@ -22,12 +22,12 @@ from pipeline.calibration.windows import Windows
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.report.progress import Progress
 from pipeline.run.site import SensorSite
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.camera import Side
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Side
 from sensors.effects.base import Effect
-from sensors.model import OrientationNoise, Spread
-from sensors.stereo import StereoPair
+from sensors.models.sensor_model import OrientationNoise, Spread
+from sensors.stereo.stereo_pair import StereoPair
 
 _ALIKE = 0.9
 """Correlation from which two parameters count as inseparable."""

@@ -13,8 +13,8 @@ from scipy import stats
 from pipeline.change.difference import DifferenceStatistics, statistics
 from pipeline.noise.statistics import Normality, TailFigures, normality, tails, without_outliers
 from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ import numpy as np
 
 from pipeline.calibration.parameters import Parameters
 from pipeline.calibration.search import Simulate
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 _STEP = 0.1
 _CLOSE = 0.02

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pipeline.calibration.reference_error import ReferenceError
 from pipeline.calibration.windows import Windows, choose_windows, unchanged
 from pipeline.config.simulation import SensorName, SimulationConfig
-from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.measurement import (
+from pipeline.formats.measurements.measurement import (
     FILE,
     Measurement,
     StereoMeasurement,
@@ -21,14 +20,15 @@ from pipeline.formats.measurement import (
     TlsMeasurement,
     read_measurement,
 )
-from pipeline.formats.result_records import RUN_FILE, read_run
+from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.noise.measured import MeasuredMaps, area_mask, read_measured
 from pipeline.run.site import SensorSite, prepare_site
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner, Pattern
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from sensors.laser.tls import LaserScanner, Pattern
+from sensors.stereo.stereo_pair import StereoPair
 
 BoolArray = NDArray[np.bool_]
 _NEIGHBOURS, _SAMPLE = 64, 5000

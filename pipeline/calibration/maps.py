@@ -13,13 +13,13 @@ from pipeline.registration.register import register_to
 from pipeline.run.acquisition import look, reconstruct
 from pipeline.run.registered import reference_and_target
 from pipeline.run.site import SensorSite
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from sensors.model import StereoModel
-from sensors.stereo import StereoPair
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.sensor_model import StereoModel
+from sensors.stereo.stereo_pair import StereoPair
 
 
 def with_model(site: SensorSite, model: StereoModel) -> SensorSite:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from scene.errors import InputError, nearest
-from scene.mesh import FloatArray
-from sensors.model import OrientationNoise, Spread, StereoModel, TlsModel
+from scene.common.errors import InputError, nearest
+from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import OrientationNoise, Spread, StereoModel, TlsModel
 
 Model = StereoModel | TlsModel
 ORIENTATION = "orientation"

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement, TlsMeasurement
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, barycentric
-from scene.raycast import RayCaster
+from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, barycentric
+from scene.ray_casting.raycast import RayCaster
 
 
 @dataclass(frozen=True)

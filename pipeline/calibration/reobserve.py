@@ -2,8 +2,8 @@
 
 A whole epoch of the Glendale site traces two million cells, meshes them and looks at five million pixels, to compare a hundred
 thousand of them. Here the wall is seen once without noise, which tells the cells that surround each window; an observation then
-is the sensor's own (`sensors.stereo`, `sensors.tls`: all noise, effects, rectification, occlusion) of these cells and of a sparse
-lattice over the whole view, by which it is registered; meshing and rasters are the pipeline's own.
+is the sensor's own (`sensors.stereo.stereo_pair`, `sensors.laser.tls`: all noise, effects, rectification, occlusion) of these
+cells and of a sparse lattice over the whole view, by which it is registered; meshing and rasters are the pipeline's own.
 
 Against the whole simulation (`pipeline.calibration.maps`) one thing differs: both epochs are registered to the wall as it is
 instead of the later to the noisy earlier one, from some thousand points instead of all. tests/pipeline/test_calibrate.py
@@ -29,15 +29,15 @@ from pipeline.registration.register import IcpConfig, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.run.site import SensorSite
 from pipeline.surface.mesh import mesh_observation
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.raycast import RayCaster
-from sensors.chosen import asked_for, looking_around
-from sensors.model import StereoModel, TlsModel
-from sensors.observation import Observation
-from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.tls import LaserScanner
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.stereo_pair import StereoPair
+from sensors.subset import asked_for, looking_around
 
 _LATTICE_POINTS = 4000
 """Points by which an observation is registered: more of them would not bring it nearer to a registration by all."""

@@ -15,11 +15,11 @@ from scipy import stats
 from pipeline.calibration.calibrate import Baseline, CalibrationResult
 from pipeline.calibration.parameters import ORIENTATION
 from pipeline.change.difference import statistics
-from pipeline.formats.atomic import write_text
+from pipeline.formats.files.atomic import write_text
 from pipeline.report.figures import DIFFERENCE_LABEL, DPI, FAMILY, difference_figure, dress, plain_numbers, png_bytes
 from pipeline.report.page import p_value_in_words, percent, template, true_minus
 from pipeline.report.plain_text import powers_of_ten
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 Pictures = Sequence[tuple[str, str, bytes]]
 """Name of the file, caption, PNG."""

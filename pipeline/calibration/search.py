@@ -32,9 +32,9 @@ from scipy import linalg, optimize, stats
 
 from pipeline.calibration.parameters import Parameters
 from pipeline.report.progress import Progress
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 MODEL_SIGMA = 0.003
 """Standard deviation of the logarithm of a length that the simulation in windows gives against the whole simulation."""

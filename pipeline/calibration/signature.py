@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pipeline.calibration.windows import Windows
 from pipeline.change.robust import nmad
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 _LAGS_PX = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 _STEEP = 0.9

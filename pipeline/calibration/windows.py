@@ -11,9 +11,9 @@ from scipy import ndimage
 
 from pipeline.change.difference import statistics
 from pipeline.config.calibration import CalibrationConfig
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import FloatArray, IntArray
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray, IntArray
 
 BoolArray = NDArray[np.bool_]
 _LEAST_STABLE = 0.6

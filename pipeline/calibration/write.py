@@ -12,15 +12,15 @@ from pipeline.calibration.calibrate import Baseline, CalibrationResult
 from pipeline.calibration.maps import noise_map
 from pipeline.calibration.report import pictures, scale_m, write_calibration_report
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
-from pipeline.formats.geotiff import write_geotiff
+from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.figures import SCALE_SIGMAS
 from pipeline.report.map_styles import difference_style
 from pipeline.report.provenance import versions
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from scene.yaml_text import yaml_line
+from scene.common.keyed_random import KeyedRandom
+from scene.common.yaml_text import yaml_line
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
 
 MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "report.html"
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from scene.config import Config
-from scene.grid import Grid
-from scene.mesh import IntArray
+from scene.common.config import Config
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import IntArray
 
 STANDS_OUT, HARDLY_SHOWS = 4.0, 2.0
 """Signal-to-noise ratios (matched_filter.py) above which a block can be found among the noise of a tile, and below which nothing

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 Box = tuple[float, float, float, float]
 Vertex = tuple[float, float]

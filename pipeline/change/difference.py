@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.change.robust import nmad
-from scene.backend import dr, mi
-from scene.config import Config
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import WALL, FloatArray, IntArray, TriangleMesh
-from scene.raycast import RayCaster
-from scene.upload import on_device
+from scene.common.backend import dr, mi
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import on_device
 
 _BYTES_PER_PIXEL = 64
 """What reference, epoch, difference, labels and the copies of statistics and pictures take at their peak."""

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.change.difference import SurfaceRaster
-from scene.config import Config
-from scene.errors import InputError
-from scene.extras import how_to_install
-from scene.grid import Grid
-from scene.mesh import WALL, FloatArray, IntArray
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.common.extras import how_to_install
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, FloatArray, IntArray
 
 _LEAST_POINTS = 2
 """In a cylinder of each epoch: fewer have no standard deviation."""

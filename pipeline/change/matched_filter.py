@@ -21,9 +21,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.grid import Grid
-from scene.mesh import WALL, FloatArray, IntArray
-from scene.raycast import RayCaster
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, FloatArray, IntArray
+from scene.ray_casting.raycast import RayCaster
 
 _SIDES = (64, 128, 256)
 _LEAST_BLOCKS = 20

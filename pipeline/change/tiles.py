@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from scene.config import Config
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import WALL, IntArray
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, IntArray
 
 MOST_TILES = 100_000
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.formats.plain_json import without_nan
+from pipeline.formats.files.plain_json import without_nan
 
 _BULKY = ("config", "versions")
 """What the records in result folders hold to make them again; too long for a script's standard input."""

@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.calibration.write import RECORD_FILE, write
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.config.simulation import load_config
-    from pipeline.formats.atomic import empty_folder, new_folder
+    from pipeline.formats.files.atomic import empty_folder, new_folder
     from pipeline.report.progress import shown_progress
 
     given = config_path("sites", arguments.config) if arguments.config else config_of(arguments.measured)

@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.comparison.comparison import compare_sensors
     from pipeline.comparison.report import COMPARISON_FILE, summary, write_comparison
     from pipeline.comparison.sensors_compared import contestants
-    from pipeline.formats.atomic import empty_folder, new_folder
+    from pipeline.formats.files.atomic import empty_folder, new_folder
     from pipeline.report.progress import shown_progress
 
     sensors = contestants(arguments.configs, arguments.overrides, arguments.seed, own_step=arguments.own_step)

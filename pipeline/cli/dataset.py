@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 if TYPE_CHECKING:
     from pipeline.dataset.run import DatasetSummary

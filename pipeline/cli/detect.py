@@ -47,16 +47,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.train import load_keras
-    from pipeline.detection.run import BASELINE, CONFIDENCES, checked_confidences, detect
-    from pipeline.formats.atomic import check_place, new_folder
+    from pipeline.detection.products.run import BASELINE, CONFIDENCES, checked_confidences, detect
+    from pipeline.formats.files.atomic import check_place, new_folder
     from pipeline.report.progress import shown_progress
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
     out = arguments.out or new_folder(Path("runs"), "detect")
     check_place(out)
     if arguments.model != BASELINE:
-        from pipeline.detection.run import detector_folder, find_inputs
-        from pipeline.detection.weights import check_detector
+        from pipeline.detection.inference.weights import check_detector
+        from pipeline.detection.products.run import detector_folder, find_inputs
 
         check_detector(detector_folder(arguments.model))  # a mistake there, or in the inputs, should not wait for TensorFlow
         find_inputs(arguments.inputs)

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 from pipeline.cli import system_libraries
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options
-from scene.errors import InputError
-from scene.extras import how_to_install
+from scene.common.errors import InputError
+from scene.common.extras import how_to_install
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -181,7 +181,7 @@ def _backend() -> Iterator[Finding]:
     else:  # of no importance where there is a GPU
         remedy = _apt_line([library for library in system_libraries.LIBRARIES if library.soname == system_libraries.LLVM])
         yield Finding("LLVM backend", None if cuda else False, "no usable libLLVM", remedy)
-    from scene.backend import VARIANT
+    from scene.common.backend import VARIANT
 
     yield Finding("Mitsuba variant", True, f"{VARIANT} with {dr.thread_count()} threads")
 

@@ -10,7 +10,7 @@ from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, one_of
 
 if TYPE_CHECKING:
-    from pipeline.detection.evaluate import Overlap
+    from pipeline.detection.evaluation.evaluate import Overlap
 
 SUMMARY = "compare detections with the truth: precision, recall, F1, mask areas, COCO metrics"
 EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detections.json
@@ -44,9 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.detection.run import CONFIDENCES, checked_confidences
-    from pipeline.detection.score_files import as_text, assess, write
-    from pipeline.formats.atomic import check_place
+    from pipeline.detection.products.run import CONFIDENCES, checked_confidences
+    from pipeline.detection.products.score_files import as_text, assess, write
+    from pipeline.formats.files.atomic import check_place
 
     confidences = checked_confidences(arguments.confidence or CONFIDENCES)
     if arguments.out:

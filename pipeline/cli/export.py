@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 SUMMARY = "make pictures, animations, glTF, COPC, sets for YOLO or Hugging Face, checksummed lists of results"
 EXAMPLE = """  scarpsim export runs/my_run picture --epoch 1 --out wall.png
@@ -75,7 +75,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 
 def _of_a_set(arguments: argparse.Namespace) -> Answer:
-    from pipeline.formats.atomic import empty_folder
+    from pipeline.formats.files.atomic import empty_folder
     from pipeline.report.progress import shown_progress
 
     form = arguments.form

@@ -9,7 +9,7 @@ from pathlib import Path
 from pipeline.cli.answer import Answer, recorded
 from pipeline.cli.measurement import add_source_arguments, built
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 SUMMARY = "find where a measurement and the model disagree, name the effect, add it, show the gap shrink"
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.formats.atomic import check_place, new_folder
+    from pipeline.formats.files.atomic import check_place, new_folder
 
     out = arguments.out or new_folder(Path("runs"), "gap")
     check_place(out)
@@ -77,7 +77,7 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
 
 
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
-    from pipeline.formats.measurement import read_measurement
+    from pipeline.formats.measurements.measurement import read_measurement
     from pipeline.gap.decisions import read_decisions
     from pipeline.gap.naming.workflow import STEPS, diagnose
     from pipeline.gap.report.report import summary, write

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.cli.answer import Answer, recorded
 from pipeline.cli.parser import add_output_options, at_least, one_of
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 SUMMARY = "find the settings of ICP that suit a run, against the true transform"
 EXAMPLE = """  scarpsim icp-study runs/my_site
@@ -48,12 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
-    from pipeline.formats.atomic import empty_folder, new_folder
+    from pipeline.formats.files.atomic import empty_folder, new_folder
     from pipeline.icp_study.report import summary, write_icp_study
     from pipeline.icp_study.study import simulated_surfaces, study, surfaces_of_run
     from pipeline.registration.register import IcpConfig
     from pipeline.report.progress import shown_progress
-    from scene.keyed_random import KeyedRandom
+    from scene.common.keyed_random import KeyedRandom
 
     if not 0 <= arguments.offset_m <= MOST_OFFSET_M:
         raise InputError(f"got {arguments.offset_m:g}", where="--offset-m", allowed=f"0 to {MOST_OFFSET_M:g} m")

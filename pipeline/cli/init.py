@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 SUMMARY = "write a short config to start from, with every further key in a comment"
 EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     files = {key: _beside(out, path) for key, path in (("mesh", arguments.mesh), ("cameras", arguments.cameras)) if path}
     text = _dataset(arguments.dataset) if arguments.dataset else simulation_text(arguments.site, arguments.scanner, **files)
     from pipeline.cli.json_schema import schema_line, schema_name, schema_text
-    from pipeline.formats.atomic import write_text
+    from pipeline.formats.files.atomic import write_text
 
     schema = out.parent / schema_name(kind)
     try:
@@ -65,7 +65,7 @@ def simulation_text(site: str | None, scanner: str | None, mesh: str = "", camer
     from pipeline.config.bundled import bundled_config
     from pipeline.config.commented import commented_yaml
     from pipeline.config.simulation import SimulationConfig
-    from scene.config import load_yaml, parse
+    from scene.common.config import load_yaml, parse
 
     source = bundled_config("sites", site) if site else bundled_config("", "demo")
     values = load_yaml(source)

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
-    from pipeline.formats.atomic import empty_folder, new_folder
+    from pipeline.formats.files.atomic import empty_folder, new_folder
     from pipeline.planning.inspect import PLAN_FILE, inspect, write_plans
     from pipeline.planning.report import summary
     from pipeline.report.progress import shown_progress

@@ -9,10 +9,10 @@ from pydantic import BaseModel, RootModel
 
 from pipeline.config.simulation import SensorModel, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
-from pipeline.detection.config import TrainConfig
-from pipeline.formats.measurement_config import MeasurementConfig
-from scene.errors import InputError, nearest
-from sensors.presets import ScannerPreset
+from pipeline.detection.network.config import TrainConfig
+from pipeline.formats.measurements.config import MeasurementConfig
+from scene.common.errors import InputError, nearest
+from sensors.laser.presets import ScannerPreset
 
 KINDS: dict[str, type[BaseModel]] = {
     "simulation": SimulationConfig,

@@ -40,7 +40,7 @@ from pipeline.cli import simulate as simulate_command
 from pipeline.cli.answer import Answer, as_json
 from pipeline.cli.interrupt import INTERRUPTED, second_interrupt_ends
 from pipeline.cli.parser import Parser
-from scene.errors import InputError, OutsideError, nearest, one_line
+from scene.common.errors import InputError, OutsideError, nearest, one_line
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
 _BAD_PLACES = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least, one_of
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 if TYPE_CHECKING:
     from pipeline.measurement.folder import Understood
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Understood:
     """Build the folder that the arguments ask for."""
-    from pipeline.formats.atomic import empty_folder
+    from pipeline.formats.files.atomic import empty_folder
     from pipeline.measurement.build import build, build_stereo
     from pipeline.measurement.surface import build_surface
 

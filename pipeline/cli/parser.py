@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from typing import NoReturn
 
-from scene.errors import InputError, nearest
+from scene.common.errors import InputError, nearest
 
 
 class Parser(argparse.ArgumentParser):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.cli.answer import Answer, recorded
 from pipeline.cli.parser import add_output_options, at_least, one_of
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 SUMMARY = "observe a rock wall before and after rocks fall, and map the differences"
 EXAMPLE = """  simulate --sensor tls
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         _use_threads(arguments.threads)
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.config.simulation import load_config
-    from pipeline.formats.atomic import new_folder
+    from pipeline.formats.files.atomic import new_folder
     from pipeline.report.progress import shown_progress
     from pipeline.run import simulation as pipeline_run
 
@@ -61,7 +61,7 @@ def _use_threads(count: int) -> None:
         os.environ[variable] = str(count)
     import cv2
 
-    from scene.backend import dr
+    from scene.common.backend import dr
 
     cv2.setNumThreads(count)
     dr.set_thread_count(count)

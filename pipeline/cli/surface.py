@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, between
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 SUMMARY = "mesh a point cloud, so that it can be a wall or a reference (extra poisson)"
 EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --out wall.ply
@@ -42,8 +42,8 @@ def run(arguments: argparse.Namespace) -> Answer:
         raise InputError("exists already", where=str(out), remedy="choose another name with --out")
     import numpy as np
 
-    from pipeline.formats.ply import write_ply
-    from pipeline.formats.points import read_points
+    from pipeline.formats.meshes.ply import write_ply
+    from pipeline.formats.points.points import read_points
     from pipeline.surface.from_cloud import surface_of_cloud
     from pipeline.surface.mesh import SurfaceConfig
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 SUMMARY = "train a rockfall detector on a data set"
 EXAMPLE = """  scarpsim train my_dataset --out my_detector
@@ -35,11 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.config.bundled import bundled_config, config_path
-    from pipeline.detection.config import load_train_config
-    from pipeline.detection.data import CocoFolder
-    from pipeline.detection.run import detector_folder
-    from pipeline.detection.weights import check_detector
-    from pipeline.formats.atomic import check_place, empty_folder
+    from pipeline.detection.inference.weights import check_detector
+    from pipeline.detection.network.config import load_train_config
+    from pipeline.detection.network.data import CocoFolder
+    from pipeline.detection.products.run import detector_folder
+    from pipeline.formats.files.atomic import check_place, empty_folder
     from pipeline.report.progress import shown_progress
 
     if arguments.resume:
@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     if config.training.start is not None:
         check_detector(detector_folder(config.training.start))
     load_keras(quiet=arguments.quiet)
-    from pipeline.detection.training import train
+    from pipeline.detection.training.training import train
 
     arguments.kept = f"what was learned is in {arguments.out}; go on with --resume"
     with shown_progress(quiet=arguments.quiet) as progress:
@@ -69,8 +69,8 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def _check_training(out: Path) -> None:
     """Raise InputError where a folder holds nothing of a training, or something else in the place of its folders."""
-    from pipeline.detection.config import BEST, CHECKPOINT, CURVES, EVENTS
-    from pipeline.formats.own_folders import require_own_folder
+    from pipeline.detection.network.config import BEST, CHECKPOINT, CURVES, EVENTS
+    from pipeline.formats.files.own_folders import require_own_folder
 
     if not any((out / name).exists() for name in (CHECKPOINT, BEST, EVENTS, CURVES)):
         remedy = "begin it without --resume, in a new folder"
@@ -81,7 +81,7 @@ def _check_training(out: Path) -> None:
 
 def load_keras(*, quiet: bool) -> None:
     """Import Keras and its backend, and say before that this is what takes so long."""
-    from pipeline.detection.keras_backend import check_installed, keras_ready
+    from pipeline.detection.network.keras_backend import check_installed, keras_ready
 
     backend = check_installed()
     if not quiet:

@@ -35,9 +35,9 @@ from pipeline.noise.statistics import (
     without_outliers,
 )
 from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
 
 Raster = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]

@@ -13,8 +13,8 @@ from pipeline.comparison.sensors_compared import Contestant
 from pipeline.comparison.trial import Trial, compare
 from pipeline.noise.measured import MeasuredMaps, read_measured
 from pipeline.report.progress import Progress
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
 
 _FIGURES_S = 3.0
 """What the plan of the progress takes for the figures of a sensor."""

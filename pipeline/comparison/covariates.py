@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.precision.surface import Places, seen_from
-from scene.backend import dr
-from scene.grid import Grid
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
+from scene.common.backend import dr
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
 
 BoolArray = NDArray[np.bool_]
 Raster = NDArray[np.float32]

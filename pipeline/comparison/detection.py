@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.noise.variogram import VariogramModel, variance_of_mean
-from scene.keyed_random import KeyedRandom
-from scene.mesh import WALL, IntArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import WALL, IntArray
 
 BoolArray = NDArray[np.bool_]
 Z_95 = 1.96

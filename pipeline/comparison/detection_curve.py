@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal, special
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 BoolArray = NDArray[np.bool_]
 LEAST_BLOCKS = 10

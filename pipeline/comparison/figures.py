@@ -30,8 +30,8 @@ from pipeline.report.figures import (
     raster_extent,
 )
 from pipeline.report.plain_text import powers_of_ten
-from scene.grid import Grid
-from scene.mesh import IntArray
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import IntArray
 
 _WIDTH_IN = 13.0
 _SIZE_LABEL = "size of the block, ∛(2 V), m"

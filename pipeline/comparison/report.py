@@ -24,8 +24,8 @@ from pipeline.comparison.figures import (
     table_figure,
 )
 from pipeline.comparison.trial import Trial
-from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
-from pipeline.formats.geotiff import write_geotiff
+from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.figures import DIFFERENCE_LABEL
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import millimetres, p_value_in_words, percent, template

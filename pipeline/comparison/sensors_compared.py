@@ -12,9 +12,9 @@ from pipeline.config.bundled import bundled_config, named_configs
 from pipeline.config.overrides import Override
 from pipeline.config.presets import is_path
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
-from pipeline.formats.result_records import RUN_FILE, read_run
-from scene.config import load_yaml, parse
-from scene.errors import InputError, nearest
+from pipeline.formats.records.result_records import RUN_FILE, read_run
+from scene.common.config import load_yaml, parse
+from scene.common.errors import InputError, nearest
 
 Given = str | tuple[str, SimulationConfig]
 """What is compared: a name, or a config with the word that it goes by."""

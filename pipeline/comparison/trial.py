@@ -24,15 +24,15 @@ from pipeline.run.acquisition import Look, look, reconstruct
 from pipeline.run.epoch import as_observed
 from pipeline.run.registered import reference_and_target, reference_sensor
 from pipeline.run.site import SensorSite, prepare_site
-from scene.blocks import RockfallConfig, place_blocks
-from scene.carve import carve, carved_records
-from scene.distributions import Gaussian
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import WALL, FloatArray, IntArray
-from scene.raycast import RayCaster
-from sensors.placement import check_in_front
+from scene.blocks.block import RockfallConfig, place_blocks
+from scene.blocks.carve import carve, carved_records
+from scene.blocks.distributions import Gaussian
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, FloatArray, IntArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.placement import check_in_front
 
 Raster = NDArray[np.float32]
 _MARGIN_M = 0.1

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scene.errors import InputError, nearest
-from scene.plug_ins import plugged
+from scene.common.errors import InputError, nearest
+from scene.common.plug_ins import plugged
 
 PLUG_INS = {"scanners": "scarpsim.scanners", "noise": "scarpsim.noise", "sites": "scarpsim.sites"}
 """The groups of entry points by which other packages name configs of a kind, each the path of a YAML file."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from pipeline.change.areas import Area
-from scene.config import Config
+from scene.common.config import Config
 
 
 class CalibrationConfig(Config):

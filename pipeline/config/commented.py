@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from scene.yaml_text import yaml_line
+from scene.common.yaml_text import yaml_line
 
 _WIDTH = 120
 _INDENT = "  "

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from scene.errors import InputError
-from scene.yaml_text import parse_yaml
+from scene.common.errors import InputError
+from scene.common.yaml_text import parse_yaml
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from typing import Any
 
 from pipeline.config.bundled import bundled_config
 from pipeline.config.overrides import Override, apply_overrides, read_override
-from scene.config import load_yaml, parse
-from scene.errors import InputError
-from sensors.presets import ScannerPreset
+from scene.common.config import load_yaml, parse
+from scene.common.errors import InputError
+from sensors.laser.presets import ScannerPreset
 
 
 def is_path(name: str) -> bool:

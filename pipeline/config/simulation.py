@@ -17,28 +17,28 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
 from pipeline.config.overrides import Override, apply_overrides
 from pipeline.config.presets import is_path, model_file, spelled_out, with_preset, without_what_a_preset_sets
-from pipeline.formats.camera_files import oriented_files, read_oriented, stereo_pair
-from pipeline.formats.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
+from pipeline.formats.cameras.camera_files import oriented_files, read_oriented, stereo_pair
+from pipeline.formats.cameras.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
 from pipeline.precision.detectability import PlanningConfig
 from pipeline.registration.register import IcpConfig
 from pipeline.surface.mesh import SurfaceConfig
 from pipeline.surface.reconstruct import FusionConfig, Reconstruction
 from pipeline.surface.stations import StationsConfig
-from scene.blocks import RockfallConfig
-from scene.config import Config, load_yaml, parse
-from scene.errors import InputError
-from scene.illumination import IlluminationConfig
-from scene.procedural import ProceduralWall
-from scene.texture import TextureConfig
-from scene.wall import WallConfig
-from scene.wetness import WetnessConfig
-from sensors.camera import CameraPair
-from sensors.exposure import ExposureConfig
-from sensors.matching import MatchingConfig
-from sensors.model import StereoModel, TlsModel
-from sensors.placement import RigConfig, StationConfig, Target
-from sensors.stereo import Quality
-from sensors.tls import ScannerConfig
+from scene.appearance.illumination import IlluminationConfig
+from scene.appearance.texture import TextureConfig
+from scene.appearance.wetness import WetnessConfig
+from scene.blocks.block import RockfallConfig
+from scene.common.config import Config, load_yaml, parse
+from scene.common.errors import InputError
+from scene.walls.procedural import ProceduralWall
+from scene.walls.wall import WallConfig
+from sensors.cameras.camera import CameraPair
+from sensors.laser.tls import ScannerConfig
+from sensors.models.placement import RigConfig, StationConfig, Target
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.stereo.exposure import ExposureConfig
+from sensors.stereo.matching import MatchingConfig
+from sensors.stereo.stereo_pair import Quality
 
 SensorName = Literal["stereo", "tls"]
 

@@ -18,9 +18,9 @@ from pipeline.dataset.folder import CHECKSUMS, Damage, found_damage, tile_files
 from pipeline.dataset.plan import SPLITS, Split
 from pipeline.dataset.records import SHARDS, Record, read_dataset_file, read_shard, shard_name
 from pipeline.dataset.statistics import SetStatistics
-from pipeline.formats.atomic import write_text, writing
-from pipeline.formats.checksum import sha256
-from scene.errors import InputError
+from pipeline.formats.files.atomic import write_text, writing
+from pipeline.formats.files.checksum import sha256
+from scene.common.errors import InputError
 
 ANNOTATIONS = "annotations.json"
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from pipeline.dataset.plan import SPLITS
 from pipeline.dataset.statistics import SIZE_EDGES_M, SetStatistics
-from pipeline.formats.atomic import write_bytes, write_text
-from pipeline.formats.inside import inside
+from pipeline.formats.files.atomic import write_bytes, write_text
+from pipeline.formats.files.inside import inside
 
 README, CARD = "README.md", "card"
 _LOADING = """## Loading
@@ -192,7 +192,7 @@ def _samples(folder: Path, statistics: SetStatistics) -> Iterator[tuple[str, byt
     """A picture for each sensor: levels of noise down, classes of sizes across."""
     from pipeline.dataset.figures import SampleTile, samples_figure
     from pipeline.dataset.loaders import masks_of
-    from pipeline.formats.geotiff import read_tiff
+    from pipeline.formats.rasters.geotiff import read_tiff
 
     def shown(key: tuple[str, str, str]) -> SampleTile:
         sample = statistics.samples[key]

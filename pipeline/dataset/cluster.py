@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.dataset import standstill
 from pipeline.dataset.worker import Order, fill_run
-from scene.errors import InputError, OutsideError
-from scene.extras import how_to_install
+from scene.common.errors import InputError, OutsideError
+from scene.common.extras import how_to_install
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster

@@ -13,11 +13,11 @@ from pipeline.dataset.assemble import assemble, whole_shards
 from pipeline.dataset.folder import tile_files
 from pipeline.dataset.records import SHARDS, Record, read_dataset_file, shard_name, write_dataset_file, write_shard
 from pipeline.dataset.run import DatasetSummary
-from pipeline.formats.atomic import note, noting, remove_written
-from pipeline.formats.checksum import sha256
-from pipeline.formats.inside import inside
-from pipeline.formats.lock import is_free, locked
-from scene.errors import InputError, nearest
+from pipeline.formats.files.atomic import note, noting, remove_written
+from pipeline.formats.files.checksum import sha256
+from pipeline.formats.files.inside import inside
+from pipeline.formats.files.lock import is_free, locked
+from scene.common.errors import InputError, nearest
 
 KEYS = ("sensor", "noise", "size", "wall", "split")
 

@@ -14,10 +14,10 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.overrides import Override, apply_overrides
 from pipeline.config.presets import is_path, model_file
 from pipeline.config.simulation import SensorModel, SensorName, SimulationConfig, load_config
-from scene.blocks import RockfallConfig
-from scene.config import Config, load_yaml, parse
-from scene.errors import InputError, nearest
-from sensors.model import StereoModel, TlsModel
+from scene.blocks.block import RockfallConfig
+from scene.common.config import Config, load_yaml, parse
+from scene.common.errors import InputError, nearest
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 DATASET_FILE = "dataset.json"
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9.-]*$", max_length=40)]

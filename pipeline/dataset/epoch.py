@@ -27,9 +27,9 @@ from pipeline.dataset.plan import (
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch, observe_epoch, observe_reference
 from pipeline.run.site import SensorSite, prepare_site
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import WALL
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL
 
 _DRAWS = 5
 """Times that an epoch's blocks are drawn before the set-up is at fault."""

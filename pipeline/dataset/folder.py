@@ -23,11 +23,11 @@ from pipeline.config.simulation import CamerasFile
 from pipeline.dataset.config import DATASET_FILE, DatasetConfig
 from pipeline.dataset.plan import SPLITS
 from pipeline.dataset.records import SHARDS, Record, read_shard
-from pipeline.formats.checksum import sha256
-from pipeline.formats.inside import inside
-from pipeline.formats.own_folders import require_own_folder
-from scene.errors import InputError
-from scene.imported import ImportedWall
+from pipeline.formats.files.checksum import sha256
+from pipeline.formats.files.inside import inside
+from pipeline.formats.files.own_folders import require_own_folder
+from scene.common.errors import InputError
+from scene.walls.imported import ImportedWall
 
 STAGING, CHECKSUMS, TRUTH = ".staging", "checksums.sha256", "truth"
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
-from pipeline.formats.coco import read_coco
-from pipeline.formats.geotiff import read_tiff
-from pipeline.formats.inside import inside
-from scene.errors import InputError, nearest
+from pipeline.formats.files.inside import inside
+from pipeline.formats.rasters.geotiff import read_tiff
+from pipeline.formats.records.coco import read_coco
+from scene.common.errors import InputError, nearest
 
 if TYPE_CHECKING:
     import tensorflow as tf

@@ -8,10 +8,10 @@ from typing import Any, Literal
 from pipeline.change.tiles import TileConfig, starts_of_tiles
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
-from scene.blocks import MOST_BLOCKS
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
+from scene.blocks.block import MOST_BLOCKS
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")

@@ -11,10 +11,10 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, StringConstra
 
 from pipeline.dataset.config import DATASET_FILE
 from pipeline.dataset.plan import Split
-from pipeline.formats.atomic import write_json, write_text
-from scene.config import parse
-from scene.errors import InputError
-from scene.regular_file import read_json, read_text
+from pipeline.formats.files.atomic import write_json, write_text
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.regular_file import read_json, read_text
 
 SCHEMA = 1
 SHARDS = "shards"

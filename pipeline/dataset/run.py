@@ -27,10 +27,10 @@ from pipeline.dataset.folder import (
 from pipeline.dataset.plan import planned_epochs
 from pipeline.dataset.records import read_dataset_file, shard_name, write_dataset_file
 from pipeline.dataset.worker import Order, fill, makers, require_same_makers
-from pipeline.formats.lock import is_free, locked
+from pipeline.formats.files.lock import is_free, locked
 from pipeline.report.progress import Progress
-from scene.config import parse
-from scene.errors import InputError, OutsideError
+from scene.common.config import parse
+from scene.common.errors import InputError, OutsideError
 
 _MOST_WORKERS = 16
 """Local processes for each core."""

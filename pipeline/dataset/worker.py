@@ -17,15 +17,15 @@ from pipeline.dataset.epoch import EpochTile, MadeEpoch, Stages, make_epoch
 from pipeline.dataset.folder import STAGING, TRUTH
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs
 from pipeline.dataset.records import SCHEMA, SHARDS, read_dataset_file, shard_name, write_shard
-from pipeline.formats.atomic import explained, give_name, to_disk
-from pipeline.formats.checksum import sha256
-from pipeline.formats.geotiff import write_geotiff
-from pipeline.formats.inside import inside
+from pipeline.formats.files.atomic import explained, give_name, to_disk
+from pipeline.formats.files.checksum import sha256
+from pipeline.formats.files.inside import inside
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
-from scene.backend import VARIANT, dr
-from scene.config import parse
-from scene.errors import InputError
+from scene.common.backend import VARIANT, dr
+from scene.common.config import parse
+from scene.common.errors import InputError
 
 _one_at_a_time = threading.Lock()
 """Dask may give a worker several threads; a stage is set up once and used by one run of epochs at a time."""

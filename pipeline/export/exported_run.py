@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-from pipeline.formats.result_records import RUN_FILE
-from pipeline.formats.run_files import RESUME, RunFiles
+from pipeline.formats.records.result_records import RUN_FILE
+from pipeline.formats.records.run_files import RESUME, RunFiles
 from pipeline.report.figures import SCALE_SIGMAS
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 
 class ExportedRun(RunFiles):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.plan import SPLITS
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 
 def splits_of(folder: Path) -> dict[str, Tiles]:

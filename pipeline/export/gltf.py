@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.export.exported_run import ExportedRun
 from pipeline.export.perspective import colours_of, difference_at
-from pipeline.formats.gltf import GltfPart, write_gltf
-from scene.mesh import WALL, TriangleMesh, renumbered
+from pipeline.formats.meshes.gltf import GltfPart, write_gltf
+from scene.geometry.mesh import WALL, TriangleMesh, renumbered
 
 
 def save_gltf(run: ExportedRun, number: int, path: Path) -> None:

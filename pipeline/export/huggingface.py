@@ -11,10 +11,10 @@ from typing import Any
 from pipeline.change.annotate import BLOCK_CATEGORY
 from pipeline.dataset.loaders import Sample, Tiles
 from pipeline.export.exported_set import splits_of
-from pipeline.formats.atomic import filling, write_text
+from pipeline.formats.files.atomic import filling, write_text
 from pipeline.report.progress import Progress
-from scene.errors import InputError
-from scene.extras import how_to_install
+from scene.common.errors import InputError
+from scene.common.extras import how_to_install
 
 _TILES_A_FILE = 256
 _NAMES = {"train": "train", "val": "validation", "test": "test"}

@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from pipeline.formats.atomic import write_json
-from pipeline.formats.checksum import sha256
-from scene.errors import InputError
+from pipeline.formats.files.atomic import write_json
+from pipeline.formats.files.checksum import sha256
+from scene.common.errors import InputError
 
 PACKAGE_FILE = "datapackage.json"
 _PROFILE = "https://datapackage.org/profiles/2.0/datapackage.json"

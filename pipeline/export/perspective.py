@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.report.figures import COLOURS, NO_DATA
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import FloatArray, TriangleMesh
-from scene.raycast import RayCaster
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
 
 _FROM = np.array([-0.42, -0.12, 1.0])
 """Towards the camera, wall frame: from the left, a little from below."""

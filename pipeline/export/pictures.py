@@ -17,13 +17,13 @@ from PIL import Image
 from pipeline.export.exported_run import ExportedRun
 from pipeline.export.perspective import Image as Pixels
 from pipeline.export.perspective import PerspectiveView, draw_wall
-from pipeline.formats.atomic import write_bytes, writing
+from pipeline.formats.files.atomic import write_bytes, writing
 from pipeline.report.figures import COLOURS, DIFFERENCE_LABEL, SCALE_SIGMAS, SEQUENTIAL
 from pipeline.report.page import litres, millimetres
 from pipeline.report.plain_text import plain_text
 from pipeline.report.progress import Progress
-from scene.errors import InputError
-from scene.mesh import FloatArray, TriangleMesh
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, TriangleMesh
 
 _DPI = 100
 _TITLE_PX, _BAR_PX = 46, 78

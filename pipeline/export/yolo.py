@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from pipeline.dataset.loaders import Sample, Tiles
 from pipeline.export.exported_set import splits_of
-from pipeline.formats.atomic import filling, write_bytes, write_text
+from pipeline.formats.files.atomic import filling, write_bytes, write_text
 from pipeline.report.progress import Progress
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 _ZERO, _STEPS = 128, 127
 _FINER = 4

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 SCAN = "scan"
 """Channel of points: the number of the scan, of several."""

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
 
 from pipeline.config.overrides import apply_overrides
-from scene.config import parse
+from scene.common.config import parse
 
 _DEVELOPMENT, _JUDGEMENT = "development cases", "judgement"
 

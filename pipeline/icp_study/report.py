@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.comparison.report import write_csv
-from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
+from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
 from pipeline.icp_study.study import IcpStudy, Parameter, Recommendation, StudyRow
 from pipeline.report.figures import DPI, FAMILY, dress, plain_numbers, png_bytes
 from pipeline.report.page import millimetres, template

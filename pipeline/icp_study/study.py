@@ -22,18 +22,18 @@ import numpy as np
 from scipy import stats
 
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
-from pipeline.formats.result_files import read_surface
-from pipeline.formats.result_records import RUN_FILE, read_run
-from pipeline.formats.run_files import epoch_folder
+from pipeline.formats.records.result_files import read_surface
+from pipeline.formats.records.result_records import RUN_FILE, read_run
+from pipeline.formats.records.run_files import epoch_folder
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, fit, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.site import prepare_site
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh, area_normals
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, TriangleMesh, area_normals
 
 Parameter = Literal["subsample_ratio", "outlier_distance_threshold"]
 RATIOS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)

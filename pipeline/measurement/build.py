@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.presets import read_preset
-from pipeline.formats.measurement import read_model
+from pipeline.formats.measurements.measurement import read_model
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.folder import Content, Understood, write
 from pipeline.measurement.photogrammetry import looking, read_pair, seen_by
@@ -18,10 +18,10 @@ from pipeline.measurement.request import Request
 from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.station import Station, find_station
 from pipeline.measurement.units import check_extent, check_same_unit
-from scene.errors import InputError
-from scene.mesh import FloatArray
-from scene.rounding import rounded_axes
-from sensors.model import StereoModel, TlsModel
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from scene.meshes.rounding import rounded_axes
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 _ONE_PLACE_M = 0.05
 """Stations that stand nearer to each other than this are one, set up again: its scans are epochs."""

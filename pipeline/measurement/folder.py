@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.atomic import filling, write_bytes, write_json, write_text
-from pipeline.formats.cameras import write_cameras_yaml
-from pipeline.formats.laz import EXACT_INTENSITY, write_laz
-from pipeline.formats.measurement import FILE, read_measurement
-from pipeline.formats.ply import write_ply
+from pipeline.formats.cameras.cameras import write_cameras_yaml
+from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
+from pipeline.formats.measurements.measurement import FILE, read_measurement
+from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import EXACT_INTENSITY, write_laz
 from pipeline.measurement.picture import picture
-from scene.errors import InputError
-from scene.mesh import FloatArray, TriangleMesh
-from scene.yaml_text import yaml_line
-from sensors.camera import CameraPair
-from sensors.model import StereoModel, TlsModel
+from scene.common.errors import InputError
+from scene.common.yaml_text import yaml_line
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from sensors.cameras.camera import CameraPair
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 UNDERSTOOD = "understood.json"
 

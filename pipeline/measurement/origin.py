@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.scan_geometry import ScanGeometry, recover_pattern
-from scene.errors import InputError
-from scene.mesh import FloatArray, IntArray
-from sensors.polar import polar_axes
+from pipeline.formats.measurements.scan_geometry import ScanGeometry, recover_pattern
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, IntArray
+from sensors.signal_chain.polar import polar_axes
 
 _SAMPLE = 60_000
 _TURNS = 6

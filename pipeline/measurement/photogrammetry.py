@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.formats.camera_files import read_oriented, stereo_pair
-from pipeline.formats.cameras import read_cameras_yaml
-from pipeline.formats.measurement_checks import check_seen
-from scene.errors import InputError
-from scene.mesh import FloatArray
-from sensors.camera import Camera, CameraPair
+from pipeline.formats.cameras.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras.cameras import read_cameras_yaml
+from pipeline.formats.measurements.checks import check_seen
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera, CameraPair
 
 
 def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:

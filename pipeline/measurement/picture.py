@@ -7,8 +7,8 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from pipeline.report.figures import FAMILY, SEQUENTIAL, dress, png_bytes
-from scene.mesh import FloatArray, TriangleMesh
-from sensors.polar import polar
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from sensors.signal_chain.polar import polar
 
 _DOTS = 15_000
 

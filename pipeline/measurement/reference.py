@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.points import SUFFIXES
-from pipeline.formats.scan_geometry import ScanGeometry
+from pipeline.formats.measurements.scan_geometry import ScanGeometry
+from pipeline.formats.points.points import SUFFIXES
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.measurement.scans import METRES, RawScan, read_scans
 from pipeline.measurement.station import Station
 from pipeline.measurement.triangulation import SeenSurface, triangulated
-from scene.errors import InputError
-from scene.imported import read_mesh
-from scene.mesh import FloatArray, TriangleMesh
-from scene.ply import read_elements
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.meshes.ply import read_elements
+from scene.walls.imported import read_mesh
 
 HALF = "half"
 DEMS = (".tif", ".tiff")

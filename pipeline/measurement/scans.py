@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement_checks import finite
+from pipeline.formats.measurements.checks import finite
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import TEXT, check_reach, placed, read_points
-from pipeline.formats.ptx import read_ptx
-from pipeline.formats.xyz import read_table, read_xyz
-from scene.errors import InputError
-from scene.mesh import FloatArray
+from pipeline.formats.points.points import TEXT, check_reach, placed, read_points
+from pipeline.formats.points.ptx import read_ptx
+from pipeline.formats.points.xyz import read_table, read_xyz
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _FEWEST = 100
@@ -75,7 +75,7 @@ def _from_text(path: Path, columns: Sequence[str]) -> RawScan:
 
 
 def _from_e57(path: Path) -> Iterator[RawScan]:
-    from pipeline.formats.e57 import read_e57  # the library takes a tenth of a second to load
+    from pipeline.formats.points.e57 import read_e57  # the library takes a tenth of a second to load
 
     for number, scan in enumerate(read_e57(path), start=1):
         name = f"{path.name} ({number}: {scan.name})"

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.formats.scan_geometry import ScanGeometry
+from pipeline.formats.measurements.scan_geometry import ScanGeometry
 from pipeline.measurement.origin import Origin, from_order, near, pattern_from
 from pipeline.measurement.scans import RawScan
-from scene.errors import InputError
-from scene.mesh import FloatArray, IntArray
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, IntArray
 
 _SURE_M = 0.05
 """An origin by scan lines is taken instead of a stated one where it is known to this, and differs by more than its error."""

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.formats.measurement import Material, SurfaceMeasurement, assembled, read_model
-from pipeline.formats.measurement_config import MeasurementConfig
+from pipeline.formats.measurements.config import MeasurementConfig
+from pipeline.formats.measurements.measurement import Material, SurfaceMeasurement, assembled, read_model
+from pipeline.formats.measurements.surface_fit import air_side, check_in_metres
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.surface_fit import air_side, check_in_metres
 from pipeline.gap.residuals.surface_noise import estimated_noise
 from pipeline.gap.residuals.surface_residuals import NO_CAMERAS, spacing_m
 from pipeline.measurement.folder import Content, Understood, write
@@ -18,11 +18,11 @@ from pipeline.measurement.reference import DEMS, HALF, Reference, from_dem, from
 from pipeline.measurement.request import Request
 from pipeline.measurement.scans import METRES, RawScan, read_scans
 from pipeline.measurement.units import check_extent, check_same_unit
-from scene.errors import InputError
-from scene.imported import read_mesh
-from scene.mesh import FloatArray, TriangleMesh
-from scene.winding import facing
-from sensors.model import StereoModel, StereoNoise
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.meshes.winding import facing
+from scene.walls.imported import read_mesh
+from sensors.models.sensor_model import StereoModel, StereoNoise
 
 _LEANING = 0.1
 """Vertical component of a wall's normal below which the side of the air is a guess."""

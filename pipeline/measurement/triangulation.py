@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.errors import InputError
-from scene.mesh import FloatArray, TriangleMesh, signed_volumes
-from scene.rounding import rounded_axes
-from sensors.polar import polar
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, TriangleMesh, signed_volumes
+from scene.meshes.rounding import rounded_axes
+from sensors.signal_chain.polar import polar
 
 _STEP_M, _STEP_SHARE = 0.1, 0.02
 """A smaller step of range is never cut: m, and share of the range."""

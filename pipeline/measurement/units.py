@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.measurement.scans import METRES
-from scene.errors import InputError
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 
 _WIDEST_M, _SPARSEST_M = 20_000.0, 5.0
 """No scanner's window is wider, and none leaves so much between points of a wall."""

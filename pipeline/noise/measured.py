@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from pipeline.change.areas import Area, in_areas
 from pipeline.change.difference import DifferenceConfig, raster_grid
-from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.measurement import FILE, read_measurement
+from pipeline.formats.measurements.measurement import FILE, read_measurement
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, Registration, register_to
-from scene.backend import mi
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from scene.upload import on_device
+from scene.common.backend import mi
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import on_device
 
 BoolArray = NDArray[np.bool_]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.change.difference import DifferenceStatistics, statistics
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 NORMAL_BEYOND_3 = 0.0027
 """Share of a normal distribution that lies more than three sigma from its median."""

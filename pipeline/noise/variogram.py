@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, optimize
 
-from scene.errors import InputError
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 
 Direction = Literal["all", "x", "y"]
 Family = Literal["spherical", "exponential", "gaussian"]

@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.simulation import SensorName, SimulationConfig
-from pipeline.formats.atomic import filling, write_json
-from pipeline.formats.geotiff import write_geotiff
+from pipeline.formats.files.atomic import filling, write_json
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.planning.maps import Plan, plans
 from pipeline.planning.report import write_plan_report
 from pipeline.report.map_styles import quantity_style
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
 from pipeline.run.site import prepare_site
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 PLAN_FILE, REPORT_FILE = "plan.json", "report.html"
 _WALL_S, _MAPS_S = 2.0, 4.0

@@ -21,12 +21,12 @@ from pipeline.precision.detectability import (
 )
 from pipeline.precision.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
 from pipeline.run.site import SensorSite
-from scene.errors import InputError
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from sensors.rectify import rectify
-from sensors.stereo import REDUCTION, StereoPair
-from sensors.tls import LaserScanner
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.rectification import rectify
+from sensors.laser.tls import LaserScanner
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 _MIDDLE_SHARE = 0.1
 """The middle of the wall are the places within this share of its smaller side from the middle of its extent."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.formats.atomic import write_text
+from pipeline.formats.files.atomic import write_text
 from pipeline.planning.maps import Plan, PlanMap
 from pipeline.report.figures import CurvePanel, curves_figure, map_figure
 from pipeline.report.page import percent, template

@@ -11,15 +11,15 @@ from pipeline.precision.detectability import PlanningConfig, detection_probabili
 from pipeline.precision.stereo_geometry import stereo_geometry
 from pipeline.precision.surface import BoolArray, Places
 from pipeline.precision.tls_geometry import tls_geometry
-from scene.blocks import RockfallConfig, place_blocks
-from scene.carve import carve
-from scene.distributions import Gaussian
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, IntArray, TriangleMesh
-from scene.raycast import RayCaster
-from sensors.model import StereoModel, TlsModel
-from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner
+from scene.blocks.block import RockfallConfig, place_blocks
+from scene.blocks.carve import carve
+from scene.blocks.distributions import Gaussian
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.tls import LaserScanner
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.stereo.stereo_pair import StereoPair
 
 _ON_SURFACE_M = 1e-4
 

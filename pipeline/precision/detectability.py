@@ -47,8 +47,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from scene.config import Config
-from scene.mesh import FloatArray
+from scene.common.config import Config
+from scene.geometry.mesh import FloatArray
 
 FINDABLE = 4.0
 """Signal-to-noise ratio from which a block can be told from the noise of the whole wall, as in a data set's card."""

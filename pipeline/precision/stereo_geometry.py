@@ -8,14 +8,14 @@ import numpy as np
 
 from pipeline.precision.detectability import Sampling, lattice
 from pipeline.precision.surface import BoolArray, Places, slide, turned
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.camera import Camera, CameraPair, Side
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera, CameraPair, Side
+from sensors.cameras.rectification import Rectification, rectify
 from sensors.effects.base import Stage, apply_stage
 from sensors.effects.matching_noise import NodeNoise
-from sensors.model import OrientationNoise, Spread, StereoModel
-from sensors.rectify import Rectification, rectify
-from sensors.stereo import REDUCTION, StereoPair
+from sensors.models.sensor_model import OrientationNoise, Spread, StereoModel
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 
 @dataclass(frozen=True)

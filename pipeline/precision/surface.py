@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.backend import dr, mi
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from scene.upload import vectors_on_device
-from sensors.device import vector
-from sensors.stereo import SHADOW_MARGIN
+from scene.common.backend import dr, mi
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import vectors_on_device
+from sensors.numerics.device import vector
+from sensors.stereo.stereo_pair import SHADOW_MARGIN
 
 _PIXELS = 1e5
 """Pixels of a map whose GSD is left open; on a wall of 70 x 45 m they measure 18 cm."""

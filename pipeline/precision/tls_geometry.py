@@ -8,13 +8,13 @@ import numpy as np
 
 from pipeline.precision.detectability import Sampling, lattice
 from pipeline.precision.surface import BoolArray, Places, slide, turned
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_noise import AngleNoise
 from sensors.effects.base import Effect, Stage
 from sensors.effects.beam_divergence import BeamDivergence
-from sensors.polar import polar, polar_axes
-from sensors.pulses import REFERENCE_RANGE_M, PulseGeometry
-from sensors.tls import LaserScanner
+from sensors.laser.tls import LaserScanner
+from sensors.signal_chain.polar import polar, polar_axes
+from sensors.signal_chain.pulses import REFERENCE_RANGE_M, PulseGeometry
 
 _OFTEN = 0.5
 """Probability of an echo beyond which a place counts as reached."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.registration.rigid import RigidTransform
-from scene.errors import InputError
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 
 LEAST_POINTS = 6
 """Of a cloud that is registered: one per unknown."""

@@ -35,11 +35,11 @@ from pipeline.registration.closest_points import (
     scan_order,
 )
 from pipeline.registration.rigid import RigidTransform, rotation_matrix
-from scene.config import Config
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.threads import executor
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.common.threads import executor
+from scene.geometry.mesh import FloatArray
 
 _LEVELS = (2**13, 2**17)
 """Sizes of the random subsets that come before all the points; each is used where the points are at least four times as many."""

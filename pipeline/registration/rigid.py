@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from pipeline.change.difference import DifferenceStatistics, statistics
 from pipeline.report.plain_text import plain_text, powers_of_ten
-from scene.grid import Grid
-from scene.mesh import WALL, IntArray
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, IntArray
 
 SCALE_SIGMAS = 6.0
 """A difference map's colours end at this many sigma on either side of zero."""

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
-from pipeline.formats.qgis_style import Stop, write_style
+from pipeline.formats.rasters.qgis_style import Stop, write_style
 from pipeline.report.figures import COLOURS, SEQUENTIAL
 
 _STEPS = 12

@@ -10,16 +10,16 @@ from pipeline.surface.depth_maps import DepthMap
 from pipeline.surface.mesh import mesh_observation
 from pipeline.surface.reconstruct import colmap_surface
 from pipeline.surface.stations import Joined, join
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from sensors.exchanged import depth_cameras, observe_right, pair_of
-from sensors.observation import Observation
-from sensors.stereo import StereoPair
-from sensors.stereo_matched import MatchedStereoPair
-from sensors.stereo_vertices import observe_vertices
-from sensors.tls import LaserScanner
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.tls import LaserScanner
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.exchanged import depth_cameras, observe_right, pair_of
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import StereoPair
+from sensors.stereo.stereo_vertices import observe_vertices
 
 DepthMaps = tuple[DepthMap, DepthMap]
 """Of the left and of the right camera."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.registration.register import Registration
-from scene.grid import Grid
-from scene.mesh import FloatArray
-from sensors.observation import Observation
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+from sensors.signal_chain.observation import Observation
 
 _CELL_M = 0.5
 """Side of the cells that displacements are averaged over, where samples are dense enough."""

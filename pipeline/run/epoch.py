@@ -19,12 +19,12 @@ from pipeline.run.acquisition import Look, look, reconstruct
 from pipeline.run.displacement import displacement
 from pipeline.run.registered import reference_and_target, reference_sensor
 from pipeline.run.site import SensorSite
-from scene.blocks import Blocks, place_blocks
-from scene.carve import Carved, carve, carved_records
-from scene.keyed_random import KeyedRandom
-from scene.mesh import WALL, FloatArray, TriangleMesh
-from scene.raycast import RayCaster
-from sensors.placement import check_in_front
+from scene.blocks.block import Blocks, place_blocks
+from scene.blocks.carve import Carved, carve, carved_records
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import WALL, FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.placement import check_in_front
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ import numpy as np
 
 from pipeline.report.page import true_minus
 from pipeline.run.site import SensorSite
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
-from sensors.exchanged import StereoSensor, pair_of
-from sensors.model import OrientationNoise, Spread
-from sensors.stereo import REDUCTION
-from sensors.stereo_matched import MatchedStereoPair
-from sensors.tls import LaserScanner
+from sensors.laser.tls import LaserScanner
+from sensors.models.sensor_model import OrientationNoise, Spread
+from sensors.stereo.exchanged import StereoSensor, pair_of
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import REDUCTION
 
 _ARCSEC = np.degrees(1.0) * 3600
 """Seconds of arc in a radian."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.formats.atomic import write_text
+from pipeline.formats.files.atomic import write_text
 from pipeline.report.figures import SCALE_SIGMAS
 from pipeline.report.page import litres, millimetres, template
 

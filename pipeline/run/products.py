@@ -21,20 +21,20 @@ from pipeline.change.difference import statistics
 from pipeline.change.m3c2 import M3c2Map
 from pipeline.change.tiles import tiles
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.atomic import explained, give_name, note, noting, to_disk, write_bytes, write_json
-from pipeline.formats.checksum import sha256
-from pipeline.formats.copc import SUFFIX as COPC
-from pipeline.formats.copc import write_copc
-from pipeline.formats.crs import wkt_of
-from pipeline.formats.e57 import E57Scan, write_e57
-from pipeline.formats.geotiff import write_geotiff, write_tiff
-from pipeline.formats.inside import inside
-from pipeline.formats.laz import LazHeader, PulseChannels, write_laz
-from pipeline.formats.pcd import write_pcd
-from pipeline.formats.ply import write_ply, write_ply_points
+from pipeline.formats.cameras.crs import wkt_of
+from pipeline.formats.files.atomic import explained, give_name, note, noting, to_disk, write_bytes, write_json
+from pipeline.formats.files.checksum import sha256
+from pipeline.formats.files.inside import inside
+from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.run_files import epoch_folder
-from pipeline.formats.xyz import write_xyz
+from pipeline.formats.points.copc import SUFFIX as COPC
+from pipeline.formats.points.copc import write_copc
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.laz import LazHeader, PulseChannels, write_laz
+from pipeline.formats.points.pcd import write_pcd
+from pipeline.formats.points.xyz import write_xyz
+from pipeline.formats.rasters.geotiff import write_geotiff, write_tiff
+from pipeline.formats.records.run_files import epoch_folder
 from pipeline.report.figures import (
     SCALE_SIGMAS,
     blocks_figure,
@@ -50,10 +50,10 @@ from pipeline.run.epoch import LaterEpoch, ReferenceEpoch
 from pipeline.run.recorded_points import recorded_points, scans_of
 from pipeline.run.site import SensorSite
 from pipeline.surface.metashape_export import write_metashape_export
-from scene.blocks import Blocks
-from scene.carve import block_meshes
-from scene.imported import ImportedWall
-from scene.mesh import WALL, FloatArray, TriangleMesh
+from scene.blocks.block import Blocks
+from scene.blocks.carve import block_meshes
+from scene.geometry.mesh import WALL, FloatArray, TriangleMesh
+from scene.walls.imported import ImportedWall
 
 EPOCH_RECORD = "epoch.json"
 Checksums = dict[str, str]

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.e57 import E57Scan
 from pipeline.formats.point_cloud import PointCloud
-from scene.frame import WallFrame
-from sensors.observation import Observation
+from pipeline.formats.points.e57 import E57Scan
+from scene.geometry.frame import WallFrame
+from sensors.signal_chain.observation import Observation
 
 
 def recorded_points(observations: Sequence[Observation]) -> PointCloud:

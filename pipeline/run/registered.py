@@ -8,12 +8,12 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import register_to
 from pipeline.run.site import SensorSite
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from sensors.exchanged import StereoSensor
-from sensors.stereo import StereoPair
-from sensors.stereo_matched import MatchedStereoPair
-from sensors.tls import LaserScanner
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from sensors.laser.tls import LaserScanner
+from sensors.stereo.exchanged import StereoSensor
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import StereoPair
 
 
 def reference_sensor(config: SimulationConfig, site: SensorSite) -> SensorSite:

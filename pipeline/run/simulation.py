@@ -15,13 +15,13 @@ from typing import Any
 
 from pipeline.change.annotate import merge
 from pipeline.config.simulation import CamerasFile, SensorName, SimulationConfig
-from pipeline.formats.atomic import noting, remove_written, write_json
-from pipeline.formats.checksum import sha256
-from pipeline.formats.crs import wkt_of
-from pipeline.formats.lock import is_free, locked
-from pipeline.formats.own_folders import require_own_folder
-from pipeline.formats.result_records import RUN_FILE, read_run
-from pipeline.formats.run_files import epoch_folder
+from pipeline.formats.cameras.crs import wkt_of
+from pipeline.formats.files.atomic import noting, remove_written, write_json
+from pipeline.formats.files.checksum import sha256
+from pipeline.formats.files.lock import is_free, locked
+from pipeline.formats.files.own_folders import require_own_folder
+from pipeline.formats.records.result_records import RUN_FILE, read_run
+from pipeline.formats.records.run_files import epoch_folder
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
 from pipeline.run.epoch import STAGES, observe_epoch, observe_reference
@@ -35,10 +35,10 @@ from pipeline.run.products import (
 )
 from pipeline.run.report import write_run_report
 from pipeline.run.site import SensorSite, prepare_site
-from scene.backend import VARIANT
-from scene.errors import InputError
-from scene.imported import ImportedWall
-from scene.keyed_random import KeyedRandom
+from scene.common.backend import VARIANT
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.walls.imported import ImportedWall
 
 SCHEMA = 1
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipeline.config.simulation import SensorName, SimulationConfig
-from scene.frame import WallFrame
-from scene.imported import ImportedWall
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.wall import Wall, build_wall
-from scene.winding import check_near, facing
-from sensors.camera import CameraPair
-from sensors.exchanged import StereoSensor
-from sensors.placement import Target
-from sensors.stereo import StereoPair
-from sensors.stereo_matched import MatchedStereoPair
-from sensors.tls import LaserScanner
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.meshes.winding import check_near, facing
+from scene.walls.imported import ImportedWall
+from scene.walls.wall import Wall, build_wall
+from sensors.cameras.camera import CameraPair
+from sensors.laser.tls import LaserScanner
+from sensors.models.placement import Target
+from sensors.stereo.exchanged import StereoSensor
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import StereoPair
 
 Origin = Literal["rule", "file", "given"]
 """Where a wall comes from: made here, read and cleaned here, or handed in as it is."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.mesh import FloatArray
-from sensors.camera import Camera
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera
 
 _SNAP_PX = 1e-6
 """A pixel this near to a sample's centre takes the sample as it is: a map without distortion keeps its values and holes."""

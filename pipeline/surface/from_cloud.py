@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.formats.measurement_checks import finite
+from pipeline.formats.measurements.checks import finite
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.surface.mesh import SurfaceConfig, mesh_cloud
-from scene.errors import InputError
-from scene.mesh import FloatArray, TriangleMesh
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, TriangleMesh
 
 _FARTHEST = 50.0
 """Extents of the cloud beyond which the place to look from is likely in another coordinate system."""

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from scene.config import Config
-from scene.errors import InputError
-from scene.extras import how_to_install
-from scene.mesh import FloatArray, IntArray, TriangleMesh, area_normals
-from sensors.observation import Observation
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.common.extras import how_to_install
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, area_normals
+from sensors.signal_chain.observation import Observation
 
 BoolArray = NDArray[np.bool_]
 

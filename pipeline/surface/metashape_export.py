@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.atomic import write_bytes, write_text
-from pipeline.formats.geotiff import write_tiff
-from pipeline.formats.metashape import write_metashape
+from pipeline.formats.cameras.metashape import write_metashape
+from pipeline.formats.files.atomic import write_bytes, write_text
+from pipeline.formats.rasters.geotiff import write_tiff
 from pipeline.surface.depth_maps import DepthMap
 
 SIDES = ("left", "right")

@@ -1,5 +1,5 @@
 """From an observation to a surface: `direct`, the sensor's own grid; `vertices`, the wall's own, each measured by the pair
-(sensors/stereo_vertices.py); or `colmap`, an outside reconstruction of the depth maps.
+(sensors/stereo/stereo_vertices.py); or `colmap`, an outside reconstruction of the depth maps.
 
 `colmap` is the analogue of handing depth maps to Metashape. Both depth maps, freed of the lens distortion, go into a COLMAP
 workspace; its stereo fusion joins what agrees in both (Schoenberger et al. 2016, "Pixelwise View Selection for Unstructured
@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.formats.colmap import write_colmap, write_map
-from pipeline.formats.ply import read_ply, read_ply_points
+from pipeline.formats.cameras.colmap import write_colmap, write_map
+from pipeline.formats.meshes.ply import read_ply, read_ply_points
 from pipeline.surface.depth_maps import DepthMap, normals, pinhole
 from pipeline.surface.mesh import SurfaceConfig, labelled_surface, octree_depth
-from scene.config import Config
-from scene.errors import InputError
-from scene.extras import how_to_install
-from scene.mesh import FloatArray, IntArray, TriangleMesh
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.common.extras import how_to_install
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh
 
 Reconstruction = Literal["direct", "vertices", "colmap"]
 NAMES = ("left.png", "right.png")

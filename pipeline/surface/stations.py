@@ -21,13 +21,13 @@ from pipeline.precision.tls_geometry import tls_geometry
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, Registration, register_to
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
-from scene.config import Config
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import DEFAULT_ALBEDO
-from sensors.observation import Observation
-from sensors.tls import LaserScanner
+from scene.common.config import Config
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import DEFAULT_ALBEDO
+from sensors.laser.tls import LaserScanner
+from sensors.signal_chain.observation import Observation
 
 _CELL_PX = 16
 """Side of the cells in which precision is compared, in pixels of the difference map: it changes slowly over the wall."""

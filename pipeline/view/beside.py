@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.view.results import Layer, Patch, Results, ViewWindow
-from scene.errors import InputError
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 
 OWN, OTHER = "own ", "other "
 """What a choice begins with: a step of the same folder, or of the other one."""

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.laz import read_laz
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import check_reach
-from pipeline.formats.result_records import GAP_FILE, read_gap
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.points.points import check_reach
+from pipeline.formats.records.result_records import GAP_FILE, read_gap
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, inside
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
 
 _MM = 1e3
 _POINTS_PER_CELL = 4

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.grid import Grid
-from scene.mesh import FloatArray
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
 
 _SURROUNDINGS, _LEAST_M, _ASPECT = 4.0, 1.0, 2.5
 """An item is shown with this many times its size, and the smallest as if it were so large; width over height of the view."""

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.difference import SurfaceRaster, surface_raster
-from pipeline.detection.events import Event, read_events
-from pipeline.formats.geotiff import read_geotiff
+from pipeline.detection.products.events import Event, read_events
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.result_files import read_own_points, read_surface
-from pipeline.formats.result_records import RUN_FILE, read_run
-from pipeline.formats.run_files import epoch_folder
+from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.formats.records.result_files import read_own_points, read_surface
+from pipeline.formats.records.result_records import RUN_FILE, read_run
+from pipeline.formats.records.run_files import epoch_folder
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, centres, cut, inside
-from scene.errors import InputError
-from scene.grid import Grid
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 _MM = 1e3
 _ROCK, _HEIGHT = Layer("rock", "rock (shaded)", ""), Layer("height", "relief", "m")

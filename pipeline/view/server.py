@@ -23,7 +23,7 @@ from pipeline.view.page import layout, register_callbacks
 from pipeline.view.results import Results
 from pipeline.view.run_results import RunResults
 from pipeline.view.tile_results import TileResults
-from scene.errors import InputError, one_line
+from scene.common.errors import InputError, one_line
 
 HOST = "127.0.0.1"
 _NO_TOKEN = "Take the whole address that scarpsim view said, with its token."

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.detection.data import CocoFolder
-from pipeline.formats.geotiff import read_geotiff
+from pipeline.detection.network.data import CocoFolder
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
 from pipeline.view.results import Item, Layer, Patch, PointLayer, ViewWindow, centres, cut
 

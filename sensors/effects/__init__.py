@@ -15,7 +15,7 @@ from typing import Annotated, Any, Union
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator
 
-from scene.errors import nearest
+from scene.common.errors import nearest
 from sensors.effects.base import Effect, Sensor
 
 Effects = tuple[type[Effect], ...]

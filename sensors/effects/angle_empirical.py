@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from scene.keyed_random import KeyedRandom
-from sensors.curve import Axis, Table, surface
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.pulses import Pulses
+from sensors.numerics.curve import Axis, Table, surface
+from sensors.signal_chain.pulses import Pulses
 
 Angle = Literal["azimuth", "zenith"]
 

@@ -6,12 +6,12 @@ from typing import Literal
 
 import numpy as np
 
-from scene.backend import mi
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.device import opaque
+from scene.common.backend import mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
-from sensors.pulses import PulseGeometry, Pulses
+from sensors.numerics.device import opaque
+from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class AngleNoise(Effect):

@@ -12,9 +12,9 @@ from typing import Any, ClassVar, Literal, TypeVar, cast
 import numpy as np
 from pydantic import Field
 
-from scene.config import Config
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.config import Config
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 StateT = TypeVar("StateT")
 Sensor = Literal["tls", "stereo"]
@@ -30,7 +30,7 @@ class Stage(IntEnum):
     RETURN = 5  # TLS: returns kept, lost, first or last
     CAMERA = 11  # stereo: the real pair against the nominal one
     EXPOSE = 12  # stereo: image rows
-    MATCH = 13  # stereo: disparity, in the order that sensors/matches.py gives
+    MATCH = 13  # stereo: disparity, in the order that sensors/signal_chain/matches.py gives
     FILL = 14  # stereo: cells without a match
     POINT = 15  # stereo: the recorded points, m
 

@@ -6,9 +6,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from scene.keyed_random import KeyedRandom
-from sensors.beam import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
+from sensors.signal_chain.beam import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
 
 
 class BeamDivergence(Effect):

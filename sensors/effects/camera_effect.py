@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sensors.camera import Side
+from sensors.cameras.camera import Side
 from sensors.effects.base import Effect, ShowsIn, Stage
 
 

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair
+from scene.common.keyed_random import KeyedRandom
+from sensors.cameras.camera import CameraPair
 from sensors.effects.base import parameter
 from sensors.effects.camera_effect import CameraEffect
 

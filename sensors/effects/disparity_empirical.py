@@ -7,11 +7,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.curve import Axis, Table, surface
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.matches import Matches
+from sensors.numerics.curve import Axis, Table, surface
+from sensors.signal_chain.matches import Matches
 
 Covariate = Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"]
 

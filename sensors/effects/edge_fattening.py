@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import parameter
 from sensors.effects.raster_effect import RasterEffect
-from sensors.matches import bridged
+from sensors.signal_chain.matches import bridged
 
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
 

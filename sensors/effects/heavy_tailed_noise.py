@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import parameter
 from sensors.effects.matching_noise import NodeNoise
-from sensors.matches import Matches
-from sensors.node_grid import even_correlation, smooth_field
+from sensors.signal_chain.matches import Matches
+from sensors.signal_chain.node_grid import even_correlation, smooth_field
 
 
 class HeavyTailedNoise(NodeNoise):

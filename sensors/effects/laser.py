@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from scene.backend import mi
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.backend import mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.functions import DEVICE, HOST, Functions, OnDevice
-from sensors.pulses import PulseGeometry, Pulses
+from sensors.numerics.functions import DEVICE, HOST, Functions, OnDevice
+from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class AimEffect(Effect):

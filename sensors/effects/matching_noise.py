@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Stage, parameter
 from sensors.effects.raster_effect import RasterEffect
-from sensors.matches import bridged
+from sensors.signal_chain.matches import bridged
 
 
 class OcclusionFill(RasterEffect):

@@ -9,12 +9,12 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.device import opaque
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
-from sensors.functions import DEVICE, HOST, Functions
-from sensors.matches import Matches
+from sensors.numerics.device import opaque
+from sensors.numerics.functions import DEVICE, HOST, Functions
+from sensors.signal_chain.matches import Matches
 
 
 class PixelLocking(Effect):

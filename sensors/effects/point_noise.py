@@ -6,11 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
-from sensors.node_grid import MEAN_VARIANCE
-from sensors.surface_places import RecordedPoints
+from sensors.signal_chain.node_grid import MEAN_VARIANCE
+from sensors.signal_chain.surface_places import RecordedPoints
 
 
 class PointNoise(Effect):

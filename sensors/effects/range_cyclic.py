@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Search, parameter
 from sensors.effects.laser import RangeEffect
-from sensors.functions import Functions
-from sensors.pulses import PulseGeometry
+from sensors.numerics.functions import Functions
+from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeCyclic(RangeEffect):

@@ -6,12 +6,12 @@ from typing import Literal
 
 from pydantic import Field
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from sensors.curve import Axis, Table, surface
-from sensors.device import bounded
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.pulses import Pulses
+from sensors.numerics.curve import Axis, Table, surface
+from sensors.numerics.device import bounded
+from sensors.signal_chain.pulses import Pulses
 
 Covariate = Literal["range", "azimuth", "zenith", "incidence", "intensity", "time"]
 

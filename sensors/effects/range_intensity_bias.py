@@ -6,12 +6,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import parameter
 from sensors.effects.laser import RangeEffect
-from sensors.functions import Functions
-from sensors.pulses import PulseGeometry, Pulses
+from sensors.numerics.functions import Functions
+from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class RangeIntensityBias(RangeEffect):

@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from sensors.effects.base import parameter
 from sensors.effects.laser import RangeSpread
-from sensors.functions import Functions
-from sensors.pulses import PulseGeometry, slant
+from sensors.numerics.functions import Functions
+from sensors.signal_chain.pulses import PulseGeometry, slant
 
 
 class RangeNoiseIncidence(RangeSpread):

@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
-from sensors.pulses import PulseGeometry, Pulses
+from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class RangeQuantization(Effect):

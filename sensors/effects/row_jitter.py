@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.camera import Side
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Side
 from sensors.effects.base import Effect, Search, ShowsIn, Stage, parameter
-from sensors.functions import DEVICE, HOST, Functions, OnDevice
-from sensors.matches import ImageRows
+from sensors.numerics.functions import DEVICE, HOST, Functions, OnDevice
+from sensors.signal_chain.matches import ImageRows
 
 
 class RowJitter(Effect):

@@ -6,11 +6,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.curve import Axis, Table, surface_on_host
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.surface_places import Covariate, RecordedPoints, SurfacePlaces
+from sensors.numerics.curve import Axis, Table, surface_on_host
+from sensors.signal_chain.surface_places import Covariate, RecordedPoints, SurfacePlaces
 
 
 class SurfaceEmpirical(Effect):

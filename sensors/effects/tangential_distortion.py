@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from scene.keyed_random import KeyedRandom
-from sensors.camera import CameraPair
+from scene.common.keyed_random import KeyedRandom
+from sensors.cameras.camera import CameraPair
 from sensors.effects.base import parameter
 from sensors.effects.camera_effect import CameraEffect
 

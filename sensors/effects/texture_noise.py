@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
-from scene.backend import mi
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.backend import mi
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage, parameter
-from sensors.matches import Matches
+from sensors.signal_chain.matches import Matches
 
 WINDOW = 5
 """Side of the window whose gradients add up, cells."""

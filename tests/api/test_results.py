@@ -20,8 +20,8 @@ import xarray
 from pipeline import Mesh, Points, Run, SimulationConfig, configure, detect, open_run, plan, simulate
 from pipeline.api import detecting, planning
 from pipeline.api.maps import raster_of
-from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.laz import read_laz
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.report.progress import Progress
 from scene import InputError
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from scene.backend import dr, mi
+from scene.common.backend import dr, mi
 
 dr.eval(dr.arange(mi.Float, 4) * 2)
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detection.boxes import anchors, clip, decode, doublings, encode, intersection_over_union, suppressed, widened
-from pipeline.detection.roi_align import roi_align
+from pipeline.detection.network.boxes import (
+    anchors,
+    clip,
+    decode,
+    doublings,
+    encode,
+    intersection_over_union,
+    suppressed,
+    widened,
+)
+from pipeline.detection.network.roi_align import roi_align
 
 STRIDES = (4, 8, 16, 32, 64)
 

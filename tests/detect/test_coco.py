@@ -20,11 +20,11 @@ from test_fuzz import ODD, QUICK, answered, places
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
 from pipeline.dataset.loaders import Tiles
-from pipeline.detection.data import CocoFolder
-from pipeline.detection.score_files import assess
-from pipeline.formats.coco import read_coco, read_detections
-from pipeline.formats.coco_masks import run_lengths
-from pipeline.formats.geotiff import write_tiff
+from pipeline.detection.network.data import CocoFolder
+from pipeline.detection.products.score_files import assess
+from pipeline.formats.rasters.geotiff import write_tiff
+from pipeline.formats.records.coco import read_coco, read_detections
+from pipeline.formats.records.coco_masks import run_lengths
 
 H, W = 48, 64
 SQUARES = [(1, 4, 6, 10, 12), (1, 30, 20, 15, 9), (2, 10, 8, 20, 20)]

@@ -13,11 +13,11 @@ from test_model import SIDE, SMALL, make_set
 
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
-from pipeline.detection.config import TrainConfig, TrainingConfig
-from pipeline.detection.data import CocoFolder, batches
-from pipeline.formats import geotiff
-from pipeline.formats.geotiff import read_geotiff, read_tiff
-from scene.errors import InputError
+from pipeline.detection.network.config import TrainConfig, TrainingConfig
+from pipeline.detection.network.data import CocoFolder, batches
+from pipeline.formats.rasters import geotiff
+from pipeline.formats.rasters.geotiff import read_geotiff, read_tiff
+from scene.common.errors import InputError
 
 
 def _claiming(path: Path, height: int, width: int) -> Path:
@@ -85,7 +85,7 @@ def test_a_tile_that_is_cut_short_stops_a_training_before_it_begins(split, tmp_p
 @pytest.mark.slow
 def test_a_training_that_fails_in_its_first_epoch_leaves_nothing(tmp_path, eager):
     """Called as a function, which does not read every tile beforehand."""
-    from pipeline.detection.training import train
+    from pipeline.detection.training.training import train
 
     for name in ("train", "val"):
         make_set(tmp_path / "set" / name, 1, 5)

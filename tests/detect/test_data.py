@@ -16,18 +16,19 @@ from pycocotools.coco import COCO
 from test_model import make_set
 
 from pipeline.cli.main import main
-from pipeline.detection import baseline, events, inference
-from pipeline.detection.config import DetectorConfig, NormalisationConfig, TrainingConfig
-from pipeline.detection.data import CocoFolder, batches, mirrored, network_input
-from pipeline.detection.detections import Detection, cropped, without_doubles
-from pipeline.detection.inference import paste, tile_places
-from pipeline.detection.keras_backend import keras_ready, stderr_dropped
-from pipeline.detection.normalisation import denormalised, nmad, normalised
-from pipeline.detection.run import detect, find_inputs
-from pipeline.detection.schedule import has_settled, learning_rate
-from pipeline.formats.geotiff import write_geotiff
-from scene.errors import InputError
-from scene.grid import Grid
+from pipeline.detection.evaluation.detections import Detection, cropped, without_doubles
+from pipeline.detection.inference import baseline, inference
+from pipeline.detection.inference.inference import paste, tile_places
+from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainingConfig
+from pipeline.detection.network.data import CocoFolder, batches, mirrored, network_input
+from pipeline.detection.network.keras_backend import keras_ready, stderr_dropped
+from pipeline.detection.network.normalisation import denormalised, nmad, normalised
+from pipeline.detection.products import events
+from pipeline.detection.products.run import detect, find_inputs
+from pipeline.detection.training.schedule import has_settled, learning_rate
+from pipeline.formats.rasters.geotiff import write_geotiff
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 
 def _map() -> np.ndarray:
@@ -228,9 +229,9 @@ def test_the_detector_does_without_the_ray_tracer_and_that_refuses_to_come_secon
     script = f"""
 import sys, {modules}
 assert "drjit" not in sys.modules and "tensorflow" in sys.modules
-from scene.errors import InputError
+from scene.common.errors import InputError
 try:
-    import scene.backend
+    import scene.common.backend
 except InputError as error:
     print(error)
 """

@@ -9,9 +9,9 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from pipeline.change.annotate import run_length_encoding
-from pipeline.detection.evaluate import coco_metrics, evaluate, matches
-from pipeline.detection.score_files import as_text, assess, write
-from scene.errors import InputError
+from pipeline.detection.evaluation.evaluate import coco_metrics, evaluate, matches
+from pipeline.detection.products.score_files import as_text, assess, write
+from scene.common.errors import InputError
 
 
 def _item(number: int, image: int, x: int, y: int, width: int, height: int, score: float | None = None) -> dict:

@@ -6,10 +6,10 @@ import keras
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detection.boxes import anchors, encode, share_inside
-from pipeline.detection.config import HeadConfig, ProposalConfig
-from pipeline.detection.losses import binary_cross_entropy, cross_entropy, smooth_l1
-from pipeline.detection.targets import anchor_targets, box_targets, mask_targets
+from pipeline.detection.network.boxes import anchors, encode, share_inside
+from pipeline.detection.network.config import HeadConfig, ProposalConfig
+from pipeline.detection.network.losses import binary_cross_entropy, cross_entropy, smooth_l1
+from pipeline.detection.network.targets import anchor_targets, box_targets, mask_targets
 
 STRIDES = (4, 8, 16, 32, 64)
 

@@ -9,11 +9,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.cli.main import main
-from pipeline.detection import operating_point, run, weights
-from pipeline.detection.config import DetectorConfig, HeadConfig, ProposalConfig
-from pipeline.detection.mirrored import VIEWS, Mirrored, network
-from pipeline.detection.model import MaskRCNN
-from scene.errors import InputError
+from pipeline.detection.inference import operating_point, weights
+from pipeline.detection.inference.mirrored import VIEWS, Mirrored, network
+from pipeline.detection.network.config import DetectorConfig, HeadConfig, ProposalConfig
+from pipeline.detection.network.model import MaskRCNN
+from pipeline.detection.products import run
+from scene.common.errors import InputError
 
 SIDE = 64
 SMALL = DetectorConfig(

@@ -11,19 +11,26 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.change.annotate import run_length_encoding
-from pipeline.detection import weights
-from pipeline.detection.backbone import feature_pyramid
-from pipeline.detection.config import DetectorConfig, HeadConfig, ProposalConfig, TrainConfig, TrainingConfig, load_train_config
-from pipeline.detection.data import CocoFolder, network_input, window
-from pipeline.detection.evaluate import evaluate
-from pipeline.detection.inference import detect
-from pipeline.detection.model import LOSSES, MaskRCNN
-from pipeline.detection.operating_point import CONFIDENCE, best_shifts, set_operating_point
-from pipeline.detection.run import detect as run_detect
-from pipeline.detection.training import train
-from pipeline.formats.geotiff import write_geotiff
-from scene.errors import InputError
-from scene.grid import Grid
+from pipeline.detection.evaluation.evaluate import evaluate
+from pipeline.detection.inference import weights
+from pipeline.detection.inference.inference import detect
+from pipeline.detection.inference.operating_point import CONFIDENCE, best_shifts, set_operating_point
+from pipeline.detection.network.backbone import feature_pyramid
+from pipeline.detection.network.config import (
+    DetectorConfig,
+    HeadConfig,
+    ProposalConfig,
+    TrainConfig,
+    TrainingConfig,
+    load_train_config,
+)
+from pipeline.detection.network.data import CocoFolder, network_input, window
+from pipeline.detection.network.model import LOSSES, MaskRCNN
+from pipeline.detection.products.run import detect as run_detect
+from pipeline.detection.training.training import train
+from pipeline.formats.rasters.geotiff import write_geotiff
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 SIDE = 128
 SMALL = DetectorConfig(
@@ -296,7 +303,7 @@ def test_boxes_stay_as_found_where_masks_have_a_margin(eager):
 @pytest.mark.parametrize(("name", "millions"), [("resnet50", 23.5), ("resnet101", 42.5)])
 def test_the_backbones_are_the_papers(name, millions):
     """Parameters of the convolutions of He et al. without the classifier; the first takes one channel in place of three."""
-    from pipeline.detection.backbone import feature_pyramid
+    from pipeline.detection.network.backbone import feature_pyramid
 
     model = feature_pyramid(name, 64, 1, 256)
     backbone = sum(

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.detection.events import Event, read_events, write_events
-from pipeline.detection.places import placed
-from pipeline.formats.atomic import write_json
-from pipeline.formats.ply import write_ply
-from scene.frame import WallFrame
-from scene.mesh import TriangleMesh
+from pipeline.detection.products.events import Event, read_events, write_events
+from pipeline.detection.products.places import placed
+from pipeline.formats.files.atomic import write_json
+from pipeline.formats.meshes.ply import write_ply
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import TriangleMesh
 
 ORIGIN = np.array([345200.0, 6389450.0, 120.0])
 EVENT = Event("difference_001.tif", 1, 3.0, 2.0, 0.4, 0.2, 0.08, 0.3, 0.2, 0.016, 0.97)

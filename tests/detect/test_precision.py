@@ -10,11 +10,11 @@ import pytest
 import tensorflow as tf
 from test_model import SMALL, make_set
 
-from pipeline.detection import weights
-from pipeline.detection.config import TrainConfig, TrainingConfig
-from pipeline.detection.keras_backend import computing_in
-from pipeline.detection.training import train
-from scene.errors import InputError
+from pipeline.detection.inference import weights
+from pipeline.detection.network.config import TrainConfig, TrainingConfig
+from pipeline.detection.network.keras_backend import computing_in
+from pipeline.detection.training.training import train
+from scene.common.errors import InputError
 
 _FLAGS = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
 bfloat16_processor = pytest.mark.skipif("avx512_bf16" not in _FLAGS, reason="this processor has no bfloat16")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipeline.change.annotate import run_length_encoding
-from pipeline.detection.figures import write_reliability
-from pipeline.detection.reliability import EDGES, reliability
+from pipeline.detection.evaluation.reliability import EDGES, reliability
+from pipeline.detection.products.figures import write_reliability
 
 _COUNT = 4000
 

@@ -13,11 +13,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_model import make_set
 
-from pipeline.detection.config import DetectorConfig, NormalisationConfig, TrainConfig, TrainingConfig
-from pipeline.detection.data import CocoFolder, mirrored, network_input, window
-from pipeline.detection.resident import cut, resident, turned
-from pipeline.detection.training import train
-from scene.errors import InputError
+from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainConfig, TrainingConfig
+from pipeline.detection.network.data import CocoFolder, mirrored, network_input, window
+from pipeline.detection.training.resident import cut, resident, turned
+from pipeline.detection.training.training import train
+from scene.common.errors import InputError
 
 FIXED = DetectorConfig(image_px=128, most_blocks=8, normalisation=NormalisationConfig(method="fixed"))
 
@@ -77,17 +77,17 @@ def test_another_backend_is_refused(tmp_path):
 _LEARNED = """
 from pathlib import Path
 
-from pipeline.detection.keras_backend import keras_ready
+from pipeline.detection.network.keras_backend import keras_ready
 
 keras_ready()
 import keras
 import numpy as np
 from keras import ops
 
-from pipeline.detection.config import DetectorConfig, NormalisationConfig, TrainingConfig
-from pipeline.detection.data import CocoFolder
-from pipeline.detection.model import LOSSES
-from pipeline.detection.resident import ResidentLearner, resident
+from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainingConfig
+from pipeline.detection.network.data import CocoFolder
+from pipeline.detection.network.model import LOSSES
+from pipeline.detection.training.resident import ResidentLearner, resident
 
 
 class Darkest(keras.Model):

@@ -13,12 +13,13 @@ from pycocotools import mask as coco_mask
 from scipy import ndimage
 
 from pipeline.cli.main import main
-from pipeline.detection import inference, run
-from pipeline.detection.config import DetectorConfig, NormalisationConfig
-from pipeline.detection.detections import Detection
-from pipeline.detection.inference import tile_places
-from pipeline.formats.geotiff import write_geotiff
-from scene.grid import Grid
+from pipeline.detection.evaluation.detections import Detection
+from pipeline.detection.inference import inference
+from pipeline.detection.inference.inference import tile_places
+from pipeline.detection.network.config import DetectorConfig, NormalisationConfig
+from pipeline.detection.products import run
+from pipeline.formats.rasters.geotiff import write_geotiff
+from scene.geometry.grid import Grid
 
 TILE, CELLS, DEPTH, NOISE = 64, 128, 1.0, 0.004
 GSD = 0.02

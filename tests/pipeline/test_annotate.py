@@ -10,7 +10,7 @@ from pycocotools.cocoeval import COCOeval
 from scipy import ndimage
 
 from pipeline.change.annotate import AnnotationConfig, LabelledImage, block_annotations, coco, run_length_encoding
-from scene.grid import Grid
+from scene.geometry.grid import Grid
 
 GRID = Grid(1.0, 9.0, 0.1, 90, 60)
 

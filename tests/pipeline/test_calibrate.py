@@ -27,17 +27,17 @@ from pipeline.cli.main import main
 from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
 from pipeline.config.simulation import SimulationConfig, load_config
-from pipeline.formats.geotiff import write_geotiff
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import look, reconstruct
 from pipeline.run.site import SensorSite, prepare_site
-from scene.config import parse
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from sensors.model import StereoModel, TlsModel
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 SMALL = [
     "wall.width_m=9",

@@ -17,16 +17,16 @@ from pipeline.calibration.report import warnings
 from pipeline.calibration.write import to_dict
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
-from pipeline.formats.laz import write_laz
-from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import write_laz
 from pipeline.measurement.build import Request, build
 from pipeline.report.progress import Progress
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from sensors.model import TlsModel
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.sensor_model import TlsModel
 
 EYE = np.array([0.0, -30.0, 0.0])
 NOISE_M = 0.003

@@ -11,14 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.config.simulation import CamerasFile
-from pipeline.formats.camera_files import read_lens, read_oriented
-from pipeline.formats.cameras import read_cameras_yaml, write_cameras_yaml
-from pipeline.formats.colmap import read_colmap, read_map, write_colmap, write_map
-from pipeline.formats.metashape import read_calibration, read_metashape, write_calibration, write_metashape
-from pipeline.formats.opencv import read_opencv, read_opencv_text, write_opencv
-from scene.errors import InputError
-from scene.mesh import FloatArray
-from sensors.camera import Camera, CameraPair
+from pipeline.formats.cameras.camera_files import read_lens, read_oriented
+from pipeline.formats.cameras.cameras import read_cameras_yaml, write_cameras_yaml
+from pipeline.formats.cameras.colmap import read_colmap, read_map, write_colmap, write_map
+from pipeline.formats.cameras.metashape import read_calibration, read_metashape, write_calibration, write_metashape
+from pipeline.formats.cameras.opencv import read_opencv, read_opencv_text, write_opencv
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera, CameraPair
 
 GLACIER = Path(__file__).parents[3] / "shared" / "data" / "stereo_glacier"
 needs_glacier = pytest.mark.skipif(not GLACIER.is_dir(), reason=f"the real lens is not at {GLACIER}")

@@ -24,11 +24,11 @@ from pipeline.cli.json_schema import json_schema
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import CamerasFile, load_config
 from pipeline.dataset.config import load_dataset_config
-from pipeline.formats.atomic import new_folder
+from pipeline.formats.files.atomic import new_folder
 from pipeline.run.site import prepare_site
-from scene.config import load_yaml
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
+from scene.common.config import load_yaml
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
 
 
 class Pipeline:

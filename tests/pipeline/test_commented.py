@@ -17,8 +17,8 @@ from pipeline.config.bundled import configs_folder
 from pipeline.config.commented import commented_yaml
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import SimulationConfig
-from scene.config import Config, parse
-from scene.yaml_text import parse_yaml
+from scene.common.config import Config, parse
+from scene.common.yaml_text import parse_yaml
 
 
 class Style(Enum):

@@ -20,13 +20,13 @@ from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.covariates import edge_distance
 from pipeline.comparison.sensors_compared import contestants
 from pipeline.comparison.trial import Trial, compare, rockfalls
-from pipeline.formats.geotiff import write_geotiff
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.progress import Progress
-from scene.blocks import RockfallConfig
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import WALL
+from scene.blocks.block import RockfallConfig
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL
 
 SMALL: dict[str, Any] = {
     "seed": 3,

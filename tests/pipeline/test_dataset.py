@@ -26,10 +26,10 @@ from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.plan import planned_epochs, region, simulation_of
 from pipeline.dataset.records import write_dataset_file
 from pipeline.dataset.run import make_dataset, verify_dataset
-from pipeline.formats.geotiff import read_geotiff
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.report.progress import Progress
-from scene.errors import InputError
-from scene.grid import Grid
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 
 def entries(folder: Path, split: str, kind: str) -> list[dict[str, Any]]:

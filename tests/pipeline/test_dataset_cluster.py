@@ -22,7 +22,7 @@ from tiny_dataset import ROOT, TINY
 
 from pipeline.dataset import standstill
 from pipeline.dataset.worker import Order
-from scene.errors import OutsideError
+from scene.common.errors import OutsideError
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")

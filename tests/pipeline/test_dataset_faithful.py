@@ -11,8 +11,8 @@ from pipeline.dataset.card import _surfaces
 from pipeline.dataset.config import DatasetConfig
 from pipeline.dataset.plan import planned_epochs, simulation_of
 from pipeline.dataset.statistics import SetStatistics
-from scene.config import parse
-from scene.errors import InputError
+from scene.common.config import parse
+from scene.common.errors import InputError
 
 PRINTED = {
     "sensor": "stereo",

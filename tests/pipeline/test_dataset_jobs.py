@@ -21,8 +21,8 @@ from pipeline.dataset.combine import merge_datasets
 from pipeline.dataset.config import load_dataset_config
 from pipeline.dataset.plan import planned_epochs
 from pipeline.dataset.run import Workers, make_dataset
-from pipeline.formats.lock import LOCK, locked
-from scene.errors import InputError
+from pipeline.formats.files.lock import LOCK, locked
+from scene.common.errors import InputError
 
 
 @pytest.fixture(scope="module")

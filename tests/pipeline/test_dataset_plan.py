@@ -12,8 +12,8 @@ from pipeline.config.bundled import bundled_config
 from pipeline.dataset.config import load_dataset_config
 from pipeline.dataset.epoch import no_tile
 from pipeline.dataset.plan import Split, check_filled, planned_epochs, region
-from scene.errors import InputError
-from scene.grid import Grid
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 
 def check(width: int, height: int, split: Split, share: float, **tiles: Any) -> None:

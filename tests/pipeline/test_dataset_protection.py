@@ -23,13 +23,13 @@ from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.records import read_dataset_file, read_shard, write_dataset_file, write_shard
 from pipeline.dataset.run import Workers, make_dataset, verify_dataset
 from pipeline.dataset.worker import Order
-from pipeline.detection.data import CocoFolder
-from pipeline.detection.run import find_inputs
-from pipeline.formats.colmap import write_colmap
-from pipeline.formats.inside import inside
-from pipeline.formats.opencv import write_opencv
-from scene.errors import InputError
-from sensors.camera import Camera
+from pipeline.detection.network.data import CocoFolder
+from pipeline.detection.products.run import find_inputs
+from pipeline.formats.cameras.colmap import write_colmap
+from pipeline.formats.cameras.opencv import write_opencv
+from pipeline.formats.files.inside import inside
+from scene.common.errors import InputError
+from sensors.cameras.camera import Camera
 
 
 @pytest.fixture(scope="module")

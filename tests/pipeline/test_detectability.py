@@ -20,15 +20,15 @@ from pipeline.precision.detectability import (
 )
 from pipeline.precision.surface import Places
 from pipeline.precision.tls_geometry import tls_geometry
-from scene.config import parse
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from sensors.model import StereoModel, TlsModel
-from sensors.placement import RigConfig, Target
-from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner, ScannerConfig
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import TriangleMesh
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.stereo.stereo_pair import StereoPair
 
 PLAN = PlanningConfig()
 LIMIT = stats.norm.isf(1e-4)

@@ -16,8 +16,8 @@ from pipeline.comparison.detection import (
     wilson_interval,
 )
 from pipeline.noise.variogram import Structure, VariogramModel
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 SIGMA = 0.01
 WHITE = VariogramModel(SIGMA**2, ())

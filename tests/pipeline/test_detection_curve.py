@@ -7,8 +7,8 @@ import pytest
 from scipy.special import ndtr, ndtri
 
 from pipeline.comparison.detection_curve import DetectionCurve, detection_curve
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 MIDDLE, WIDTH = 0.1, 0.3
 

@@ -17,10 +17,10 @@ from pipeline.change.difference import (
 )
 from pipeline.change.robust import nmad
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import TriangleMesh
-from sensors.observation import Observation
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
+from sensors.signal_chain.observation import Observation
 
 STEP = 0.1
 WIDTH, HEIGHT = 8.0, 6.0

@@ -24,14 +24,14 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.export import pictures
 from pipeline.export.perspective import PerspectiveView, draw_wall
 from pipeline.export.yolo import grey_values, outline
-from pipeline.formats.atomic import write_json
-from pipeline.formats.geotiff import read_tiff, write_geotiff
-from pipeline.formats.ply import read_ply
-from pipeline.formats.run_files import RunFiles
+from pipeline.formats.files.atomic import write_json
+from pipeline.formats.meshes.ply import read_ply
+from pipeline.formats.rasters.geotiff import read_tiff, write_geotiff
+from pipeline.formats.records.run_files import RunFiles
 from pipeline.run.simulation import simulate
-from scene.config import parse
-from scene.grid import Grid
-from scene.mesh import TriangleMesh
+from scene.common.config import parse
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
 
 SMALL: dict[str, Any] = {
     "seed": 3,

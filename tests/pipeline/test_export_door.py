@@ -13,16 +13,16 @@ from PIL import Image
 from pipeline.cli.main import main
 from pipeline.export.perspective import PerspectiveView
 from pipeline.export.yolo import save_yolo
-from pipeline.formats.atomic import write_json
-from pipeline.formats.geotiff import write_geotiff
-from pipeline.formats.laz import write_laz
-from pipeline.formats.ply import write_ply
+from pipeline.formats.files.atomic import write_json
+from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.result_records import read_run
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.rasters.geotiff import write_geotiff
+from pipeline.formats.records.result_records import read_run
 from pipeline.report.progress import Progress
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.mesh import FloatArray, TriangleMesh
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray, TriangleMesh
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 3.0, 0.5], [0.0, 3.0, 0.0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)

@@ -15,18 +15,18 @@ from scene_files import UTM, rock, sheet, written
 from surfaces import sphere
 
 from pipeline.config.simulation import SensorName, SimulationConfig
-from pipeline.formats.measurement import Measurement, read_measurement
-from pipeline.formats.ply import read_ply, write_ply
+from pipeline.formats.measurements.measurement import Measurement, read_measurement
+from pipeline.formats.meshes.ply import read_ply, write_ply
 from pipeline.gap.residuals.registration import residuals_of
 from pipeline.run.site import prepare_site
-from scene.cleaning import flipped
-from scene.config import parse
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from scene.winding import facing
-from sensors.placement import look_at
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.meshes.cleaning import flipped
+from scene.meshes.winding import facing
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.placement import look_at
 
 CENTRE = np.array([3.5, 0.3, 2.5])
 EYE = CENTRE - [0.0, 15.0, 0.0]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.formats.atomic import check_place, empty_folder, filling, write_bytes, writing
-from scene.errors import InputError
+from pipeline.formats.files.atomic import check_place, empty_folder, filling, write_bytes, writing
+from scene.common.errors import InputError
 
 
 @pytest.mark.parametrize("there", [False, True])

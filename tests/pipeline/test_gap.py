@@ -15,14 +15,14 @@ import yaml
 from gap_cases import Scan, write_scan
 
 from pipeline.cli.main import main
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import STEPS, GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import where
 from pipeline.gap.report.in_words import paragraph
 from pipeline.gap.report.report import summary, to_dict
-from scene import threads
-from scene.backend import dr
-from sensors.curve import Axis, surface_on_host
+from scene.common import threads
+from scene.common.backend import dr
+from sensors.numerics.curve import Axis, surface_on_host
 
 ROOT = Path(__file__).parents[2]
 

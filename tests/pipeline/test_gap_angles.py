@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
-from sensors.curve import Axis, surface_on_host
 from sensors.effects.angle_empirical import AngleEmpirical
+from sensors.numerics.curve import Axis, surface_on_host
 
 CYCLES, AMPLITUDE = 20, 4e-4
 """Of the azimuth's error on the whole circle; it moves points by 15 mm along the wall."""

@@ -9,11 +9,11 @@ import annotated_types
 import pytest
 from gap_cases import Scan, write_scan
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.entries import Named, only_within_bounds, with_effects
 from pipeline.gap.naming.workflow import diagnose
 from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
-from sensors.model import StereoModel, TlsModel
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 
 def _bounded() -> list[tuple[str, str, str, float]]:

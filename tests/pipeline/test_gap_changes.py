@@ -13,7 +13,7 @@ import pytest
 from change_cases import SIGMA, Array, Box, Scan, draw_boxes, noise, scan
 from gap_cases import STEP, smooth_noise, write_scan
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import summary, to_dict
 from pipeline.gap.residuals.changes import SceneChange, find_changes

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from gap_cases import write_scan
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.families import families_of
 from pipeline.gap.residuals.registration import settled
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 TRUE = 0.008
 STEPS = (0.013, 0.006)

@@ -14,14 +14,14 @@ from gap_cases import write_scan
 from surfaces import plane
 
 from pipeline.cli.main import main
-from pipeline.formats.laz import write_laz
-from pipeline.formats.measurement import read_measurement
-from pipeline.formats.measurement_checks import PointFit, check_different
+from pipeline.formats.measurements.checks import PointFit, check_different
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
-from pipeline.formats.xyz import read_xyz
-from scene.errors import InputError
-from scene.raycast import RayCaster
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
+from pipeline.formats.points.xyz import read_xyz
+from scene.common.errors import InputError
+from scene.ray_casting.raycast import RayCaster
 from sensors.effects.base import Sensor
 
 SCALE_AT, OFFSET_AT = 131, 155

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gap_cases import Scan, write_scan
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.residuals.registration import residuals_of
 

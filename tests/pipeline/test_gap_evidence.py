@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gap_cases import Array, Scan, smooth_noise, write_scan
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.selection import Choice, Members, Tried
 from pipeline.gap.naming.attempts import few
@@ -22,7 +22,7 @@ from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.other.spread import find_spread
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
 from pipeline.gap.residuals.registration import registered, settled
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 
 def test_debris_on_blocks_that_were_held_out_does_not_speak_against_an_effect(tmp_path: Path) -> None:

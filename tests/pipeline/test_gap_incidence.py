@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.formats.measurement import TlsMeasurement, read_measurement
-from pipeline.formats.measurement_config import MeasurementConfig
+from pipeline.formats.measurements.config import MeasurementConfig
+from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.rays import RayGeometry
 from pipeline.gap.residuals.scan_simulation import simulated_ranges
 from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.measurement.build import Request, build
-from scene.config import parse
-from scene.errors import InputError
-from scene.point_planes import PointPlanes
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.geometry.point_planes import PointPlanes
 from sensors.effects.range_incidence_bias import RangeIncidenceBias
 
 HEIGHT_M = 1.7

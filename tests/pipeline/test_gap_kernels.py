@@ -8,7 +8,7 @@ import pytest
 from kernels import kernels
 
 from benchmarks.gap_challenge.cases import Case, make
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 
 

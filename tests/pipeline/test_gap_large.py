@@ -15,7 +15,7 @@ from benchmarks.gap_challenge import stereo_cases
 from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_challenge.strength import Target
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.decisions import Decisions, deciding
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
@@ -38,8 +38,8 @@ from pipeline.gap.other.spread import SpreadFound, find_spread
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
 from pipeline.gap.residuals.registration import registered, settled
 from pipeline.gap.residuals.residuals import Residuals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 
 class _Strong(Target):

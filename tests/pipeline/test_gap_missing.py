@@ -11,7 +11,7 @@ from gap_cases import write_scan
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
-from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.naming.verify import measure_losses
 from pipeline.gap.other.missing import MissingFound, find_missing, isolated
 from pipeline.gap.residuals.residuals import Missing

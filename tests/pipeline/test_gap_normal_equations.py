@@ -15,7 +15,7 @@ from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.residuals import cells
 from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.shared_noise import SharedNoise
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 
 @pytest.fixture(scope="module")

@@ -23,10 +23,10 @@ from pipeline.gap.residuals.rays import RayGeometry
 from pipeline.gap.residuals.shared_noise import SharedNoise
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
-from sensors.model import StereoModel, StereoNoise
+from sensors.models.sensor_model import StereoModel, StereoNoise
 
 SIDE = 50
 SIGMA = 0.003

@@ -10,7 +10,7 @@ import pytest
 from gap_cases import write_scan
 
 from benchmarks.gap_challenge.cases import Case, make
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated, twice_a_pixel
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.signatures import _searched, mean_families
@@ -22,11 +22,11 @@ from pipeline.gap.residuals.registration import residuals_of
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.curve import surface_on_host
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.effects.row_jitter import RowJitter
+from sensors.numerics.curve import surface_on_host
 
 SIDE, STRIDE, SIGMA, PERIOD = 100, 4.0, 0.2, 64.0
 PIXELS = STRIDE * np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)

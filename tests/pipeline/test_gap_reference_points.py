@@ -10,17 +10,17 @@ import pytest
 import yaml
 
 from benchmarks import workshop
-from pipeline.formats.laz import write_laz
-from pipeline.formats.measurement import TlsMeasurement, read_measurement
-from pipeline.formats.measurement_config import MeasurementConfig
+from pipeline.formats.measurements.config import MeasurementConfig
+from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import write_laz
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
 from pipeline.measurement.build import Request, build
-from scene.config import parse
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.point_planes import own_noise
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.point_planes import own_noise
 
 MODEL = {"sensor": "tls", "noise": {"range_sigma_m": 0.001, "angle_sigma_rad": 5e-5}}
 SCANNER = np.zeros(3)

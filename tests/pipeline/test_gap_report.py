@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from pipeline.cli.main import main
-from pipeline.formats.laz import read_laz
-from pipeline.formats.measurement import Measurement, read_measurement
+from pipeline.formats.measurements.measurement import Measurement, read_measurement
+from pipeline.formats.points.laz import read_laz
 from pipeline.gap.decisions import read_decisions
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.splitting import split_of_noises
@@ -30,7 +30,7 @@ from pipeline.gap.report.quantities import with_std
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.residuals import Missing
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from sensors.model import StereoModel
+from sensors.models.sensor_model import StereoModel
 
 FILES = {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}
 GAP = Gap(before=0.004, after=0.0011, floor=0.001, error=0.0002, floor_error=0.0002, points=900)

@@ -11,10 +11,10 @@ import yaml
 from gap_cases import WIDTH, write_scan
 from numpy.testing import assert_allclose
 
-from pipeline.formats.e57 import E57Scan, write_e57
-from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.points import read_points
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
 from pipeline.gap.residuals.registration import registered, residuals_of
@@ -24,9 +24,9 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals, with_order
 from pipeline.gap.survey.identifiability import identifiability
 from pipeline.gap.survey.planned import TlsSurvey, measured_survey
 from pipeline.measurement.build import Request, build
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from sensors.model import TlsModel
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from sensors.models.sensor_model import TlsModel
 
 HERE, NEAR = (WIDTH * 0.42, -34.0, 2.5), (WIDTH * 0.55, -20.0, 1.0)
 

@@ -12,7 +12,7 @@ import pytest
 from gap_cases import write_scan
 
 from benchmarks.gap_challenge.cases import Case, make
-from pipeline.formats.measurement import StereoMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.mean.candidates import PLACE
 from pipeline.gap.naming import workflow
 from pipeline.gap.naming.attempts import Attempt, Starts, State, attempt
@@ -27,11 +27,11 @@ from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.registration import residuals_of, settled
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.smoothing import Smoothing
-from sensors.model import StereoNoise
-from sensors.stereo import REDUCTION
+from sensors.models.sensor_model import StereoNoise
+from sensors.stereo.stereo_pair import REDUCTION
 
 
 def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from scipy.interpolate import RectBivariateSpline
 from benchmarks.gap_challenge import stereo_effects
 from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_judge.cases import build, schedule
-from pipeline.formats.measurement import Measurement, TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import naming as steps
 from pipeline.gap.naming.entries import with_effects
@@ -31,12 +31,12 @@ from pipeline.gap.residuals.nominal_pair import NominalPair, project
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.occlusion_fill import OcclusionFill
 from sensors.effects.smoothing import Smoothing
-from sensors.model import StereoModel
+from sensors.models.sensor_model import StereoModel
 
 Made = tuple[Measurement, Residuals, dict[str, Any]]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.formats.measurement import read_measurement, read_model
+from pipeline.formats.measurements.measurement import read_measurement, read_model
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import write
 

@@ -20,8 +20,8 @@ from pipeline.gap.residuals.cells import Cells, patches
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.shared_noise import NodeField, SharedNoise
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
 
 STRIDE, SIDE = 4, 40

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from gap_cases import Array, Scan, write_scan
 
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verification import Showing
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
 from pipeline.gap.residuals.registration import settled
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 
 def _biased(coefficient_m: float) -> Callable[[Scan], Array]:

@@ -13,17 +13,17 @@ from scipy import stats
 from surface_cases import HEIGHT, SIGMA, WIDTH, Array, cloud, depth, normals, write_cloud, write_wall
 
 from pipeline.cli.main import main
-from pipeline.formats.geotiff import write_geotiff
-from pipeline.formats.measurement import SurfaceMeasurement, read_measurement, read_model
-from pipeline.formats.ply import write_ply
+from pipeline.formats.measurements.measurement import SurfaceMeasurement, read_measurement, read_model
+from pipeline.formats.meshes.ply import write_ply
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.report import to_dict
 from pipeline.gap.residuals.registration import residuals_of, settled
 from pipeline.measurement.request import Request
 from pipeline.measurement.surface import build_surface
-from scene.grid import Grid
-from scene.mesh import TriangleMesh
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
 from sensors.effects.surface_empirical import SurfaceEmpirical
 
 KEYS = ("schema", "verdict", "effects", "where", "scene_changes", "sensor", "registration", "identifiability", "gap", "remaining",

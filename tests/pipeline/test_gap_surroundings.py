@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.gap_challenge.cases import Case, make
-from pipeline.formats.measurement import StereoMeasurement, read_measurement
-from pipeline.formats.surroundings import Surroundings
+from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
+from pipeline.formats.measurements.surroundings import Surroundings
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals, with_surroundings
-from scene.raycast import RayCaster
+from scene.ray_casting.raycast import RayCaster
 
 
 @pytest.fixture(scope="module")

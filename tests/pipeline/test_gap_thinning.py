@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from gap_cases import Array, write_scan
 
-from pipeline.formats.measurement import TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.decisions import Decisions, deciding
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.thinning import thinned
 from pipeline.gap.residuals.tls_residuals import missing_returns, tls_residuals, with_order
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 _MOST = 6_000
 

@@ -15,7 +15,7 @@ from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_n
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.report.in_words import paragraph, title
 from pipeline.gap.report.report import summary
-from sensors.model import StereoModel, TlsModel
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 ERROR = 0.0001
 GAPS = [

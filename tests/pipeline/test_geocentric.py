@@ -11,9 +11,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from pipeline.formats.metashape import read_metashape, write_metashape
-from scene.errors import InputError
-from sensors.camera import Camera
+from pipeline.formats.cameras.metashape import read_metashape, write_metashape
+from scene.common.errors import InputError
+from sensors.cameras.camera import Camera
 
 A, F = 6_378_137.0, 1 / 298.257223563  # WGS 84
 E2 = F * (2 - F)

@@ -10,8 +10,8 @@ import rasterio
 import tifffile
 from format_cases import GRID, a_raster
 
-from pipeline.formats.geotiff import read_geotiff, read_tiff, write_geotiff, write_tiff
-from scene.errors import InputError
+from pipeline.formats.rasters.geotiff import read_geotiff, read_tiff, write_geotiff, write_tiff
+from scene.common.errors import InputError
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from pipeline.icp_study.report import write_icp_study
 from pipeline.icp_study.study import Recommendation, StudyRow, Surfaces, recommended, study, true_pose
 from pipeline.registration.register import IcpConfig
 from pipeline.registration.rigid import RigidTransform
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
 
 SIGMA = 0.003
 

@@ -9,8 +9,8 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
 from pipeline.run.site import prepare_site
-from scene.config import parse
-from scene.keyed_random import KeyedRandom
+from scene.common.config import parse
+from scene.common.keyed_random import KeyedRandom
 
 SHIFT_M = 0.03
 

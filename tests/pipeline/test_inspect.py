@@ -14,22 +14,22 @@ from surfaces import plane, step
 
 from pipeline.cli import main as cli
 from pipeline.config.simulation import SimulationConfig, load_config
-from pipeline.formats.geotiff import read_geotiff
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.planning.inspect import write_plans
 from pipeline.planning.maps import plans
 from pipeline.precision.stereo_geometry import stereo_geometry
 from pipeline.precision.surface import Places, seen_from, wall_raster
 from pipeline.precision.tls_geometry import TlsGeometry, tls_geometry
 from pipeline.run.site import prepare_site
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair
-from sensors.model import StereoModel, TlsModel
-from sensors.placement import RigConfig, Target
-from sensors.stereo import StereoPair
-from sensors.tls import LaserScanner, Pattern, ScannerConfig
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.laser.tls import LaserScanner, Pattern, ScannerConfig
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.stereo.stereo_pair import StereoPair
 
 SIGNIFICANCE = 1e-5
 """False-failure rate of each statistical test here; seeds are fixed."""

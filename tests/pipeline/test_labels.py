@@ -11,10 +11,10 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch, observe_epoch, observe_reference
 from pipeline.run.site import prepare_site
-from scene.config import parse
-from scene.keyed_random import KeyedRandom
-from scene.mesh import WALL, IntArray, TriangleMesh
-from scene.raycast import RayCaster, heights
+from scene.common.config import parse
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import WALL, IntArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster, heights
 
 QUIET = {"sensor": "stereo", "noise": {"parallax_sigma_px": 0, "regularization_sigma_px": 0}}
 NOISY = {"sensor": "stereo", "noise": {"parallax_sigma_px": 0.6, "regularization_sigma_px": 0.25}}

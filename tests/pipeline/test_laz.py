@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from format_cases import UTM, a_cloud
 
-from pipeline.formats.laz import EXACT_INTENSITY, read_laz, write_laz
 from pipeline.formats.point_cloud import PointCloud
-from scene.errors import InputError
+from pipeline.formats.points.laz import EXACT_INTENSITY, read_laz, write_laz
+from scene.common.errors import InputError
 
 
 @pytest.fixture

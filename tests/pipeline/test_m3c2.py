@@ -12,13 +12,13 @@ from pycocotools import mask
 from pipeline.change.difference import SurfaceRaster
 from pipeline.change.m3c2 import M3c2Config, core_grid, m3c2
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.geotiff import read_geotiff
-from pipeline.formats.laz import read_laz
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.run.simulation import simulate
-from scene.config import parse
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, IntArray
+from scene.common.config import parse
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray, IntArray
 
 GRID = Grid(0.0, 4.0, 0.1, 60, 40)
 SIGMA = 0.004

@@ -16,12 +16,12 @@ from matplotlib.transforms import Bbox
 
 from pipeline.comparison import figures as comparison_figures
 from pipeline.comparison.figures import MapPanel, side_by_side
-from pipeline.formats.measurement import read_measurement
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report import figures as gap_figures
 from pipeline.report import figures
 from pipeline.report.figures import DIFFERENCE_LABEL, difference_figure, map_figure
-from scene.grid import Grid
+from scene.geometry.grid import Grid
 
 EAST, NORTH = 679_805.0, 8_428_069.0
 SHAPES = [(40, 800), (60, 240), (100, 100), (300, 40)]

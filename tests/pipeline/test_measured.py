@@ -11,15 +11,15 @@ from surfaces import heightfield
 
 from pipeline.change.difference import DifferenceConfig
 from pipeline.config.calibration import CalibrationConfig
-from pipeline.formats.geotiff import write_geotiff
-from pipeline.formats.ply import write_ply, write_ply_points
+from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.noise.measured import area_mask, point_differences, read_measured
-from scene.config import parse
-from scene.errors import InputError
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.ray_casting.raycast import RayCaster
 
 
 def test_differences_are_reference_minus_point_per_pixel() -> None:

@@ -17,26 +17,26 @@ import yaml
 from gap_cases import write_scan
 
 from pipeline.cli.main import main
-from pipeline.formats.cameras import write_cameras_yaml
-from pipeline.formats.colmap import write_colmap
-from pipeline.formats.e57 import E57Scan, write_e57
-from pipeline.formats.geotiff import write_geotiff
-from pipeline.formats.laz import PulseChannels, write_laz
-from pipeline.formats.measurement import StereoMeasurement, TlsMeasurement, read_measurement
-from pipeline.formats.metashape import write_metashape
-from pipeline.formats.ply import read_ply
+from pipeline.formats.cameras.cameras import write_cameras_yaml
+from pipeline.formats.cameras.colmap import write_colmap
+from pipeline.formats.cameras.metashape import write_metashape
+from pipeline.formats.measurements.measurement import StereoMeasurement, TlsMeasurement, read_measurement
+from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
-from pipeline.formats.ptx import read_ptx
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.laz import PulseChannels, write_laz
+from pipeline.formats.points.points import read_points
+from pipeline.formats.points.ptx import read_ptx
+from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.measurement.build import build
 from pipeline.measurement.origin import from_order
 from pipeline.measurement.request import Request
 from pipeline.measurement.scans import orthonormal, read_scans
 from pipeline.measurement.triangulation import triangulated
-from scene.errors import InputError
-from scene.grid import Grid
-from sensors.camera import Camera, CameraPair
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from sensors.cameras.camera import Camera, CameraPair
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 FOREST = SHARED / "tls_forest_vz400i" / "TLS_scan.npz"

@@ -5,9 +5,9 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.surface.mesh import SurfaceConfig, mesh_cloud, mesh_observation
-from scene.errors import InputError
-from scene.mesh import TriangleMesh
-from sensors.observation import Observation
+from scene.common.errors import InputError
+from scene.geometry.mesh import TriangleMesh
+from sensors.signal_chain.observation import Observation
 
 VIEWPOINT = np.array([1.0, -2.0, 50.0])
 SHAPE = (31, 41)

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.formats.geotiff import read_tiff
-from pipeline.formats.metashape import read_metashape
+from pipeline.formats.cameras.metashape import read_metashape
+from pipeline.formats.rasters.geotiff import read_tiff
 from pipeline.surface.depth_maps import DepthMap
 from pipeline.surface.metashape_export import SCRIPT, write_metashape_export
-from sensors.camera import Camera
+from sensors.cameras.camera import Camera
 
 LENS = {"b1": 3.0, "b2": -2.0, "k1": -0.05, "k2": 0.03, "k3": 0.0, "k4": 0.01, "p1": 1e-3, "p2": -7e-4}
 

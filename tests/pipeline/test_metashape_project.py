@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.formats.camera_files import oriented_files, read_oriented, stereo_pair
-from pipeline.formats.metashape import read_metashape, write_metashape
-from scene.errors import InputError
-from sensors.camera import Camera
+from pipeline.formats.cameras.camera_files import oriented_files, read_oriented, stereo_pair
+from pipeline.formats.cameras.metashape import read_metashape, write_metashape
+from scene.common.errors import InputError
+from sensors.cameras.camera import Camera
 
 DESCRIPTOR = '<?xml version="1.0" encoding="UTF-8"?>\n<document version="1.2.0" path="{projectname}.files/project.zip"/>\n'
 """As Metashape 1.2 to 2.3 write it, and the list below."""
@@ -118,7 +118,7 @@ def test_what_is_missing_or_damaged_is_named(project: Path, spoil: Callable[[Pat
 
 
 def test_a_document_beyond_the_limit_is_not_unpacked(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.formats.metashape_project.MOST_TEXT_BYTES", 100)
+    monkeypatch.setattr("pipeline.formats.cameras.metashape_project.MOST_TEXT_BYTES", 100)
     with pytest.raises(InputError, match=r"project\.zip: its doc\.xml has 0 MB") as found:
         read_metashape(project)
     assert "no archive" not in str(found.value)

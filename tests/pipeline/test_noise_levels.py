@@ -12,10 +12,10 @@ from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.run.acquisition import look, reconstruct
 from pipeline.run.registered import reference_sensor
 from pipeline.run.site import SensorSite, prepare_site
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
-from sensors.model import StereoModel, StereoNoise
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.sensor_model import StereoModel, StereoNoise
 
 GLENDALE = bundled_config("sites", "glendale")
 FAST = ["depth_map=low", "wall.resolution_m=0.2", "difference.gsd_m=0.2", "icp.subsample_points=true", "icp.subsample_ratio=0.95"]

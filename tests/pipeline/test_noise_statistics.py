@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.noise.statistics import NORMAL_BEYOND_3, binned, histogram, normality, quantile_edges, tails, without_outliers
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 NORMAL = KeyedRandom(5).generator().normal(0.002, 0.01, 200_000)
 

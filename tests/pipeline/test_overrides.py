@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from pipeline.config.overrides import apply_overrides
-from scene.errors import InputError
-from scene.yaml_text import parse_yaml
+from scene.common.errors import InputError
+from scene.common.yaml_text import parse_yaml
 
 VALUES: dict[str, Any] = {"seed": 1, "wall": None, "sensor": [{"noise": {"range_sigma_m": 0.003}}, {"noise": {}}], "effects": []}
 

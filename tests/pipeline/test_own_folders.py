@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli.main import main
-from pipeline.formats.own_folders import require_own_folder
+from pipeline.formats.files.own_folders import require_own_folder
 from pipeline.run.simulation import _remove_unfinished
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 MAKES = [os.mkfifo, Path.touch, lambda path: path.symlink_to("nowhere"), lambda path: path.symlink_to("/etc")]
 

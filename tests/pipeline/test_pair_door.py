@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.formats.measurement_checks import check_seen
-from scene.errors import InputError
-from sensors.camera import Camera, CameraPair
+from pipeline.formats.measurements.checks import check_seen
+from scene.common.errors import InputError
+from sensors.cameras.camera import Camera, CameraPair
 
 LEFT = Camera(1000, 800, 1000.0, *[0.0] * 10, position=np.zeros(3), rotation=np.eye(3))
 PAIR = CameraPair(LEFT, replace(LEFT, position=np.array([1.0, 0.0, 0.0])))

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.formats.pcd import write_pcd
 from pipeline.formats.point_cloud import PointCloud
-from scene.errors import InputError
+from pipeline.formats.points.pcd import write_pcd
+from scene.common.errors import InputError
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.detection.figures import write_overlay
+from pipeline.detection.products.figures import write_overlay
 from pipeline.report.figures import hillshade_figure, png_bytes
 from pipeline.report.pictures import png
 from pipeline.report.plain_text import power_of_ten, powers_of_ten
-from scene.grid import Grid
+from scene.geometry.grid import Grid
 
 FORMULAE = ["$x^$", r"a $\frac b$", r"$\nonsense$"]
 

@@ -10,11 +10,11 @@ import pytest
 import trimesh
 from format_cases import UTM, a_cloud, a_mesh
 
-from pipeline.formats.ply import read_ply, read_ply_points, write_ply, write_ply_points
+from pipeline.formats.meshes.ply import read_ply, read_ply_points, write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from scene.errors import InputError
-from scene.mesh import TriangleMesh
-from scene.ply import read_elements
+from scene.common.errors import InputError
+from scene.geometry.mesh import TriangleMesh
+from scene.meshes.ply import read_elements
 
 
 @pytest.fixture

@@ -15,14 +15,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.bad_inputs.raw_cases import in_e57
-from pipeline.formats.e57 import E57Scan, read_e57, write_e57
-from pipeline.formats.laz import PulseChannels, read_laz, write_laz
-from pipeline.formats.ply import read_ply_points, write_ply_points
+from pipeline.formats.meshes.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import SUFFIXES, read_points
-from pipeline.formats.xyz import read_xyz, write_xyz
+from pipeline.formats.points.e57 import E57Scan, read_e57, write_e57
+from pipeline.formats.points.laz import PulseChannels, read_laz, write_laz
+from pipeline.formats.points.points import SUFFIXES, read_points
+from pipeline.formats.points.xyz import read_xyz, write_xyz
 from pipeline.measurement.scans import read_scans
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 UTM = np.array([331_245.0, 6_270_118.0, 412.0])
 ROTATION = Rotation.from_rotvec([0.1, -0.4, 2.0]).as_matrix()
@@ -134,7 +134,7 @@ def test_an_e57_takes_memory_for_the_points_that_are_there(tmp_path: Path, cloud
     (at_once,) = read_e57(path)
     monkeypatch = pytest.MonkeyPatch()
     with monkeypatch.context() as patched:
-        patched.setattr("pipeline.formats.e57._PIECE", 1000)
+        patched.setattr("pipeline.formats.points.e57._PIECE", 1000)
         assert_same(read_e57(path)[0].cloud, at_once.cloud)
     in_e57(path, claim, 'recordCount="999999999">')
     with pytest.raises(InputError, match="5,000 points, where it says 999,999,999"):

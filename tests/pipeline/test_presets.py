@@ -12,12 +12,12 @@ from scipy.optimize import brentq
 from pipeline.config.bundled import config_path, configs_folder
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import SimulationConfig, load_config
-from scene.config import parse
-from scene.errors import InputError
+from scene.common.config import parse
+from scene.common.errors import InputError
 from sensors.effects.beam_divergence import BeamDivergence
-from sensors.model import TlsNoise
-from sensors.presets import Divergence, ScannerPreset
-from sensors.tls import ScannerConfig
+from sensors.laser.presets import Divergence, ScannerPreset
+from sensors.laser.tls import ScannerConfig
+from sensors.models.sensor_model import TlsNoise
 
 NAMES = ["faro_s350", "leica_p40", "leica_p50", "riegl_vz2000i", "riegl_vz400", "riegl_vz400i", "zf_5016"]
 DEMO = configs_folder() / "demo.yaml"

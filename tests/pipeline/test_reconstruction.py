@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.colmap import read_map
+from pipeline.formats.cameras.colmap import read_map
 from pipeline.run.simulation import simulate
 from pipeline.surface.depth_maps import DepthMap, normals, pinhole
 from pipeline.surface.mesh import SurfaceConfig
 from pipeline.surface.reconstruct import FusionConfig, colmap_surface, write_workspace
-from scene.config import parse
-from scene.errors import InputError
-from scene.mesh import FloatArray
-from sensors.camera import Camera
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera
 
 LENS = {"b1": 1.0, "b2": -0.5, "k1": -0.05, "k2": 0.03, "k3": 0.0, "k4": 0.01, "p1": 1e-3, "p2": -7e-4}
 NORMAL = np.array([0.2, -0.15, 1.0]) / np.linalg.norm([0.2, -0.15, 1.0])

@@ -16,9 +16,9 @@ from scipy.stats import chi2, norm
 from pipeline.registration.closest_points import ReferenceSurface, scan_order
 from pipeline.registration.register import IcpConfig, Registration, _point_step, fit, register, register_to
 from pipeline.registration.rigid import RigidTransform, rotation_matrix
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 WIDTH, HEIGHT, SIGMA = 20.0, 12.0, 0.01
 RANDOM = KeyedRandom(7, ("test_register",))

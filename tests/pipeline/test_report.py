@@ -28,7 +28,7 @@ from pipeline.report.figures import (
 )
 from pipeline.report.page import litres, template
 from pipeline.run.page import BlockRow, EpochReport, RegistrationSummary, RunReport, write_report
-from scene.grid import Grid
+from scene.geometry.grid import Grid
 
 TEMPLATES = Path(__file__).parents[2] / "pipeline"
 GRID = Grid(x_min=0.0, y_max=20.0, gsd=0.1, width=300, height=200)

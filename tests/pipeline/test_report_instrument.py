@@ -12,8 +12,8 @@ import trimesh
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.run.instrument import instrument_figures
 from pipeline.run.site import prepare_site
-from scene.config import parse
-from scene.keyed_random import KeyedRandom
+from scene.common.config import parse
+from scene.common.keyed_random import KeyedRandom
 
 OFFSET = np.array([1000.0, 2000.0, 100.0])
 

@@ -10,13 +10,13 @@ import pytest
 import yaml
 from gap_cases import SIGMA, write_scan
 
-from pipeline.formats.laz import write_laz
-from pipeline.formats.measurement import Measurement, read_measurement
-from pipeline.formats.ply import read_ply_points, write_ply_points
+from pipeline.formats.measurements.measurement import Measurement, read_measurement
+from pipeline.formats.measurements.rounded_points import check_rounded_points
+from pipeline.formats.meshes.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.rounded_points import check_rounded_points
+from pipeline.formats.points.laz import write_laz
 from pipeline.gap.residuals.registration import residuals_of
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 
 def rounded(folder: Path, steps: list[float]) -> Measurement:

@@ -18,16 +18,16 @@ from pycocotools.coco import COCO
 
 from pipeline.cli.main import main
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
-from pipeline.formats.e57 import read_e57
-from pipeline.formats.laz import read_laz
-from pipeline.formats.ply import read_ply, write_ply
-from pipeline.formats.points import read_points
+from pipeline.formats.meshes.ply import read_ply, write_ply
+from pipeline.formats.points.e57 import read_e57
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.points.points import read_points
 from pipeline.run import simulation as pipeline_run
 from pipeline.run.simulation import simulate
-from scene.config import parse
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.procedural import ProceduralWall
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.walls.procedural import ProceduralWall
 
 SMALL: dict[str, Any] = {
     "seed": 3,

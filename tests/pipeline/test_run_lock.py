@@ -15,13 +15,13 @@ import pytest
 from test_run import config, digests
 
 from pipeline.cli.main import simulate as command
-from pipeline.formats import atomic
-from pipeline.formats.atomic import write_bytes
-from pipeline.formats.lock import LOCK, locked
+from pipeline.formats.files import atomic
+from pipeline.formats.files.atomic import write_bytes
+from pipeline.formats.files.lock import LOCK, locked
 from pipeline.run import simulation as pipeline_run
 from pipeline.run.products import is_whole
 from pipeline.run.simulation import simulate
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 COARSE: dict[str, Any] = {

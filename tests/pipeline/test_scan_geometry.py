@@ -14,17 +14,17 @@ import yaml
 from scipy.spatial.transform import Rotation
 from surfaces import heightfield
 
-from pipeline.formats.laz import read_laz, write_laz
+from pipeline.formats.measurements.scan_geometry import ScanGeometry, polar, recover_pattern
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points import read_points
-from pipeline.formats.scan_geometry import ScanGeometry, polar, recover_pattern
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from sensors.model import TlsModel
-from sensors.observation import Observation
-from sensors.tls import LaserScanner, Pattern, ScannerConfig
+from pipeline.formats.points.laz import read_laz, write_laz
+from pipeline.formats.points.points import read_points
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.tls import LaserScanner, Pattern, ScannerConfig
+from sensors.models.sensor_model import TlsModel
+from sensors.signal_chain.observation import Observation
 
 SHARED = Path(__file__).parents[3] / "shared"
 FOREST = SHARED / "data" / "tls_forest_vz400i" / "TLS_scan.npz"

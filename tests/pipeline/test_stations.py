@@ -13,20 +13,20 @@ from surfaces import heightfield
 from test_run import config
 
 from pipeline.change.difference import DifferenceConfig, raster_grid, surface_raster
-from pipeline.formats.laz import read_laz
+from pipeline.formats.points.laz import read_laz
 from pipeline.registration.register import IcpConfig
 from pipeline.registration.rigid import RigidTransform
 from pipeline.run.simulation import simulate
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from pipeline.surface.stations import Joined, StationsConfig, join, merged
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from sensors.model import TlsModel
-from sensors.placement import EXACT_POSE, PoseSigma
-from sensors.tls import LaserScanner, ScannerConfig
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.placement import EXACT_POSE, PoseSigma
+from sensors.models.sensor_model import TlsModel
 
 WALL = heightfield(16.0, 10.0, 0.1, roughness=0.15)
 CASTER = RayCaster(WALL)

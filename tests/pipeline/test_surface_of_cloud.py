@@ -11,10 +11,10 @@ import pytest
 from surfaces import heightfield
 
 from pipeline.cli import main as cli
-from pipeline.formats.laz import write_laz
-from pipeline.formats.ply import read_ply
+from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from scene.imported import ImportedWall
+from pipeline.formats.points.laz import write_laz
+from scene.walls.imported import ImportedWall
 
 STATION = np.array([345203.0, 6389435.0, 122.0])
 ORIGIN = np.array([345200.0, 6389450.0, 120.0])

@@ -5,8 +5,8 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.change.tiles import TileConfig, tiles
-from scene.errors import InputError
-from scene.grid import Grid
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 
 def raster(height, width):

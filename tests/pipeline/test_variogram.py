@@ -15,9 +15,9 @@ from pipeline.noise.variogram import (
     variance_of_mean,
     variogram,
 )
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 
 def planted(model: VariogramModel, shape: tuple[int, int], gsd: float, random: KeyedRandom) -> FloatArray:

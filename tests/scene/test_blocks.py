@@ -10,15 +10,15 @@ import trimesh
 from scipy.spatial import ConvexHull
 from walls import grid_wall, plane_wall, rough_wall
 
-from scene.blocks import Blocks, RockfallConfig, place_blocks
-from scene.carve import carve
-from scene.config import parse
-from scene.contour import highest_under
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from scene.under_boxes import faces_under
+from scene.blocks.block import Blocks, RockfallConfig, place_blocks
+from scene.blocks.carve import carve
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.geometry.under_boxes import faces_under
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.contour import highest_under
 
 RANDOM = KeyedRandom(5).child("rockfall")
 

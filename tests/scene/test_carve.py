@@ -12,14 +12,14 @@ import trimesh
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 from walls import closed, grid_wall, plane_wall, rough_wall
 
-from scene.blocks import Blocks, RockfallConfig, place_blocks
-from scene.carve import FRESH_ALBEDO, Carved, block_meshes, carve, carved_records
-from scene.config import parse
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.slivers import SLIVER_M, Mended, smallest_height
-from scene.solid import boundary
+from scene.blocks.block import Blocks, RockfallConfig, place_blocks
+from scene.blocks.carve import FRESH_ALBEDO, Carved, block_meshes, carve, carved_records
+from scene.blocks.slivers import SLIVER_M, Mended, smallest_height
+from scene.blocks.solid import boundary
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
 
 RANDOM = KeyedRandom(11).child("rockfall")
 
@@ -209,7 +209,7 @@ def test_slivers_that_resist_the_simplest_collapse(seed: int, cell_m: float, sig
 
 
 def test_the_mending_has_something_to_mend(rough: TriangleMesh, rough_blocks: Blocks, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scene.carve.mend", lambda vertices, faces, tag, rank: Mended(faces, tag, np.zeros(301)))
+    monkeypatch.setattr("scene.blocks.carve.mend", lambda vertices, faces, tag, rank: Mended(faces, tag, np.zeros(301)))
     mesh = carve(rough, rough_blocks).mesh
     at_rim = rim(mesh)[mesh.faces].any(axis=1)
     assert (smallest_height(mesh.vertices[mesh.faces[at_rim]]) < SLIVER_M).sum() > 20

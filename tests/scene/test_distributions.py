@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scene.config import Config, parse
-from scene.distributions import Distribution, Histogram
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
+from scene.blocks.distributions import Distribution, Histogram
+from scene.common.config import Config, parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
 
 SIGNIFICANCE = 1e-3 / 8
 SIZE = 20_000

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scene import extras
+from scene.common import extras
 
 
 def test_a_checkout_is_told_its_own_set_up_and_a_package_pip(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -15,15 +15,15 @@ from pydantic import Field
 from scipy import stats
 from surfaces import heightfield, plane, sphere
 
-from scene.backend import dr, mi
-from scene.config import Config, load_yaml, parse
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.grid import Grid
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster, heights
-from scene.regular_file import check_file
+from scene.common.backend import dr, mi
+from scene.common.config import Config, load_yaml, parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.common.regular_file import check_file
+from scene.geometry.frame import WallFrame
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster, heights
 
 SIGNIFICANCE = 1e-5
 """False-failure rate of each statistical test here; seeds are fixed."""

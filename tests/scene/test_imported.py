@@ -9,12 +9,12 @@ from scene_files import UTM, sheet, written
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from scene.cleaning import clean, groups, unique_rows, weld
-from scene.errors import InputError
-from scene.imported import ImportedWall
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.wall import build_wall
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.meshes.cleaning import clean, groups, unique_rows, weld
+from scene.walls.imported import ImportedWall
+from scene.walls.wall import build_wall
 
 
 def load(path, **keys):

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scene import regular_file
-from scene.errors import InputError
-from scene.regular_file import read_json
+from scene.common import regular_file
+from scene.common.errors import InputError
+from scene.common.regular_file import read_json
 
 NUMBERS = np.random.default_rng(1).random(40).tolist()
 POLYGON = {"id": 1, "bbox": NUMBERS[:4], "area": 80, "segmentation": [NUMBERS]}

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from scene.backend import LLVM, VARIANT
+from scene.common.backend import LLVM, VARIANT
 
 FORBIDDEN_PAGE = """
 import ctypes, mmap
@@ -26,8 +26,8 @@ def at_the_end_of_a_page(values):
 
 """
 RAY_CASTER = """
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
 
 fan = np.array([[0.0, 0, 0]] + [[np.cos(a), np.sin(a), 0] for a in np.linspace(0, 6, 602)])
 faces = np.stack([np.zeros(601, int), np.arange(1, 602), np.arange(2, 603)], axis=1)
@@ -37,13 +37,13 @@ print(distance[0])
 """
 UPLOAD = """
 from types import SimpleNamespace
-import scene.upload
-from scene.backend import dr, mi
+import scene.ray_casting.upload
+from scene.common.backend import dr, mi
 
-scene.upload.np = SimpleNamespace(empty=lambda size, dtype: at_the_end_of_a_page(np.zeros(size, dtype)))
+scene.ray_casting.upload.np = SimpleNamespace(empty=lambda size, dtype: at_the_end_of_a_page(np.zeros(size, dtype)))
 for kind in (mi.Float32, mi.Float64, mi.Int32, mi.UInt32, mi.Bool):
     for size in (1, 7, 1001, 4096):
-        values = scene.upload.on_device(kind, np.arange(size) % 2)
+        values = scene.ray_casting.upload.on_device(kind, np.arange(size) % 2)
         assert dr.sum(mi.Float64(dr.select(values == kind(1), 1, 0)))[0] == size // 2
 print("read")
 """

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from scene.cleaning import areas, clean
-from scene.config import Config, parse
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.imported import ImportedWall
-from scene.keyed_random import KeyedRandom
-from scene.procedural import SITES, ProceduralWall
-from scene.rock import SplineNoise
-from scene.wall import WallConfig, build_wall
+from scene.common.config import Config, parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.meshes.cleaning import areas, clean
+from scene.walls.imported import ImportedWall
+from scene.walls.procedural import SITES, ProceduralWall
+from scene.walls.rock import SplineNoise
+from scene.walls.wall import WallConfig, build_wall
 
 STYLES = get_args(ProceduralWall.model_fields["style"].annotation)
 SENSORS = np.array([35.0, -100.0, 10.0])

@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from scene_files import UTM, rock, sheet, written
 
-from scene.errors import InputError
-from scene.imported import read_mesh, read_reference
-from scene.mesh import TriangleMesh
-from scene.rounding import rounded_axes, step_of
+from scene.common.errors import InputError
+from scene.geometry.mesh import TriangleMesh
+from scene.meshes.rounding import rounded_axes, step_of
+from scene.walls.imported import read_mesh, read_reference
 
 
 def refused(path, words, **keys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from surfaces import sphere
 
-from scene.mesh import TriangleMesh, renumbered, signed_volumes
+from scene.geometry.mesh import TriangleMesh, renumbered, signed_volumes
 
 
 @pytest.mark.parametrize("seed", range(5))

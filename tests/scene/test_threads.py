@@ -7,7 +7,7 @@ from contextvars import ContextVar
 
 import pytest
 
-from scene.threads import side_by_side
+from scene.common.threads import side_by_side
 
 VALUE: ContextVar[int] = ContextVar("value", default=0)
 

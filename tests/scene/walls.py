@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from scene.mesh import TriangleMesh
+from scene.geometry.mesh import TriangleMesh
 
 
 def grid_wall(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> TriangleMesh:

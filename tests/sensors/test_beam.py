@@ -11,12 +11,12 @@ from scipy import stats
 from surfaces import heightfield, plane, step
 from test_tls import POSITION, ROTATION, scan, scanner
 
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.raycast import DEFAULT_ALBEDO, RayCaster
-from sensors.beam import unit_offsets
-from sensors.observation import Observation
-from sensors.tls import LaserScanner, Pattern
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
+from sensors.laser.tls import LaserScanner, Pattern
+from sensors.signal_chain.beam import unit_offsets
+from sensors.signal_chain.observation import Observation
 
 LIGHT = 299_792_458.0
 TERRACES = [(-40.0, -0.55, 0.0), (-0.55, -0.45, 3.0), (-0.45, 0.1, 1.0), (0.1, 0.3, 1.3), (0.3, 0.35, 2.4), (0.5, 40.0, 2.6)]

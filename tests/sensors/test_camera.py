@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from scene.errors import InputError
-from sensors.camera import INTERIOR, Camera, CameraPair, axis_rotation
+from scene.common.errors import InputError
+from sensors.cameras.camera import INTERIOR, Camera, CameraPair, axis_rotation
+from sensors.cameras.rectification import rectify
 from sensors.effects import STEREO_EFFECTS
 from sensors.effects.base import Stage
-from sensors.placement import look_at
-from sensors.rectify import rectify
+from sensors.models.placement import look_at
 
 LENS = {"b1": 1.2, "b2": -0.5, "k1": -0.05, "k2": 0.04, "k3": 0.01, "k4": 0.02, "p1": 0.001, "p2": -0.0005}
 

@@ -7,11 +7,11 @@ from surfaces import heightfield
 from test_stereo import FRAME, rig
 from test_tls import scanner
 
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
-from sensors.chosen import asked_for, looking_around
-from sensors.model import StereoModel
-from sensors.stereo import StereoPair
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.sensor_model import StereoModel
+from sensors.stereo.stereo_pair import StereoPair
+from sensors.subset import asked_for, looking_around
 
 EFFECTS = (
     {"name": "camera_omega", "angle_rad": 1e-4},

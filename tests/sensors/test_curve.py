@@ -10,11 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.interpolate import RegularGridInterpolator
 
-from scene.backend import mi
-from scene.config import parse
-from scene.errors import InputError
-from sensors.curve import Axis, surface, surface_on_host
+from scene.common.backend import mi
+from scene.common.config import parse
+from scene.common.errors import InputError
 from sensors.effects.range_empirical import RangeEmpirical
+from sensors.numerics.curve import Axis, surface, surface_on_host
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,17 @@ import pytest
 from scipy.sparse import csr_array
 
 from pipeline.gap.residuals.shared_noise import SharedNoise
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects import EFFECTS
 from sensors.effects.base import Effect, Search, ShowsIn, Stage
 from sensors.effects.heavy_tailed_noise import HeavyTailedNoise
 from sensors.effects.matching_noise import MatchingNoise
 from sensors.effects.range_incidence_bias import RangeIncidenceBias
 from sensors.effects.regularization_noise import RegularizationNoise
-from sensors.functions import DEVICE, HOST
-from sensors.matches import ImageRows, Matches
-from sensors.pulses import PulseGeometry, Pulses, slant
+from sensors.numerics.functions import DEVICE, HOST
+from sensors.signal_chain.matches import ImageRows, Matches
+from sensors.signal_chain.pulses import PulseGeometry, Pulses, slant
 
 PULSES = 200_000
 AZIMUTH, ZENITH, RANGE, COSINE, POWER, LINE, SHARE = 0.3, 1.2, 83.0, 0.6, 0.4, 37, 0.25

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from surfaces import plane
 
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair, axis_rotation
-from sensors.exchanged import depth_cameras, observe_right
-from sensors.model import StereoModel
-from sensors.observation import Observation
-from sensors.stereo import StereoPair
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import Camera, CameraPair, axis_rotation
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.exchanged import depth_cameras, observe_right
+from sensors.stereo.stereo_pair import StereoPair
 
 QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}
 FRAME = WallFrame(np.eye(3), np.zeros(3))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene.keyed_random import KeyedRandom
-from sensors.exposure import WHITE_LEVEL, ExposureConfig, expose, full_scale
+from scene.common.keyed_random import KeyedRandom
+from sensors.stereo.exposure import WHITE_LEVEL, ExposureConfig, expose, full_scale
 
 STEP = 4
 

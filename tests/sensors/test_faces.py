@@ -11,14 +11,14 @@ from surfaces import plane, step
 from test_beam import beam
 from test_tls import POSITION, ROTATION, scanner
 
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from sensors.faces import mean_of_faces
-from sensors.observation import Observation
-from sensors.placement import PoseSigma
-from sensors.tls import LaserScanner
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.faces import mean_of_faces
+from sensors.laser.tls import LaserScanner
+from sensors.models.placement import PoseSigma
+from sensors.signal_chain.observation import Observation
 
 TILTED = plane(np.array([0.5, 0.6, 1.0]), np.zeros(3), half_side=200.0)
 ANGLE = 1e-3

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from surfaces import plane, step
 
-from scene.backend import dr, mi
-from scene.errors import InputError
-from scene.illumination import J2000, Illumination, IlluminationConfig, equatorial, sun_position
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.raycast import RayCaster
-from scene.texture import TextureConfig, solid_noise
+from scene.appearance.illumination import J2000, Illumination, IlluminationConfig, equatorial, sun_position
+from scene.appearance.texture import TextureConfig, solid_noise
+from scene.common.backend import dr, mi
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
 
 UP = np.array([0.0, 1.0, 0.0])
 

@@ -12,12 +12,12 @@ from surfaces import step
 from test_stereo import FRAME, rig
 from test_tls import scanner
 
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
 from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
 from sensors.effects.base import Effect
-from sensors.model import StereoModel
-from sensors.stereo import StereoPair
+from sensors.models.sensor_model import StereoModel
+from sensors.stereo.stereo_pair import StereoPair
 
 NOISE = {"range_sigma_m": 0.003, "angle_sigma_rad": 5e-5}
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
 from sensors.effects.pixel_locking import PixelLocking
-from sensors.matches import Matches
+from sensors.signal_chain.matches import Matches
 
 COUNT = 12
 

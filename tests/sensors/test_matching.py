@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 from surfaces import plane, sphere, step
 
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.illumination import IlluminationConfig
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.procedural import ProceduralWall
-from scene.raycast import RayCaster
-from scene.texture import TextureConfig
-from sensors.camera import CameraPair
-from sensors.exposure import ExposureConfig
-from sensors.matching import MatchingConfig, SearchRange, match, without_speckles
-from sensors.model import StereoModel
-from sensors.observation import Observation
-from sensors.placement import RigConfig, Target
-from sensors.rectified import RectifiedGrid
-from sensors.rectify import rectify
-from sensors.stereo import StereoPair
-from sensors.stereo_matched import MatchedStereoPair
+from scene.appearance.illumination import IlluminationConfig
+from scene.appearance.texture import TextureConfig
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.procedural import ProceduralWall
+from sensors.cameras.camera import CameraPair
+from sensors.cameras.rectification import rectify
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.exposure import ExposureConfig
+from sensors.stereo.matching import MatchingConfig, SearchRange, match, without_speckles
+from sensors.stereo.rectified import RectifiedGrid
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import StereoPair
 
 # The wall frame's x is the world's x, its y the world's z, its z the world's -y: a vertical wall, cameras in the south.
 FRAME = WallFrame(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), np.zeros(3))

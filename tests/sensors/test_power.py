@@ -9,15 +9,15 @@ import pytest
 from surfaces import heightfield, plane
 from test_tls import scanner
 
-from scene.config import parse
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.raycast import DEFAULT_ALBEDO, RayCaster
-from scene.wetness import WetnessConfig
-from sensors.atmosphere import extinction_per_m
-from sensors.observation import Observation
-from sensors.tls import ScannerConfig
+from scene.appearance.wetness import WetnessConfig
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
+from sensors.laser.atmosphere import extinction_per_m
+from sensors.laser.tls import ScannerConfig
+from sensors.signal_chain.observation import Observation
 
 TILTED = plane(np.array([0.3, 0.5, 1.0]), np.zeros(3))
 

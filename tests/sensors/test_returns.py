@@ -10,11 +10,11 @@ from surfaces import step
 from test_beam import LIGHT, axis_at, beam, edge, scan_with, terraces
 from test_tls import scanner
 
-from scene.keyed_random import KeyedRandom
-from scene.raycast import RayCaster
-from sensors.beam import unit_offsets
-from sensors.observation import FurtherReturns, Observation
-from sensors.tls import Pattern
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
+from sensors.laser.tls import Pattern
+from sensors.signal_chain.beam import unit_offsets
+from sensors.signal_chain.observation import FurtherReturns, Observation
 
 DIVERGENCE = 2e-3
 PATTERN = Pattern(-0.03, 2e-4, 240, np.pi / 2 - 0.01, 1e-3, 20)

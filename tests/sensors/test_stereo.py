@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from surfaces import heightfield, plane, sphere, step
 
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import RayCaster
-from sensors.camera import CameraPair
-from sensors.model import StereoModel
-from sensors.observation import Observation
-from sensors.placement import RigConfig, Target
-from sensors.rectify import rectify
-from sensors.stereo import StereoPair
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import CameraPair
+from sensors.cameras.rectification import rectify
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.stereo_pair import StereoPair
 
 QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}
 # The wall frame's x is the world's x, its y the world's z, its z the world's -y: a vertical wall, cameras in the south.

@@ -17,24 +17,24 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from surfaces import heightfield, plane, step
 
-from scene.backend import dr, mi
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair
+from scene.common.backend import dr, mi
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.cameras.rectification import rectify
 from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening, fattened
 from sensors.effects.smoothing import smoothed
 from sensors.effects.texture_noise import LARGEST_SIGMA_PX, WINDOW, TextureNoise, texture
-from sensors.matches import Matches, bridged
-from sensors.model import StereoModel
-from sensors.observation import Observation
-from sensors.placement import RigConfig, Target
-from sensors.rectify import rectify
-from sensors.stereo import REDUCTION, Quality, StereoPair
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.matches import Matches, bridged
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.stereo_pair import REDUCTION, Quality, StereoPair
 
 QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}
 SIGNIFICANCE = 1e-5

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from surfaces import heightfield, plane
 
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray, TriangleMesh
-from scene.raycast import RayCaster
-from sensors.model import StereoModel
-from sensors.placement import RigConfig, Target
-from sensors.stereo import StereoPair
-from sensors.stereo_vertices import observe_vertices
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from sensors.models.placement import RigConfig, Target
+from sensors.models.sensor_model import StereoModel
+from sensors.stereo.stereo_pair import StereoPair
+from sensors.stereo.stereo_vertices import observe_vertices
 
 QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}
 FRAME = WallFrame(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), np.zeros(3))

@@ -11,18 +11,18 @@ from scipy import stats
 from scipy.spatial import cKDTree
 from surfaces import heightfield, plane, sphere, step
 
-from scene.config import parse
-from scene.errors import InputError
-from scene.frame import WallFrame
-from scene.keyed_random import KeyedRandom
-from scene.mesh import TriangleMesh
-from scene.raycast import DEFAULT_ALBEDO, RayCaster
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import TriangleMesh
+from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
 from sensors.effects import TLS_EFFECTS
-from sensors.model import TlsModel
-from sensors.observation import Observation
-from sensors.placement import check_in_front
-from sensors.pulses import Pulses
-from sensors.tls import LaserScanner, Pattern, ScannerConfig
+from sensors.laser.tls import LaserScanner, Pattern, ScannerConfig
+from sensors.models.placement import check_in_front
+from sensors.models.sensor_model import TlsModel
+from sensors.signal_chain.observation import Observation
+from sensors.signal_chain.pulses import Pulses
 
 QUIET = {"range_sigma_m": 0.0, "angle_sigma_rad": 0.0}
 SIGNIFICANCE = 1e-5

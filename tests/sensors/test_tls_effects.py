@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 from surfaces import heightfield, plane, step
 from test_tls import POSITION, QUIET, ROTATION, SIGNIFICANCE, scan, scanner
 
-from scene.config import parse
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.raycast import DEFAULT_ALBEDO, RayCaster
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
 from sensors.effects import TLS_EFFECTS
-from sensors.model import TlsModel
-from sensors.observation import Observation
-from sensors.tls import LaserScanner
+from sensors.laser.tls import LaserScanner
+from sensors.models.sensor_model import TlsModel
+from sensors.signal_chain.observation import Observation
 
 NORMAL = np.array([0.5, 0.4, 1.0]) / np.linalg.norm([0.5, 0.4, 1.0])
 NOISY = {"range_sigma_m": 0.002, "range_ppm": 20.0, "angle_sigma_rad": 5e-5}

@@ -22,19 +22,19 @@ import pytest
 from pipeline.change.annotate import BLOCK_CATEGORY
 from pipeline.change.difference import surface_raster
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.atomic import write_json, write_text
-from pipeline.formats.geotiff import read_geotiff, write_geotiff
-from pipeline.formats.laz import read_laz, write_laz
-from pipeline.formats.ply import read_ply
+from pipeline.formats.files.atomic import write_json, write_text
+from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import read_laz, write_laz
+from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.run.simulation import simulate
 from pipeline.view.beside import Pair, beside, border
 from pipeline.view.page import following, pictures
 from pipeline.view.results import Item, Patch, ViewWindow, cut
 from pipeline.view.server import cookie_name, make_app, make_page_server, open_results, open_second
-from scene.config import parse
-from scene.errors import InputError
-from scene.grid import Grid
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 SMALL: dict[str, Any] = {
     "seed": 3,

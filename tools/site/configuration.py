@@ -5,7 +5,7 @@ from __future__ import annotations
 from pipeline.config.bundled import bundled_config
 from pipeline.config.commented import commented_yaml
 from pipeline.config.simulation import SimulationConfig
-from scene.config import load_yaml, parse
+from scene.common.config import load_yaml, parse
 
 _TEXT = """# Configuration
 

@@ -9,8 +9,8 @@ import yaml
 
 from pipeline.config.bundled import configs_folder
 from pipeline.config.presets import read_preset
-from sensors.model import TlsModel, TlsNoise
-from sensors.presets import ScannerPreset
+from sensors.laser.presets import ScannerPreset
+from sensors.models.sensor_model import TlsModel, TlsNoise
 
 _INTRODUCTION = """# Scanners
 

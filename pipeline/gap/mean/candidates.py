@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 Rows = NDArray[np.int64]
 Explanation = tuple[str, bool]

@@ -15,9 +15,9 @@ from pipeline.gap.mean.mean_model import Covariance, MeanFit, MeanModel, Project
 from pipeline.gap.mean.normal_equations import Equations, NoiseDraws, Waves, assembled, extended, wave_products
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.residuals import Residuals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.keyed_random import KeyedRandom
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 
 DRAWS = 499
 _NULL_ROWS = 8_000

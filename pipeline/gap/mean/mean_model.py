@@ -28,9 +28,9 @@ from scipy.special import j0
 from pipeline.gap.mean.within_noise import WithinNoise
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.keyed_random import KeyedRandom
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 
 _ROUGH, _SMOOTH, _WAVY = (0.7, 1.5, 3.0), (1.0, 2.0), (1.7, 2.5, 3.5, 5.0)
 """Lengths in cells of the three forms of correlation; of some 30 x 25 cells, so that the longest are still local."""

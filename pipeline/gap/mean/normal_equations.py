@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.keyed_random import KeyedRandom
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 
 _SMALLEST = 1e-9
 """Share of a column that others have to leave of it, in variance, for its gain to be told from rounding."""

@@ -9,9 +9,9 @@ import numpy as np
 
 from pipeline.gap.mean.design import DRAWS, Design
 from pipeline.gap.mean.mean_model import Covariance
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.keyed_random import KeyedRandom
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 
 _NEAR_NULL = 8
 """Covariances, the most likely ones, at which the draws are fitted."""

@@ -14,8 +14,8 @@ from pipeline.gap.mean.mean_model import MeanFit
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
 from pipeline.gap.residuals.residuals import Residuals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 _MOST_LEADING = 8
 """Effects that are taken exactly."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement, StereoMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import (
     Candidate,
     SineGrid,
@@ -25,7 +25,7 @@ from pipeline.gap.residuals.disparity_raster import spacing, through
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
 from pipeline.gap.residuals.residuals import Geometry, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, Search, ShowsIn
 from sensors.effects.camera_effect import CameraEffect
 from sensors.effects.pixel_locking import PixelLocking

@@ -15,8 +15,8 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 
 from pipeline.gap.residuals.shared_noise import NodeField
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 
 _LEAST_WHITE = 0.02
 """Share of the variance that counts as white where a model says there is none."""

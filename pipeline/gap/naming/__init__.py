@@ -1,0 +1,5 @@
+"""Decide which effects are named, and in which order they are fitted.
+
+The fits themselves are in `pipeline/gap/mean` and `pipeline/gap/other`.
+Start with `workflow.py`.
+"""

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.naming.entries import Named, from_shape, settled_with, with_effects
 from pipeline.gap.naming.families import believes
@@ -23,8 +23,8 @@ from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.smoothing import Smoothing
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import SURFACE, Candidate
 from pipeline.gap.mean.selection import Chosen
@@ -21,17 +21,17 @@ from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.registration import Settled, settled
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.config import parse
-from scene.errors import InputError
-from scene.mesh import FloatArray
-from sensors.curve import Axis, surface_on_host
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 from sensors.effects import effect_of
 from sensors.effects.angle_empirical import AngleEmpirical
 from sensors.effects.base import Effect, ShowsIn
 from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
-from sensors.model import StereoModel, TlsModel
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.numerics.curve import Axis, surface_on_host
 
 _NODES, _GRID, _JOINED, _MOST_POINTS = 65, 17, 257, 20_000
 """Of the curve of an empirical term, of each side of a surface, and of a sum of curves."""

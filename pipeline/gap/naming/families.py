@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import (
     MOST_CYCLES,
@@ -25,7 +25,7 @@ from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects import EFFECTS, effect_of
 from sensors.effects.angle_empirical import AngleEmpirical
 

@@ -10,7 +10,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.sparse import csr_array
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.within_noise import inverse_of
 from pipeline.gap.naming.entries import Named, settled_with
@@ -18,7 +18,7 @@ from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.shared_noise import SharedNoise
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
 
 _POINTS_PER_PATCH = 30.0

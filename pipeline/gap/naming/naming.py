@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement, StereoMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import PLACE, REPEATED
 from pipeline.gap.mean.search import MeanSearch
@@ -36,8 +36,8 @@ from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_empirical import AngleEmpirical
 from sensors.effects.base import ShowsIn
 from sensors.effects.pixel_locking import PixelLocking

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import HARMONICS, OVERTONES, Candidate, Explanation, SineGrid, harmonics, precision_of
 from pipeline.gap.mean.search import MeanSearch
@@ -17,8 +17,8 @@ from pipeline.gap.naming.families import PERIODIC, effects_of, families_of
 from pipeline.gap.other.spread import SpreadFound
 from pipeline.gap.residuals.registration import Settled, registered
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects import effect_of
 from sensors.effects.matching_noise import MatchingNoise
 

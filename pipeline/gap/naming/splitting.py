@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
 from pipeline.gap.survey.planned import measured_survey

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pipeline.gap.decisions import decided
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verify import Gap
-from sensors.model import StereoModel, TlsModel
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 VERDICTS = {
     "no_gap": "The measurement agrees with the model: nothing was found that the model does not hold.",

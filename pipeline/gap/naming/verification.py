@@ -7,17 +7,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.naming.entries import Named, settled_with, with_effects
 from pipeline.gap.naming.verify import LOSS_MEASURE, Gap, Version, measure_gap, measure_losses, thinned
 from pipeline.gap.other.missing import MissingFound
 from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
-from sensors.model import StereoModel, TlsModel
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 _FEWEST_POINTS = 100
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_simulation import simulate_disparities
@@ -26,9 +26,9 @@ from pipeline.gap.residuals.several_scans import simulate_departures
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, simulated_distances
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.model import StereoModel, TlsModel
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 MEASURE = "mean continuous ranked probability score of patches (mean and spread of their residuals) against simulated ones"
 LOSS_MEASURE = "mean Brier score of pulses (lost or not) against the chance of losing them"

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pipeline.formats.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement
-from pipeline.formats.measurement_checks import check_noise
+from pipeline.formats.measurements.checks import check_noise
+from pipeline.formats.measurements.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import Tried
 from pipeline.gap.naming.attempts import Starts, State, attempt, few, thinned_rows
@@ -42,10 +42,10 @@ from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surrou
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.thinning import thinned
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.occlusion_fill import OcclusionFill
-from sensors.model import StereoModel, TlsModel
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
 """The steps of `diagnose` and about what each takes, s."""

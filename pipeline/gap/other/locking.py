@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from scipy.special import j1, jv
 
 from pipeline.gap.decisions import decided
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 _SCALE_UNKNOWN, _TILT_UNKNOWN = 0.03, 0.1

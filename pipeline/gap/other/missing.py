@@ -13,7 +13,7 @@ from scipy.special import expit, logit, ndtr
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import BoolArray, Missing
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects import catalogue
 from sensors.effects.base import ShowsIn
 from sensors.effects.detection_limit import DetectionLimit

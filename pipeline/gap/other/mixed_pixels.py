@@ -8,18 +8,18 @@ from functools import cache, cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import TlsMeasurement
+from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.beam import Mode
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_noise import AngleNoise
 from sensors.effects.beam_divergence import BeamDivergence
-from sensors.model import TlsModel
+from sensors.models.sensor_model import TlsModel
+from sensors.signal_chain.beam import Mode
 
 _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]

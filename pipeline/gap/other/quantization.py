@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.gap.decisions import decided
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 _BIN_M = 1e-5
 _SMALLEST_STEP_M, _LARGEST_STEP_M = 5e-5, 0.05

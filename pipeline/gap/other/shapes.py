@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import BoolArray
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 
 _STRAY = 1e-3

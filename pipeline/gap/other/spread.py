@@ -14,8 +14,8 @@ from pipeline.change.robust import nmad
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import Cells, block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn
 
 DRAWS = 1999

@@ -23,10 +23,10 @@ from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
-from sensors.model import StereoModel
+from sensors.models.sensor_model import StereoModel
 
 _LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _LONGEST_PX = (256.0, 128.0, 64.0)

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import StereoMeasurement
+from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening
 from sensors.effects.occlusion_fill import OcclusionFill

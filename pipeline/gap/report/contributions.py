@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement, TlsMeasurement
+from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement
 from pipeline.gap.naming.entries import settled_with
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.tls_residuals import with_order
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 
 def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:

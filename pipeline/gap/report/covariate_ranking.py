@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import Missing, Residuals
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 _BINS = 12
 _MOST_ROWS = 10

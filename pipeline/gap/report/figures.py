@@ -22,8 +22,8 @@ from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.report.figures import COLOURS, dress_map
 from pipeline.report.pictures import png
 from pipeline.report.plain_text import power_of_ten
-from scene.mesh import FloatArray
-from sensors.model import StereoModel, TlsModel
+from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import StereoModel, TlsModel
 
 _BINS = 24
 _POINTS_PER_PIXEL = 8.0

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.atomic import write_json, write_text, writing
+from pipeline.formats.files.atomic import write_json, write_text, writing
 from pipeline.gap.report.figures import matrix_figure
 from pipeline.gap.report.in_words import listed, number
 from pipeline.gap.survey.identifiability import ALIKE, NAMED_AT, Identifiability

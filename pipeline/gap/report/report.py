@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from pipeline.formats.atomic import write_json, write_text, writing
-from pipeline.formats.laz import write_laz
-from pipeline.formats.measurement import Measurement
+from pipeline.formats.files.atomic import write_json, write_text, writing
+from pipeline.formats.measurements.measurement import Measurement
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import write_laz
 from pipeline.gap.decisions import deciding
 from pipeline.gap.naming.verdict import closing
 from pipeline.gap.naming.workflow import GapDiagnosis
@@ -36,7 +36,7 @@ from pipeline.gap.report.in_words import (
 from pipeline.gap.report.scale import scale_of
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.report.page import p_value_in_words, template
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 _MOST_TRIED = 25
 

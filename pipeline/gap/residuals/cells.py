@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 _MOST_CELLS = 800
 _FEWEST_POINTS = 3

@@ -36,8 +36,8 @@ from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import NEIGHBOURS, Sight
 from pipeline.gap.residuals.standardized import medians, spread, standardized
-from scene.frame import WallFrame
-from scene.mesh import FloatArray
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
 
 Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import StereoMeasurement
+from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, project, rays, real_pair
 from pipeline.gap.residuals.residuals import BoolArray
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
-from sensors.camera import Camera
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera
 from sensors.effects.base import Effect
 from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import LowPass, Smoothing

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import StereoMeasurement
+from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, project
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.chosen import asked_for, looking_around
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Stage
 from sensors.effects.raster_effect import RasterEffect
-from sensors.model import StereoModel
-from sensors.stereo import REDUCTION, StereoPair
+from sensors.models.sensor_model import StereoModel
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair
+from sensors.subset import asked_for, looking_around
 
 _SAME_STEP = 0.5
 """px by which two rasters' steps may differ: registrations move pixels a little."""

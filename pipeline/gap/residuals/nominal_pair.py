@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.formats.measurement import StereoMeasurement
+from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.residuals.residuals import BoolArray, Rows, part_of
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from scene.upload import on_device, vectors_on_device
-from sensors.camera import INTERIOR, Camera, CameraPair
-from sensors.device import rotated, vector
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import on_device, vectors_on_device
+from sensors.cameras.camera import INTERIOR, Camera, CameraPair
+from sensors.cameras.rectification import Rectification, rectify
 from sensors.effects.base import Effect, Stage
-from sensors.rectify import Rectification, rectify
-from sensors.stereo import rectified_pixel, rectified_tangents, row_tangent
+from sensors.numerics.device import rotated, vector
+from sensors.stereo.stereo_pair import rectified_pixel, rectified_tangents, row_tangent
 
 _HIDDEN_SHARE = 2e-4
 """A point is hidden where another surface stands before it by this share of its distance."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.formats.measurement import TlsMeasurement
+from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.residuals.residuals import Rows, part_of, plane_slopes
-from scene.mesh import FloatArray, IntArray, barycentric
-from scene.point_planes import PointPlanes
-from sensors.pulses import PulseGeometry
+from scene.geometry.mesh import FloatArray, IntArray, barycentric
+from scene.geometry.point_planes import PointPlanes
+from sensors.signal_chain.pulses import PulseGeometry
 
 _PROBE_RAD = 6e-4
 """Angle to the neighbouring rays that tell edges: about the width of a beam."""

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
 from pipeline.gap.residuals.several_scans import scans_residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 
 _ROUNDS = 6
 _AT_ONCE = 2048

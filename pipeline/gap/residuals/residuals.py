@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects, catalogue
 from sensors.effects.base import Effect, Sensor
 

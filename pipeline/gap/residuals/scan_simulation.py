@@ -7,18 +7,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.formats.measurement import TlsMeasurement
+from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.residuals.rays import RayGeometry
-from scene.backend import dr, mi
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from scene.upload import on_device
-from sensors.beam import Echo, Mode, SubRays
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import on_device
 from sensors.effects.base import ShowsIn
-from sensors.model import TlsModel, TlsNoise
-from sensors.pulses import PulseGeometry, Pulses, direction
-from sensors.tls import LaserScanner, Pattern, ScannerConfig
+from sensors.laser.tls import LaserScanner, Pattern, ScannerConfig
+from sensors.models.sensor_model import TlsModel, TlsNoise
+from sensors.signal_chain.beam import Echo, Mode, SubRays
+from sensors.signal_chain.pulses import PulseGeometry, Pulses, direction
 
 _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
 

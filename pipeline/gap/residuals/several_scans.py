@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.measurement import TlsMeasurement
+from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.residuals.scan_simulation import simulate_ranges
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from sensors.model import TlsModel
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import TlsModel
 
 
 def scans_residuals(measurement: TlsMeasurement) -> TlsResiduals:

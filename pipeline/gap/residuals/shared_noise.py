@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 from sensors.effects.matching_noise import MatchingNoise, NodeNoise
-from sensors.model import StereoModel
-from sensors.node_grid import MEAN_VARIANCE
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.node_grid import MEAN_VARIANCE
 
 _MOST_NODES = 2500
 """What is finer is represented by nodes farther apart, of the same power at long wavelengths."""

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, cKDTree
 
-from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.residuals import Residuals, Rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.mesh import FloatArray, area_normals
-from scene.threads import side_by_side
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray, area_normals
 
 NEIGHBOURS = 8
 """The ring around a point of a raster."""

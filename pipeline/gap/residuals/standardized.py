@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from pipeline.change.robust import nmad
 from pipeline.gap.residuals.residuals import Residuals
-from scene.mesh import FloatArray
-from scene.threads import side_by_side
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray
 
 _CELLS, _WINDOW = 36, 9
 """Cells along the longer side of the view, and how many of them make up the surroundings: a quarter of the side."""

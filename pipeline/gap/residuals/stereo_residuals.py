@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.formats.measurement import StereoMeasurement
-from pipeline.formats.surroundings import Surroundings
+from pipeline.formats.measurements.measurement import StereoMeasurement
+from pipeline.formats.measurements.surroundings import Surroundings
 from pipeline.gap.residuals.disparity_raster import MOST_CELLS, DisparityRaster, cell_px, cells_over, through
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
@@ -22,15 +22,15 @@ from pipeline.gap.residuals.nominal_pair import (
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.shared_noise import SharedNoise
 from pipeline.registration.rigid import RigidTransform
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair
-from sensors.curve import surface_on_host
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import Camera, CameraPair
 from sensors.effects.camera_effect import CameraEffect
 from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.effects.parallax_noise import ParallaxNoise
 from sensors.effects.raster_effect import RasterEffect
-from sensors.model import StereoModel
+from sensors.models.sensor_model import StereoModel
+from sensors.numerics.curve import surface_on_host
 
 _PROBE_PX = 3.0
 _EDGE_PX, _MOST_EDGE_PX = 1.0, 10.0

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
-from pipeline.formats.measurement import SurfaceMeasurement
+from pipeline.formats.measurements.measurement import SurfaceMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.registration import registered, settled
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, spacing_m
-from scene.errors import InputError
-from scene.mesh import FloatArray
-from sensors.model import StereoModel, StereoNoise
-from sensors.node_grid import node_semivariogram
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import StereoModel, StereoNoise
+from sensors.signal_chain.node_grid import node_semivariogram
 
 _LAGS = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0])
 """Of points, in spacings."""

@@ -12,21 +12,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.formats.measurement import SurfaceMeasurement
-from pipeline.formats.surface_datum import datum_columns
-from pipeline.formats.surface_fit import near_m
+from pipeline.formats.measurements.measurement import SurfaceMeasurement
+from pipeline.formats.measurements.surface_datum import datum_columns
+from pipeline.formats.measurements.surface_fit import near_m
 from pipeline.gap.residuals.cells import block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
 from pipeline.gap.residuals.shared_noise import SharedNoise
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects
 from sensors.effects.base import Stage, apply_stage
 from sensors.effects.point_noise import PointNoise
 from sensors.effects.regularization_noise import RegularizationNoise
 from sensors.effects.surface_empirical import SurfaceEmpirical
-from sensors.model import StereoModel
-from sensors.surface_places import RecordedPoints, SurfacePlaces
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.surface_places import RecordedPoints, SurfacePlaces
 
 NO_CAMERAS = (
     "no cameras: every effect of the catalogue of stereo pairs needs them, and none was tried; what is left is described over "

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.tls_residuals import pulse_of, pulses_of, recorded
-from scene.keyed_random import KeyedRandom
+from scene.common.keyed_random import KeyedRandom
 
 
 def thinned(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:

@@ -8,19 +8,19 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurement import TlsMeasurement
-from pipeline.formats.measurement_config import ScanPattern
+from pipeline.formats.measurements.config import ScanPattern
+from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.rays import RayGeometry, met, turned
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, plane_slopes
 from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Stage
 from sensors.effects.range_empirical import RangeEmpirical
 from sensors.effects.range_noise import RangeNoise
-from sensors.polar import polar, polar_axes
-from sensors.pulses import PulseGeometry
+from sensors.signal_chain.polar import polar, polar_axes
+from sensors.signal_chain.pulses import PulseGeometry
 
 _EDGE_SIGMAS = 3.0
 _LARGEST_SLOPE = 4.0

@@ -26,8 +26,8 @@ from pipeline.gap.survey.known_points import KnownPoints, known_points
 from pipeline.gap.survey.planned import Survey, View
 from pipeline.gap.survey.spread_identifiability import OtherEffect, others
 from pipeline.gap.survey.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE, SurveyDesign, families_of, label, signatures
-from scene.errors import InputError
-from scene.mesh import FloatArray
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
 
 NAMED_AT = 8.0
 ALIKE = 0.9

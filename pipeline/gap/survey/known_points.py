@@ -13,11 +13,11 @@ from pipeline.gap.residuals.nominal_pair import NominalPair, moved_pair, project
 from pipeline.gap.residuals.rays import RayGeometry
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.survey.planned import StereoView, TlsView
-from scene.mesh import FloatArray
-from sensors.camera import CameraPair
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import CameraPair
 from sensors.effects import effect_of
 from sensors.effects.base import Effect
-from sensors.polar import polar_axes
+from sensors.signal_chain.polar import polar_axes
 
 _TARGETS = 12
 _TARGET_SIGMA_M = 0.001

@@ -14,21 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.simulation import SensorName, SimulationConfig
-from pipeline.formats.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
 from pipeline.run.site import prepare_site
-from scene.errors import InputError
-from scene.keyed_random import KeyedRandom
-from scene.mesh import FloatArray
-from scene.raycast import RayCaster
-from sensors.camera import Camera, CameraPair
-from sensors.exchanged import pair_of
-from sensors.model import StereoModel, TlsModel, TlsNoise
-from sensors.stereo import REDUCTION, Quality, StereoPair
-from sensors.tls import LaserScanner, ScannerConfig
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.sensor_model import StereoModel, TlsModel, TlsNoise
+from sensors.stereo.exchanged import pair_of
+from sensors.stereo.stereo_pair import REDUCTION, Quality, StereoPair
 
 _MOST_PULSES = 30_000
 _FEWEST_POINTS = 300

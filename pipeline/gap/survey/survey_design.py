@@ -14,7 +14,7 @@ from pipeline.gap.mean.signatures import mean_candidates
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.survey.known_points import KnownPoints
 from pipeline.gap.survey.planned import View
-from scene.mesh import FloatArray
+from scene.geometry.mesh import FloatArray
 
 SIGNAL_TO_NOISE = 5.0
 REFERENCE_LENGTH_M = 3.0

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.config.simulation import SensorName, load_config
-from pipeline.formats.measurement import FILE, read_measurement
+from pipeline.formats.measurements.measurement import FILE, read_measurement
 from pipeline.gap.survey.planned import Survey, measured_survey, planned_survey
-from scene.errors import InputError
+from scene.common.errors import InputError
 
 
 def surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName | None = None) -> list[Survey]:

@@ -1,0 +1,87 @@
+"""What a detection's score means: of the detections with about such a score, the share that are blocks.
+
+A reliability diagram (Murphy & Winkler 1977). A score that is a probability lies on the diagonal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.detection.evaluation.evaluate import Overlap, matched_scores
+
+EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
+"""Of the classes of scores, finer towards 1 where most detections lie; 1 itself belongs to the last."""
+OVERLAP = 0.25
+
+
+@dataclass(frozen=True)
+class ScoreClass:
+    """Detections with scores from `low` up to `high`. score: their mean; right: how many are blocks."""
+
+    low: float
+    high: float
+    score: float
+    detections: int
+    right: int
+
+    @property
+    def precision(self) -> float:
+        """Share of the detections that are blocks."""
+        return self.right / self.detections
+
+    @property
+    def error(self) -> float:
+        """Standard error of that share, never 0: with one block and one false alarm more (Agresti & Coull 1998)."""
+        count = self.detections + 2
+        share = (self.right + 1) / count
+        return float(np.sqrt(share * (1 - share) / count))
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Of one group of images; classes without a detection are left out."""
+
+    group: str
+    classes: tuple[ScoreClass, ...]
+    kind: Overlap
+    iou: float = OVERLAP
+
+    @property
+    def calibration_error(self) -> float:
+        """Mean |precision - score| over the detections, NaN without any (Naeini et al. 2015)."""
+        count = sum(each.detections for each in self.classes)
+        off = sum(abs(each.right - each.score * each.detections) for each in self.classes)
+        return off / count if count else float("nan")
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON types; null for NaN."""
+        classes = [{**asdict(each), "precision": each.precision, "standard_error": each.error} for each in self.classes]
+        error = None if np.isnan(self.calibration_error) else self.calibration_error
+        return {"group": self.group, "kind": self.kind, "iou": self.iou, "calibration_error": error, "classes": classes}
+
+
+def reliability(
+    truth: Mapping[str, Any],
+    predictions: Sequence[Mapping[str, Any]],
+    groups: Mapping[str, Iterable[int]],
+    kind: Overlap = "segm",
+) -> list[Reliability]:
+    """By group of image ids; a detection is a block as `evaluate` counts it, at an overlap of OVERLAP and every score."""
+    return [_of(group, *matched_scores(truth, predictions, images, OVERLAP, kind), kind) for group, images in groups.items()]
+
+
+def _of(group: str, score: np.ndarray, right: np.ndarray, kind: Overlap) -> Reliability:
+    number = np.minimum(np.searchsorted(EDGES, score, side="right"), len(EDGES) - 1) - 1
+    count, hits, total = (np.bincount(number, each, len(EDGES) - 1) for each in (None, right, score))
+    return Reliability(
+        group,
+        tuple(
+            ScoreClass(EDGES[each], EDGES[each + 1], float(total[each] / count[each]), int(count[each]), int(hits[each]))
+            for each in np.flatnonzero(count)
+        ),
+        kind,
+    )

@@ -1,0 +1,59 @@
+"""What a user would take instead of a network: a threshold at the level of detection, morphology, connected components."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pipeline.detection.evaluation.detections import Detection
+from pipeline.detection.network.normalisation import LEVEL_OF_DETECTION, nmad
+from scene.common.config import Config
+
+
+class BaselineConfig(Config):
+    """How the baseline finds blocks."""
+
+    median_px: Literal[1, 3, 5] = Field(3, description="side of the median filter before the threshold; 1: none")
+    levels: float = Field(
+        1.0, gt=0, description="threshold, in multiples of the level of detection, 1.96 NMAD of the filtered map"
+    )
+    opening_px: int = Field(3, ge=1, description="side of the disc of the opening, which takes out specks; 1: none")
+    closing_px: int = Field(3, ge=1, description="side of the disc of the closing, which fills gaps; 1: none")
+    minimum_area_px: int = Field(12, ge=1, description="smaller components are left out")
+
+
+def detect(difference: NDArray[np.float32], config: BaselineConfig | None = None) -> list[Detection]:
+    """Missing rock in a difference map (h, w), m, NaN where there are no data, best first.
+
+    The score of a component is 1 - 2^-r^2 with r the mean difference over the threshold: 0.5 at the threshold, 0.94 at twice.
+    """
+    config = config or BaselineConfig()
+    valid = np.isfinite(difference)
+    filled = np.where(valid, difference, np.float32(0))
+    smooth = cv2.medianBlur(filled, config.median_px) if config.median_px > 1 else filled
+    threshold = config.levels * LEVEL_OF_DETECTION * nmad(np.where(valid, smooth, np.float32(np.nan)))
+    above = ((smooth > max(threshold, 1e-6)) & valid).astype(np.uint8)
+    above = cv2.morphologyEx(above, cv2.MORPH_OPEN, _disc(config.opening_px))
+    above = cv2.morphologyEx(above, cv2.MORPH_CLOSE, _disc(config.closing_px))
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(above, connectivity=8)
+    pixels = np.maximum(np.bincount(labels.ravel(), minlength=count), 1)
+    mean = np.bincount(labels.ravel(), weights=smooth.ravel(), minlength=count) / pixels
+    found = []
+    for number in range(1, count):
+        column, row, width, height, area = (int(value) for value in boxes[number])
+        if area >= config.minimum_area_px:
+            mask = labels[row : row + height, column : column + width] == number
+            found.append(Detection(row, column, mask, _score(float(mean[number]) / max(threshold, 1e-6))))
+    return sorted(found, key=lambda item: (-item.score, item.row, item.column))
+
+
+def _score(ratio: float) -> float:
+    return 1.0 - 2.0 ** -(ratio**2)
+
+
+def _disc(size: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))

@@ -1,0 +1,171 @@
+"""COCO folders of difference maps as batches for the network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+
+from pipeline.detection.network.config import DetectorConfig, TrainingConfig
+from pipeline.detection.network.normalisation import normalised
+from pipeline.formats.files.inside import inside
+from pipeline.formats.rasters.geotiff import read_tiff
+from pipeline.formats.records.coco import read_coco
+from scene.common.errors import InputError
+
+Batch = dict[str, NDArray[Any]]
+MIRRORED: dict[bool | str, tuple[int, ...]] = {True: (1, 0), "left_right": (1,), False: ()}
+"""Axes along which images are mirrored, by `training.flips`."""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A difference map (h, w), m, and its blocks.
+
+    labels: (h, w) int32, 1 + the index of the block that a pixel shows (of the later one where two overlap), 0 for none;
+    boxes: (g, 4) float32 y0, x0, y1, x1 px; ignored: (g,) blocks left out of the loss, COCO's `ignore` or `iscrowd`.
+    """
+
+    difference: NDArray[np.float32]
+    labels: NDArray[np.int32]
+    boxes: NDArray[np.float32]
+    ignored: NDArray[np.bool_]
+
+
+class CocoFolder:
+    """A folder with `annotations.json` and the TIFF images that it names."""
+
+    def __init__(self, folder: Path, *, masks: bool = True) -> None:
+        """masks: each annotation needs one. Raises InputError for all that `read_coco` does."""
+        content = read_coco(folder / "annotations.json", masks=masks)
+        self.folder = folder
+        self.images = sorted(content.images, key=lambda image: image["id"])
+        self.annotations = content.annotations
+        self._of: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in self.images}
+        for annotation in self.annotations:
+            self._of[annotation["image_id"]].append(annotation)
+
+    def check_images(self) -> None:
+        """Read every image once; raises InputError for the first that is damaged or of another size than annotated."""
+        for index in range(len(self)):
+            self._difference(index)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def path(self, image: dict[str, Any]) -> Path:
+        """The file of an entry of `images`; raises InputError for one outside of the folder."""
+        return inside(self.folder, image.get("file_name"), self.folder / "annotations.json")
+
+    def labelled(self, index: int) -> Labelled:
+        """The image at `index` with its blocks, those of which it shows a pixel.
+
+        Raises InputError for a damaged file and a size other than annotated.
+        """
+        difference = self._difference(index)
+        labels = np.zeros(difference.shape, np.int32)
+        boxes: list[tuple[float, float, float, float]] = []
+        ignored: list[bool] = []
+        for annotation in self._of[self.images[index]["id"]]:
+            if annotation["area"] == 0:
+                continue
+            x, y, width, height = annotation["bbox"]
+            boxes.append((y, x, y + height, x + width))
+            ignored.append(bool(annotation.get("ignore") or annotation.get("iscrowd")))
+            labels[coco_mask.decode(annotation["segmentation"]) > 0] = len(boxes)
+        return Labelled(difference, labels, np.array(boxes, np.float32).reshape(-1, 4), np.array(ignored, dtype=bool))
+
+    def _difference(self, index: int) -> NDArray[np.float32]:
+        image = self.images[index]
+        path = self.path(image)
+        difference = read_tiff(path)
+        if difference.shape != (image["height"], image["width"]):
+            allowed = f"{image['height']} x {image['width']} px as annotated"
+            problem = f"has {difference.shape[0]} x {difference.shape[1]} px"
+            raise InputError(problem, where=str(path), allowed=allowed, remedy="give the image that was annotated")
+        return difference
+
+
+def batches(
+    folder: CocoFolder, detector: DetectorConfig, training: TrainingConfig, epoch: int, *, learning: bool
+) -> Iterator[Batch]:
+    """The images once, as inputs of the network; `learning`: in random order, mirrored and cut at random, else as they are.
+
+    What is drawn depends on (seed, epoch, image) alone. The last batch is filled up with its own first images.
+    """
+    order = np.arange(len(folder))
+    if learning:
+        order = np.random.default_rng((training.seed, epoch)).permutation(order)
+    size = training.crop_px or detector.image_px
+    count = training.batch
+    groups = [np.resize(order[first : first + count], count) for first in range(0, len(order), count)]
+
+    def load(group: NDArray[np.int64]) -> Batch:
+        examples = []
+        for index in group:
+            random = np.random.default_rng((training.seed, epoch, 1 + int(index))) if learning else None
+            labelled = window(folder.labelled(int(index)), size, random)
+            if random is not None:
+                for axis in MIRRORED[training.flips]:
+                    labelled = mirrored(labelled, axis) if random.random() < 0.5 else labelled
+            examples.append(network_input(labelled, detector))
+        return {name: np.stack([example[name] for example in examples]) for name in examples[0]}
+
+    with ThreadPoolExecutor(1) as pool:  # the next batch is read while the network works on this one
+        coming = None
+        for group in groups:
+            ready, coming = coming, pool.submit(load, group)
+            if ready is not None:
+                yield ready.result()
+        if coming is not None:
+            yield coming.result()
+
+
+def network_input(labelled: Labelled, config: DetectorConfig) -> Batch:
+    """One image with its blocks as the network takes them, without the batch's axis; raises InputError past `most_blocks`."""
+    count = len(labelled.boxes)
+    if count > config.most_blocks:
+        raise InputError(f"an image shows {count} blocks", where="detector.most_blocks", allowed=f"at least {count}")
+    boxes, valid = np.zeros((config.most_blocks, 4), np.float32), np.zeros(config.most_blocks, np.float32)
+    boxes[:count], valid[:count] = labelled.boxes, np.where(labelled.ignored, -1, 1)
+    image = normalised(labelled.difference, config.normalisation)
+    return {"image": image, "boxes": boxes, "valid": valid, "labels": labelled.labels}
+
+
+def mirrored(labelled: Labelled, axis: int) -> Labelled:
+    """Up and down (axis 0) or left and right (1) exchanged."""
+    boxes = labelled.boxes.copy()
+    boxes[:, [axis, axis + 2]] = labelled.difference.shape[axis] - labelled.boxes[:, [axis + 2, axis]]
+    return replace(labelled, difference=np.flip(labelled.difference, axis), labels=np.flip(labelled.labels, axis), boxes=boxes)
+
+
+def window(labelled: Labelled, size: int, random: np.random.Generator | None) -> Labelled:
+    """A square of side `size`: anywhere at random, or the middle; pixels beyond the image have no data.
+
+    Of a block that is cut through, the part inside counts where it is at least half of it; lesser parts are background.
+    """
+    if labelled.difference.shape == (size, size):
+        return labelled
+    room = [max(length - size, 0) for length in labelled.difference.shape]
+    row, column = (int(random.integers(0, each + 1)) if random is not None else each // 2 for each in room)
+    cut = np.s_[row : row + size, column : column + size]
+    missing = [(0, size - length) for length in labelled.difference[cut].shape]
+    labels = np.pad(labelled.labels[cut], missing)
+    before = np.bincount(labelled.labels.ravel(), minlength=len(labelled.boxes) + 1)
+    inside = np.bincount(labels.ravel(), minlength=len(labelled.boxes) + 1)
+    kept = np.flatnonzero(2 * inside[1:] >= np.maximum(before[1:], 1))
+    numbers = np.zeros(len(labelled.boxes) + 1, np.int32)
+    numbers[kept + 1] = np.arange(1, len(kept) + 1)
+    shifted = labelled.boxes[kept] - np.array([row, column, row, column], np.float32)
+    return Labelled(
+        np.pad(labelled.difference[cut], missing, constant_values=np.nan),
+        numbers[labels],
+        np.clip(shifted, 0, size, dtype=np.float32),
+        labelled.ignored[kept],
+    )

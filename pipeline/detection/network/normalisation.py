@@ -1,0 +1,49 @@
+"""A difference map as the network's input."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change import robust
+from pipeline.detection.network.config import NormalisationConfig
+
+Image = NDArray[np.float32]
+LEVEL_OF_DETECTION = 1.96
+"""Of normal errors, 95 % lie within this many standard deviations."""
+
+
+def nmad(difference: Image) -> float:
+    """Robust standard deviation of the pixels with data, m; 0 where there are none."""
+    values = difference[np.isfinite(difference)]
+    return robust.nmad(values) if values.size else 0.0
+
+
+def normalised(difference: Image, config: NormalisationConfig, noise_m: float | None = None) -> Image:
+    """(h, w, channels) of a difference map (h, w), m, NaN where there are no data.
+
+    noise_m: standard deviation of the noise for `level_of_detection`, of a map that the image is a part of; its NMAD by default.
+    """
+    valid = np.isfinite(difference)
+    if config.method == "minmax":
+        scaled = _minmax(difference, valid)
+    else:
+        noise = nmad(difference) if noise_m is None else noise_m
+        scale = config.scale_m if config.method == "fixed" else max(LEVEL_OF_DETECTION * noise, 1e-6)
+        scaled = np.arcsinh(np.where(valid, difference, 0.0) / scale)
+    channels = [scaled, valid] if config.validity_channel else [scaled]
+    return np.stack(channels, axis=-1).astype(np.float32)
+
+
+def denormalised(image: Image, lowest_m: float, highest_m: float) -> Image:
+    """The difference map of an image (h, w) of the `minmax` kind, from the extremes that it had, m."""
+    return np.asarray(lowest_m + image * (highest_m - lowest_m), dtype=np.float32)
+
+
+def _minmax(difference: Image, valid: NDArray[np.bool_]) -> Image:
+    if not valid.any():
+        return np.zeros_like(difference)
+    values = difference[valid]
+    low, high = float(values.min()), float(values.max())
+    filled = np.where(valid, difference, np.median(values))
+    return np.asarray((filled - low) / max(high - low, 1e-9), dtype=np.float32)

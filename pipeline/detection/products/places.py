@@ -1,0 +1,62 @@
+"""Where events lie in the coordinates of the survey: a run knows its wall frame, and its reference how far the rock stood out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.detection.products.events import Event
+from pipeline.formats.records.result_files import read_surface
+from pipeline.formats.records.result_records import RUN_FILE, read_run
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
+
+_NEAR_M, _FARTHEST_M = 0.05, 1.0
+"""Radius in which the reference's vertices tell how far the rock stood out, doubled up to this where there are none."""
+
+
+@dataclass(frozen=True)
+class EventPlaces:
+    """A run's wall frame, and the vertices (n, 3) of its reference, wall frame, by rising x; none where the run wrote none."""
+
+    frame: WallFrame
+    vertices: FloatArray
+
+    def world(self, x: float, y: float) -> FloatArray:
+        """(3,) the place on the rock before it fell at (x, y) of the wall frame, world frame, m; NaN where that is not known."""
+        return np.asarray(self.frame.to_world(np.array([x, y, self._height(x, y)])))
+
+    def _height(self, x: float, y: float) -> float:
+        radius = _NEAR_M
+        while radius <= _FARTHEST_M:
+            low, high = np.searchsorted(self.vertices[:, 0], [x - radius, x + radius])
+            part = self.vertices[low:high]
+            near = part[np.abs(part[:, 1] - y) <= radius, 2]
+            if near.size:
+                return float(np.median(near))
+            radius *= 2
+        return float("nan")
+
+
+def placed(event: Event, path: Path) -> Event:
+    """The event with its world coordinates, where its map, at `path`, belongs to a run that says where its wall stands."""
+    run = next((folder for folder in (path.parent, path.parent.parent) if (folder / RUN_FILE).is_file()), None)
+    places = _places(run.resolve()) if run is not None else None
+    if places is None:
+        return event
+    x, y, z = places.world(event.x_m, event.y_m).tolist()
+    return replace(event, world_x_m=x, world_y_m=y, world_z_m=z)
+
+
+@lru_cache(2)
+def _places(folder: Path) -> EventPlaces | None:
+    frame = read_run(folder / RUN_FILE, "make the run again").get("wall_frame")
+    if not frame:
+        return None
+    surface = folder / "epoch_000" / "surface.ply"
+    vertices = read_surface(surface).vertices if surface.is_file() else np.empty((0, 3))
+    ordered = vertices[np.argsort(vertices[:, 0])]
+    return EventPlaces(WallFrame(np.array(frame["rotation"]), np.array(frame["origin_m"])), ordered)

@@ -1,0 +1,150 @@
+"""`scarpsim evaluate`: files in, tables out."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.change.annotate import STANDS_OUT
+from pipeline.detection.evaluation.evaluate import CONFIDENCES, Overlap, Score, coco_metrics, evaluate
+from pipeline.detection.evaluation.reliability import EDGES, OVERLAP, Reliability, reliability
+from pipeline.detection.products.figures import write_reliability
+from pipeline.formats.files.atomic import write_json, write_text
+from pipeline.formats.records.coco import read_coco, read_detections
+from scene.common.errors import InputError, nearest
+
+_MOST_PAIRS = 25_000_000
+"""Of annotations and detections of one image, whose overlaps take 200 MB."""
+_KINDS: dict[Overlap, str] = {"segm": "masks", "bbox": "boxes"}
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Scores of every group, by overlap of masks and of boxes, and pycocotools' figures over all images.
+
+    coco, reliability: by overlap of masks, of boxes where there are no masks.
+    """
+
+    scores: list[Score]
+    coco: dict[str, float]
+    reliability: list[Reliability]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON types."""
+        scores, reliable = ([each.to_dict() for each in found] for found in (self.scores, self.reliability))
+        return {"scores": scores, "coco": self.coco, "reliability": reliable}
+
+
+def assess(
+    truth: Path,
+    predictions: Path,
+    keys: Sequence[str] = (),
+    kinds: Sequence[Overlap] = ("segm", "bbox"),
+    confidences: Sequence[float] = CONFIDENCES,
+) -> Assessment:
+    """Compare two COCO files; `keys` of the truth's images, such as noise or wall, make the groups.
+
+    kinds: overlap of masks, of boxes (the thesis's), or both; confidences: lowest scores that count, each a column of the tables.
+
+    Raises InputError for all that `read_coco` and `read_detections` do, and for keys that do not tell the images apart.
+    """
+    path = truth / "annotations.json" if truth.is_dir() else truth
+    reference = read_coco(path, masks="segm" in kinds)
+    found = read_detections(predictions, reference, masks="segm" in kinds)
+    _check_pairs(reference.annotations, found, str(predictions))
+    groups = _groups(reference.images, keys, str(path))
+    scores = [score for kind in kinds for score in evaluate(reference.to_dict(), found, groups, confidences, kind=kind)]
+    reliable = reliability(reference.to_dict(), found, groups, kinds[0])
+    return Assessment(scores, coco_metrics(reference.to_dict(), found, kinds[0]), reliable)
+
+
+def _check_pairs(truth: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]], where: str) -> None:
+    """Raise InputError where an image has so many annotations and detections that their overlaps take gigabytes."""
+    annotated, detected = (Counter(each["image_id"] for each in entries) for entries in (truth, found))
+    for image, count in detected.items():
+        if count * annotated[image] > _MOST_PAIRS:
+            problem = f"has {count:,} detections in image {image}, where the truth has {annotated[image]:,} blocks"
+            allowed, remedy = f"{_MOST_PAIRS:,} pairs of both", "cut the image into tiles, or leave the lowest scores out"
+            raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
+
+
+def as_text(assessment: Assessment) -> str:
+    """Tables in the form of the thesis's, one per group and overlap, and COCO's figures."""
+    lines = []
+    groups: dict[tuple[str, Overlap], list[Score]] = {}
+    for score in assessment.scores:
+        groups.setdefault((score.group, score.kind), []).append(score)
+    by_group = sorted(groups.items(), key=lambda item: [name for name, _ in groups].index(item[0][0]))
+    for (group, kind), scores in by_group:
+        lines += [
+            "",
+            f"{group}, IoU of {_KINDS[kind]}",
+            f"{'confidence':<12}" + "".join(f"{_probability(score.confidence):>9}" for score in scores),
+        ]
+        lines.append(f"{'IoU':<12}" + "".join(f"{score.iou:>9.2f}" for score in scores))
+        for title, name in (("TP", "true_positives"), ("FP", "false_positives"), ("FN", "false_negatives")):
+            lines.append(f"{title:<12}" + "".join(f"{getattr(score, name):>9}" for score in scores))
+        for title, name in (("precision", "precision"), ("recall", "recall"), ("F1", "f1"), ("area ratio", "area_ratio")):
+            lines.append(f"{title:<12}" + "".join(_cell(getattr(score, name)) for score in scores))
+        if kind == by_group[0][0][1] and not np.isnan(scores[0].stand_out):
+            lines.append(f"blocks that stand out from the noise (S/N > {STANDS_OUT:g}): {100 * scores[0].stand_out:.1f} %")
+    lines += ["", *_what_scores_mean(assessment.reliability)]
+    coco = "  ".join(f"{name} {value:.3f}" for name, value in assessment.coco.items() if value >= 0)
+    return "\n".join([*lines[1:], "", f"COCO: {coco}"])
+
+
+def _what_scores_mean(groups: Sequence[Reliability]) -> Iterator[str]:
+    """The share of blocks among the detections of each class of scores, a line for each group."""
+    yield f"of detections with a score, how many are blocks ({_KINDS[groups[0].kind]} overlap by {OVERLAP:g})"
+    heads = [f"{low:g}-{high:g}" for low, high in pairwise(EDGES)]
+    width = max(len(each.group) for each in groups) + 2
+    yield " " * width + "".join(f"{head:>11}" for head in heads)
+    for each in groups:
+        shares = {one.low: one.precision for one in each.classes}
+        yield f"{each.group:<{width}}" + "".join(f"  {_cell(shares.get(low, float('nan')))}" for low in EDGES[:-1])
+
+
+def write(assessment: Assessment, folder: Path) -> None:
+    """scores.json, scores.csv and reliability.png."""
+    write_reliability(assessment.reliability, folder / "reliability.png")
+    write_json(folder / "scores.json", assessment.to_dict())
+    text = io.StringIO()
+    rows = [score.to_dict() for score in assessment.scores]
+    table = csv.DictWriter(text, rows[0], lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    write_text(folder / "scores.csv", text.getvalue())
+
+
+def _probability(value: float) -> str:
+    """With two decimals, or more where it has more."""
+    return max(f"{value:.2f}", f"{value:g}", key=len)
+
+
+def _cell(value: float) -> str:
+    return f"{'-':>9}" if np.isnan(value) else f"{100 * value:>7.1f} %"
+
+
+def _groups(images: Sequence[Mapping[str, Any]], keys: Sequence[str], where: str) -> dict[str, list[int]]:
+    groups: dict[str, list[int]] = {"all": [image["id"] for image in images]}
+    for key in keys:
+        known = [name for name in sorted(set.intersection(*map(set, images))) if all(_is_word(image[name]) for image in images)]
+        if key not in known:
+            problem = f"the images' '{key}' is no word or number" if any(key in image for image in images) else ""
+            problem = problem or f"the images have no '{key}'"
+            raise InputError(problem, where=where, allowed=", ".join(known), remedy=nearest(key, known) or "give another --by")
+        for value in sorted({image[key] for image in images}, key=str):
+            groups[f"{key} {value}"] = [image["id"] for image in images if image[key] == value]
+    return groups
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str | int | float | bool | None)

@@ -1,0 +1,94 @@
+"""Which reader a camera file needs, told by what stands in it, and which two of its cameras are the pair."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from pipeline.formats.cameras.colmap import read_colmap
+from pipeline.formats.cameras.metashape import MetashapeCameras, read_calibration, read_metashape
+from pipeline.formats.cameras.metashape_project import is_project, project_files
+from pipeline.formats.cameras.opencv import read_opencv, read_opencv_text
+from pipeline.formats.files.xml_file import read_root
+from scene.common.errors import InputError
+from scene.common.regular_file import check_file
+from sensors.cameras.camera import Camera, CameraPair
+
+_COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
+
+
+def read_oriented(path: Path) -> MetashapeCameras | None:
+    """Cameras with poses by label: Metashape's camera XML or project, or COLMAP's text model (its folder or a file of it).
+
+    None where the file is of another kind, such as the project's cameras.yaml. Raises InputError for a calibration alone.
+    """
+    if path.is_dir() or path.name in _COLMAP_FILES:
+        return MetashapeCameras(read_colmap(path if path.is_dir() else path.parent), ())
+    root = _xml_root(path)
+    if root == "document":
+        return read_metashape(path)
+    if root or _is_opencv_yaml(path):
+        raise InputError(
+            "holds a calibration and no poses",
+            where=str(path),
+            remedy="name it as `calibration:` of a camera in cameras.yaml, beside position_m and rotation",
+        )
+    return None
+
+
+def oriented_files(path: Path) -> list[Path]:
+    """The files of what `read_oriented` reads: COLMAP's model, whose folder may hold others, a project's, or `path` alone."""
+    if path.is_dir() or path.name in _COLMAP_FILES:
+        folder = path if path.is_dir() else path.parent
+        return [folder / name for name in sorted(_COLMAP_FILES) if (folder / name).exists()]
+    return project_files(path) if is_project(path) else [path]
+
+
+def read_lens(path: Path) -> Camera:
+    """A calibration alone, at the origin: Metashape's calibration XML, OpenCV's FileStorage, or plain numbers (.txt)."""
+    root = _xml_root(path)
+    if root == "document":
+        raise InputError("is a camera XML, not a calibration", where=str(path), remedy="name it as cameras.file in the config")
+    if root not in ("", "opencv_storage"):
+        return read_calibration(path)
+    return read_opencv_text(path) if path.suffix.lower() == ".txt" else read_opencv(path)
+
+
+def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, where: str) -> CameraPair:
+    """The cameras labelled `left` and `right`; where both are None the only two, told apart by where they stand.
+
+    Cameras that are not aligned are left out with a warning. Raises InputError where the pair is not clear.
+    """
+    known = ", ".join(found.cameras)
+    for label in (label for label in (left, right) if label is not None and label not in found.cameras):
+        why = "is not aligned" if label in found.unaligned else "is not in the file"
+        raise InputError(f"camera '{label}' {why}", where=where, allowed=known)
+    if left is not None and right is not None:
+        return CameraPair(found.cameras[left], found.cameras[right])
+    if left is not None or right is not None or len(found.cameras) != 2:
+        what = f"holds {len(found.cameras)} aligned cameras, a pair is two"
+        raise InputError(what, where=where, allowed=known, remedy="name both as cameras.left and cameras.right")
+    if found.unaligned:
+        warnings.warn(f"{where}: left out as not aligned: {', '.join(found.unaligned)}", stacklevel=2)
+    first, second = found.cameras.values()
+    swapped = first.rotation[:, 0] @ (second.position - first.position) < 0
+    return CameraPair(second, first) if swapped else CameraPair(first, second)
+
+
+def _xml_root(path: Path) -> str:
+    """The tag of an XML file's root, "" for a file that is no XML."""
+    return read_root(path).tag if path.suffix.lower() == ".xml" or _start(path).startswith(b"<") else ""
+
+
+def _is_opencv_yaml(path: Path) -> bool:
+    start = _start(path)
+    return start.startswith(b"%YAML") and b"opencv-matrix" in start
+
+
+def _start(path: Path) -> bytes:
+    check_file(path)
+    try:
+        with path.open("rb") as file:
+            return file.read(4096).lstrip()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None

@@ -1,0 +1,161 @@
+"""Camera poses and calibrations in COLMAP's text form, and its depth and normal maps.
+
+cameras.txt: CAMERA_ID MODEL WIDTH HEIGHT PARAMS; images.txt, two lines per image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME,
+then its keypoints (which may be empty); points3D.txt: POINT3D_ID X Y Z R G B ERROR and the track as (IMAGE_ID, KEYPOINT) pairs
+(COLMAP documentation, "Output Format"). Poses lead from the world to the camera, the quaternion's scalar comes first, and the
+centre of the top-left pixel is (0.5, 0.5). The camera models are OpenCV's: see pipeline.formats.opencv.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.cameras.opencv import OpencvInterior, shared_distortion
+from pipeline.formats.files.atomic import write_bytes, write_text
+from scene.common.errors import InputError
+from scene.common.regular_file import read_text
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera, Pose
+
+MODELS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+"""Parameters of COLMAP's models that ours covers (where k4, k5 and k6 are zero), in the order of cameras.txt."""
+_PLACE = ("f", "fx", "fy", "cx", "cy")
+_LARGEST = 1e12
+"""No coordinate, pixel or lens parameter is larger; squares and products of such numbers stay finite."""
+_MAP_HEADER = re.compile(rb"(\d+)&(\d+)&(\d+)&")
+
+
+def read_colmap(folder: Path) -> dict[str, Camera]:
+    """Read the cameras of a COLMAP text model by image name, world frame.
+
+    Raises InputError for a missing or malformed file, and for a camera model or parameter that ours does not have.
+    """
+    from scipy.spatial.transform import Rotation
+
+    interiors = {words[0]: (words, where) for words, where in _records(folder / "cameras.txt", 5, 1)}
+    cameras = {}
+    for words, where in _records(folder / "images.txt", 10, 2):
+        if words[8] not in interiors:
+            raise InputError(f"names the camera {words[8]}, which cameras.txt does not hold", where=where)
+        quaternion, translation = np.split(_numbers(words[1:8], where), [4])
+        if np.abs(quaternion).max() < 1e-9:
+            raise InputError("the quaternion is zero", where=where)
+        rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix().T
+        cameras[" ".join(words[9:])] = _camera(*interiors[words[8]], (-rotation @ translation, rotation))
+    return cameras
+
+
+def write_colmap(folder: Path, cameras: Mapping[str, Camera], points: FloatArray | None = None) -> None:
+    """Write a COLMAP text model: cameras by image name, world frame, and points (n, 3), m, each seen by every image.
+
+    COLMAP's fusion looks for overlapping images by the points that they share, so it needs some. Raises InputError where COLMAP
+    has no camera model with a parameter that is not zero (b2, k4).
+    """
+    from scipy.spatial.transform import Rotation
+
+    points = np.zeros((0, 3)) if points is None else points
+    interiors, images, track = [], [], []
+    for number, (name, camera) in enumerate(cameras.items(), start=1):
+        interiors.append(f"{number} {_interior(camera, f'{folder}: {name}')}")
+        world_to_camera = camera.rotation.T
+        quaternion = Rotation.from_matrix(world_to_camera).as_quat(scalar_first=True)
+        pose = _text([*quaternion, *(-world_to_camera @ camera.position)])
+        images += [f"{number} {pose} {number} {name}", _keypoints(camera, points)]
+        track.append(number)
+    tracks = [" ".join(f"{image} {index}" for image in track) for index in range(len(points))]
+    landmarks = [f"{index + 1} {_text(point)} 128 128 128 0 {tracks[index]}" for index, point in enumerate(points)]
+    for file, lines in (("cameras.txt", interiors), ("images.txt", images), ("points3D.txt", landmarks)):
+        write_text(folder / file, "".join(f"{line}\n" for line in lines))
+
+
+def write_map(path: Path, values: NDArray[np.floating]) -> None:
+    """Write a depth map (h, w), or a normal map (h, w, 3), as COLMAP does: `w&h&channels&`, then float32, channel by channel."""
+    channels = values[..., None] if values.ndim == 2 else values
+    height, width, depth = channels.shape
+    planes = np.ascontiguousarray(np.moveaxis(channels, 2, 0), dtype="<f4")
+    write_bytes(path, f"{width}&{height}&{depth}&".encode() + planes.tobytes())
+
+
+def read_map(path: Path) -> NDArray[np.float32]:
+    """Read a depth map as (h, w), a normal map as (h, w, 3); raises InputError for a file that is none."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
+    header = _MAP_HEADER.match(data)
+    width, height, depth = (int(number) for number in header.groups()) if header else (0, 0, 0)
+    if header is None or len(data) != header.end() + 4 * width * height * depth:
+        raise InputError("is no whole depth or normal map of COLMAP", where=str(path))
+    planes = np.frombuffer(data, "<f4", offset=header.end()).reshape(depth, height, width)
+    return planes[0] if depth == 1 else np.moveaxis(planes, 0, 2)
+
+
+def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]:
+    """The words of every `stride`-th line that is no comment, and where it stands; lines of fewer words are errors."""
+    remedy = "export the model as text (colmap model_converter --output_type TXT)"
+    lines = read_text(path, remedy=remedy).splitlines()
+    numbered = [(number, line) for number, line in enumerate(lines, start=1) if not line.startswith("#")]
+    if stride == 1:
+        numbered = [(number, line) for number, line in numbered if line.strip()]
+    while numbered and not numbered[-1][1].strip():
+        numbered.pop()
+    records = [(line.split(), f"{path}, line {number}") for number, line in numbered[::stride]]
+    for found, where in records:
+        if len(found) < words:
+            raise InputError(f"has {len(found)} words", where=where, allowed=f"at least {words}")
+    return records
+
+
+def _camera(words: list[str], where: str, pose: Pose) -> Camera:
+    model = words[1]
+    if model not in MODELS:
+        raise InputError(f"the camera model {model} is not covered by ours", where=where, allowed=", ".join(MODELS))
+    values = _numbers(words[2:], where)
+    if len(values) != 2 + len(MODELS[model]) or min(values[:3]) <= 0:
+        raise InputError(f"{model} needs width, height and {', '.join(MODELS[model])}", where=where)
+    named = dict(zip(MODELS[model], values[2:].tolist(), strict=True))
+    distortion = shared_distortion({name: value for name, value in named.items() if name not in _PLACE}, where)
+    fx, fy = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
+    return OpencvInterior(fx, fy, named["cx"], named["cy"], **distortion).camera(values[0], values[1], where, pose)
+
+
+def _interior(camera: Camera, where: str) -> str:
+    """MODEL WIDTH HEIGHT PARAMS in the smallest of COLMAP's models that holds the camera."""
+    interior = OpencvInterior.of(camera, where)
+    distorted = any(getattr(interior, name) != 0 for name in ("k1", "k2", "p1", "p2"))
+    model = "FULL_OPENCV" if interior.k3 != 0 else "OPENCV" if distorted else "PINHOLE"
+    return f"{model} {camera.width} {camera.height} {_text([getattr(interior, name, 0.0) for name in MODELS[model]])}"
+
+
+def _keypoints(camera: Camera, points: FloatArray) -> str:
+    """The image's second line: X Y POINT3D_ID of every point."""
+    local = (points - camera.position) @ camera.rotation
+    u, v = camera.pixel(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
+    return " ".join(f"{_text(pixel)} {index}" for index, pixel in enumerate(zip(u, v, strict=True), start=1))
+
+
+def _text(values: object) -> str:
+    """Numbers with all the digits that they have."""
+    return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))
+
+
+def _numbers(words: list[str], where: str) -> FloatArray:
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        values = np.array([np.nan])
+    if not (np.abs(values) <= _LARGEST).all():
+        raise InputError(f"expected numbers, got '{' '.join(words)[:60]}'", where=where, allowed=f"up to {_LARGEST:g}")
+    return values

@@ -1,0 +1,27 @@
+"""Coordinate systems of the survey's own coordinates, as files state them."""
+
+from __future__ import annotations
+
+from scene.common.errors import InputError
+from scene.common.extras import how_to_install
+
+
+def wkt_of(name: str, where: str) -> str:
+    """The WKT (version 1, as LAS has it) of a coordinate system in metres with two or three axes, such as EPSG:28356.
+
+    Raises InputError for one that is not known or not in metres, and where pyproj, the extra `crs`, is not installed.
+    """
+    try:
+        from pyproj import CRS
+        from pyproj.exceptions import CRSError
+    except ImportError:
+        raise InputError("needs pyproj, which is not installed", where=where, remedy=how_to_install("crs")) from None
+    try:
+        crs = CRS.from_user_input(name)
+    except (CRSError, UnicodeError) as error:
+        problem = f"is not understood: {name!r:.60} ({' '.join(str(error).split())[:100]})"
+        raise InputError(problem, where=where, allowed="an EPSG code such as EPSG:28356, or WKT") from None
+    if any(axis.unit_conversion_factor != 1 or "degree" in axis.unit_name for axis in crs.axis_info):
+        problem = f"'{crs.name}' has the unit {crs.axis_info[0].unit_name}"
+        raise InputError(problem, where=where, allowed="a projected coordinate system, m")
+    return str(crs.to_wkt("WKT1_GDAL"))

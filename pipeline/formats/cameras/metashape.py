@@ -1,0 +1,204 @@
+"""Cameras and calibrations in Agisoft Metashape's XML, whose camera model is ours.
+
+Camera XML (File > Export > Export Cameras): a sensor may hold two calibrations, the one of class "adjusted" counts; missing tags
+are 0. A camera without a transform is not aligned. A transform is row-major, camera to chunk; the similarity (s, R, t) of the
+camera's component, or where that has none of the chunk, leads on: x_world = s R x_chunk + t. In a chunk with a projected
+coordinate system (the tag `reference`) that leads to geocentric coordinates, which are taken to the projected ones. A project
+(.psx) holds the same of its active chunk.
+Calibration XML (Tools > Camera Calibration > Save): one interior orientation.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.formats.cameras.geocentric import Projection, is_geocentric
+from pipeline.formats.cameras.metashape_project import active_chunk, is_project
+from pipeline.formats.files.atomic import write_bytes
+from pipeline.formats.files.xml_file import read_root
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera, checked_camera
+
+_TAGS = {"f": "f_px", "cx": "cx_px", "cy": "cy_px"} | {name: name for name in ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")}
+_LARGEST = 1e12
+"""No coordinate, pixel or lens parameter is larger; products of such numbers stay finite."""
+
+
+@dataclass(frozen=True)
+class MetashapeCameras:
+    """Cameras by label, world frame, and the labels of those that were not aligned."""
+
+    cameras: dict[str, Camera]
+    unaligned: tuple[str, ...]
+
+
+def read_metashape(path: Path) -> MetashapeCameras:
+    """Read all frame cameras of a Metashape camera XML, or of a project's active chunk.
+
+    Raises InputError where the file is no such XML, a sensor of an aligned camera is not a frame camera with a calibration, and
+    where two cameras have one label.
+    """
+    chunk = _chunk(path)
+    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors//sensor")}
+    default = _similarity(chunk, path)
+    to_world = {
+        component.get("id", ""): default if component.find("transform") is None else _similarity(component, path)
+        for component in chunk.iterfind("components//component")
+    }
+    reference = (chunk.findtext("reference") or "").strip()
+    projection = None if _is_metric(reference) else Projection(reference, str(path))
+    cameras: dict[str, Camera] = {}
+    unaligned = []
+    for element in chunk.iterfind("cameras//camera"):
+        label, transform = element.get("label", element.get("id", "")), element.findtext("transform")
+        if transform is None:
+            unaligned.append(label)
+            continue
+        if label in cameras:
+            raise InputError(f"two cameras are labelled '{label}'", where=str(path), remedy="rename one of them in Metashape")
+        sensor = sensors.get(element.get("sensor_id", ""))
+        if sensor is None:
+            raise InputError(f"camera '{label}' names no sensor of the file", where=str(path))
+        in_chunk = _numbers(transform, 16, f"{path}: camera {label}").reshape(4, 4)
+        pose = to_world.get(element.get("component_id", ""), default) @ in_chunk
+        if projection is not None and is_geocentric(pose[:3, 3]):
+            pose = projection.pose(pose)
+        cameras[label] = _sensor_camera(sensor, pose, f"{path}: sensor {sensor.get('label', sensor.get('id'))}")
+    return MetashapeCameras(cameras, tuple(unaligned))
+
+
+def write_metashape(path: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write a camera XML that Metashape imports (File > Import > Import Cameras): cameras by label, in one metric component."""
+    document = ElementTree.Element("document", version="2.0.0")
+    chunk = ElementTree.SubElement(document, "chunk", label="scarpsim", enabled="true")
+    sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(cameras)))
+    components = ElementTree.SubElement(chunk, "components", next_id="1", active_id="0")
+    elements = ElementTree.SubElement(chunk, "cameras", next_id=str(len(cameras)), next_group_id="0")
+    transform = ElementTree.SubElement(ElementTree.SubElement(components, "component", id="0", label="Component 1"), "transform")
+    _texts(transform, {"rotation": np.eye(3), "translation": np.zeros(3), "scale": np.ones(1)})
+    for number, (label, camera) in enumerate(cameras.items()):
+        sensor = ElementTree.SubElement(sensors, "sensor", id=str(number), label=label, type="frame")
+        size = {"width": str(camera.width), "height": str(camera.height)}
+        ElementTree.SubElement(sensor, "resolution", size)
+        calibration = ElementTree.SubElement(sensor, "calibration", {"type": "frame", "class": "adjusted"})
+        ElementTree.SubElement(calibration, "resolution", size)
+        _write_interior(calibration, camera)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.rotation, camera.position
+        identity = {"id": str(number), "sensor_id": str(number), "component_id": "0", "label": label, "enabled": "true"}
+        _texts(ElementTree.SubElement(elements, "camera", identity), {"transform": pose})
+    _write(path, document)
+
+
+def read_calibration(path: Path) -> Camera:
+    """Read a calibration XML; the camera stands at the origin."""
+    root = read_root(path)
+    if root.tag != "calibration":
+        raise InputError(f"is no calibration XML of Metashape (its root is <{root.tag}>)", where=str(path))
+    if (projection := root.findtext("projection", "frame")) != "frame":
+        raise InputError(f"has the projection '{projection}'", where=str(path), allowed="frame")
+    width, height = (_whole(root.findtext(tag, "0"), str(path)) for tag in ("width", "height"))
+    return _camera(root, (width, height), np.eye(4), str(path))
+
+
+def write_calibration(path: Path, camera: Camera) -> None:
+    """Write the interior orientation of a camera as a calibration XML."""
+    root = ElementTree.Element("calibration")
+    for tag, text in (("projection", "frame"), ("width", str(camera.width)), ("height", str(camera.height))):
+        ElementTree.SubElement(root, tag).text = text
+    _write_interior(root, camera)
+    _write(path, root)
+
+
+def _chunk(path: Path) -> ElementTree.Element:
+    if is_project(path):
+        return active_chunk(path)
+    root = read_root(path)
+    chunk = root.find("chunk") if root.tag == "document" else None
+    if chunk is None:
+        raise InputError("is no Metashape camera XML", where=str(path), remedy="export it with File > Export > Export Cameras")
+    return chunk
+
+
+def _is_metric(reference: str) -> bool:
+    """Whether a chunk's coordinate system, in WKT, is one that transforms lead to: none, a local or a geocentric one."""
+    return not reference or reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS", "GEOCCS"))
+
+
+def _similarity(element: ElementTree.Element, path: Path) -> FloatArray:
+    """(4, 4) the transform tag of a chunk or component, the identity where it has none."""
+    matrix = np.eye(4)
+    transform = element.find("transform")
+    if transform is None:
+        return matrix
+    where = f"{path}: transform"
+    scale = float(_numbers(transform.findtext("scale", "1"), 1, where)[0])
+    if scale <= 0:
+        raise InputError(f"has the scale {scale:g}", where=where, allowed="greater than 0")
+    matrix[:3, :3] = scale * _numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1"), 9, where).reshape(3, 3)
+    matrix[:3, 3] = _numbers(transform.findtext("translation", "0 0 0"), 3, where)
+    return matrix
+
+
+def _sensor_camera(sensor: ElementTree.Element, pose: FloatArray, where: str) -> Camera:
+    """The camera of a sensor; pose: (4, 4) camera to world, which may hold a scale."""
+    calibrations = sensor.findall("calibration")
+    adjusted = [calibration for calibration in calibrations if calibration.get("class") == "adjusted"] or calibrations
+    resolution = sensor.find("resolution")
+    if resolution is None or not adjusted:
+        raise InputError("has no resolution or no calibration", where=where, remedy="align the cameras before the export")
+    for kind in (sensor.get("type", "frame"), adjusted[0].get("type", "frame")):
+        if kind != "frame":
+            raise InputError(f"has the model '{kind}'", where=where, allowed="frame")
+    width, height = (_whole(resolution.get(side, "0"), where) for side in ("width", "height"))
+    return _camera(adjusted[0], (width, height), pose, where)
+
+
+def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: FloatArray, where: str) -> Camera:
+    interior = {name: float(_numbers(calibration.findtext(tag, "0"), 1, where)[0]) for tag, name in _TAGS.items()}
+    if interior["f_px"] <= 0 or min(size) <= 0:
+        raise InputError("has no frame size or no f", where=where, allowed="width, height and f greater than 0")
+    left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation: takes out the similarity's scale
+    if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:
+        raise InputError("a camera's transform is no rotation with one scale", where=where)
+    return checked_camera(where, size, interior, (pose[:3, 3], left @ right))
+
+
+def _write_interior(element: ElementTree.Element, camera: Camera) -> None:
+    """The calibration's tags; those that are zero are left out, as Metashape does."""
+    values = {tag: float(getattr(camera, name)) for tag, name in _TAGS.items()}
+    _texts(element, {tag: np.array([value]) for tag, value in values.items() if value != 0})
+
+
+def _texts(parent: ElementTree.Element, values: Mapping[str, FloatArray]) -> None:
+    """Children with numbers in row-major order, with all the digits that they have."""
+    for tag, array in values.items():
+        ElementTree.SubElement(parent, tag).text = " ".join(repr(float(number)) for number in array.ravel())
+
+
+def _write(path: Path, root: ElementTree.Element) -> None:
+    ElementTree.indent(root)
+    write_bytes(path, ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n")
+
+
+def _whole(text: str, where: str) -> int:
+    value = float(_numbers(text, 1, where)[0])
+    if value != int(value):
+        raise InputError(f"expected a whole number of pixels, got '{text}'", where=where)
+    return int(value)
+
+
+def _numbers(text: str, count: int, where: str) -> FloatArray:
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != count or not (np.abs(values) <= _LARGEST).all():
+        raise InputError(f"expected {count} numbers, got '{' '.join(text.split())[:60]}'", where=where)
+    return values

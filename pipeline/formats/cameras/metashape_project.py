@@ -1,0 +1,81 @@
+"""A Metashape project (.psx): a small XML that names an archive, that names the archives of its chunks.
+
+    wall.psx                      <document path="{projectname}.files/project.zip"/>
+    wall.files/project.zip        doc.xml: <chunks active_id="0"><chunk id="0" path="0/chunk.zip"/>
+    wall.files/0/chunk.zip        doc.xml: <chunk> with sensors, components, cameras and transform, as in an exported camera XML
+
+The tags are those of projects of Metashape 1.2 to 2.3, as programs of others read and write them.
+"""
+
+from __future__ import annotations
+
+import lzma
+import xml.etree.ElementTree as ElementTree
+import zipfile
+import zlib
+from pathlib import Path
+
+from pipeline.formats.files.inside import inside
+from pipeline.formats.files.xml_file import parsed, read_root
+from scene.common.errors import InputError
+from scene.common.regular_file import MOST_TEXT_BYTES, check_file
+
+_DOCUMENT = "doc.xml"
+_DAMAGED = (OSError, zipfile.BadZipFile, KeyError, EOFError, zlib.error, lzma.LZMAError, RuntimeError, UnicodeDecodeError)
+"""Of `zipfile`: unreadable; no archive; without doc.xml; cut off; a damaged stream, of either kind; encrypted, or packed in a way
+that it does not know (NotImplementedError); names in no encoding."""
+_EXPORT = "save the project in Metashape again, or export the cameras with File > Export > Export Cameras"
+
+
+def is_project(path: Path) -> bool:
+    """Whether a file is a project, by its name."""
+    return path.suffix.lower() == ".psx"
+
+
+def active_chunk(path: Path) -> ElementTree.Element:
+    """The chunk that was open when the project was saved, or its only one.
+
+    Raises InputError where files of the project are missing or damaged, and where it has several chunks of which none is active.
+    """
+    return _document(project_files(path)[-1], "chunk")
+
+
+def project_files(path: Path) -> list[Path]:
+    """The project, its archive, and that of its active chunk."""
+    root = read_root(path)
+    if root.tag != "document" or root.get("path") is None:
+        raise InputError("is no Metashape project", where=str(path), remedy=_EXPORT)
+    project = inside(path.parent, str(root.get("path")).replace("{projectname}", path.stem), path)
+    document = _document(project, "document")
+    chunks, listed = document.findall("chunks/chunk"), document.find("chunks")
+    number = None if listed is None else listed.get("active_id")
+    chosen = [chunk for chunk in chunks if chunk.get("id") == number] or chunks
+    if len(chosen) != 1:
+        remedy = "open the chunk in Metashape and save the project"
+        raise InputError(f"holds {len(chunks)} chunks, of which none is active", where=str(project), remedy=remedy)
+    return [path, project, inside(project.parent, chosen[0].get("path"), project)]
+
+
+def _document(archive: Path, tag: str) -> ElementTree.Element:
+    """The root of an archive's doc.xml."""
+    where = f"{archive}: {_DOCUMENT}"
+    root = parsed(_unpacked(archive), where)
+    if root.tag != tag:
+        raise InputError(f"begins with <{root.tag}>", where=where, allowed=f"<{tag}>", remedy=_EXPORT)
+    return root
+
+
+def _unpacked(archive: Path) -> bytes:
+    """What stands in an archive's doc.xml."""
+    check_file(archive)
+    try:
+        with zipfile.ZipFile(archive) as file:
+            size = file.getinfo(_DOCUMENT).file_size
+            text = file.read(_DOCUMENT) if size <= MOST_TEXT_BYTES else b""
+    except _DAMAGED as error:
+        problem = f"is no archive of a Metashape project ({' '.join(str(error).split())[:200]})"
+        raise InputError(problem, where=str(archive), remedy=_EXPORT) from None
+    if size > MOST_TEXT_BYTES:
+        allowed = f"{MOST_TEXT_BYTES / 1e6:,.0f} MB"
+        raise InputError(f"its {_DOCUMENT} has {size / 1e6:,.0f} MB", where=str(archive), allowed=allowed, remedy=_EXPORT)
+    return text

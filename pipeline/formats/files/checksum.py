@@ -1,0 +1,21 @@
+"""Checksums of files."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from scene.common.errors import InputError
+from scene.common.regular_file import check_file
+
+_MOST_BYTES = 16_000_000_000
+
+
+def sha256(path: Path) -> str:
+    """The checksum of a file, in hexadecimal; raises InputError where it cannot be read, or is of a size that takes minutes."""
+    check_file(path, most_bytes=_MOST_BYTES, smaller="cut it to the scene")
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None

@@ -1,0 +1,71 @@
+"""One writer to a folder: a lock file that the kernel releases with its process, however that ends."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TextIO
+
+from pipeline.formats.files.atomic import explained
+from scene.common.errors import InputError
+
+LOCK = ".lock"
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold `folder`, which is made where it is missing; at the end the lock's file goes, and folders made here that are empty.
+
+    Raises InputError where another process holds it, or where no folder can be.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file", where=f"--out {folder}", remedy="choose a folder")
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    path = folder / LOCK
+    with explained(path):
+        file = _held(path)
+    try:
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # before it is released: who waits for it looks whether the file is still there
+        file.close()
+        for each in missing:
+            with suppress(OSError):  # holds what was made
+                each.rmdir()
+
+
+def is_free(folder: Path) -> bool:
+    """Whether a folder holds nothing but a lock."""
+    return folder.is_dir() and all(path.name == LOCK for path in folder.iterdir())
+
+
+def _held(path: Path) -> TextIO:
+    """The open lock file, locked and empty."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not path.is_file():
+            raise InputError("is no file", where=str(path), allowed="a lock file or none", remedy="remove it")
+        try:
+            file = path.open("a+", encoding="utf-8")
+        except FileNotFoundError:  # the last holder has just removed the folder that it made
+            continue
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            with file:
+                file.seek(0)
+                holder = file.read().strip() or "another process"
+            raise InputError(
+                f"is in use by {holder}", where=str(path.parent), remedy="wait for it to end, or choose another folder"
+            ) from None
+        with suppress(FileNotFoundError):
+            if os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                file.truncate(0)
+                return file
+        file.close()  # its holder removed it between our opening and our locking it

@@ -1,0 +1,29 @@
+"""XML of other programs, read without the entities by which a small file fills the memory."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from scene.common.errors import InputError
+from scene.common.regular_file import MOST_TEXT_BYTES, check_file
+
+
+def read_root(path: Path) -> ElementTree.Element:
+    """The root of an XML file; raises InputError for a file that is none, or that declares entities."""
+    check_file(path, most_bytes=MOST_TEXT_BYTES)
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
+    return parsed(text, str(path))
+
+
+def parsed(text: bytes, where: str) -> ElementTree.Element:
+    """The root of what stands in an XML file."""
+    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+        raise InputError("declares entities, which Metashape never does", where=where)
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"is not valid XML ({error})", where=where, remedy="export it again") from None

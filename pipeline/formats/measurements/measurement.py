@@ -1,0 +1,498 @@
+"""A measurement as `scarpsim gap` takes it: points, the surface as known, the instrument and what is believed about it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Discriminator, Tag
+
+from pipeline.change.areas import Area, in_areas
+from pipeline.formats.cameras.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras.cameras import read_cameras_yaml
+from pipeline.formats.measurements.checks import (
+    PointFit,
+    check_different,
+    check_frame,
+    check_inside,
+    check_near_rays,
+    check_pixels,
+    check_power,
+    check_pulses,
+    check_seen,
+    finite,
+)
+from pipeline.formats.measurements.config import MeasurementConfig, ScanPattern
+from pipeline.formats.measurements.reference_points import ReferencePoints
+from pipeline.formats.measurements.rounded_points import check_rounded_points
+from pipeline.formats.measurements.scanner_poses import Face, Pose, Scanned, ScannerPose, set_ups
+from pipeline.formats.measurements.surface_datum import told_datum
+from pipeline.formats.measurements.surface_fit import SurfaceFit, air_side, check_in_metres
+from pipeline.formats.measurements.surroundings import Surroundings
+from pipeline.formats.point_cloud import SCAN, PointCloud, joined
+from pipeline.formats.points.points import read_points
+from pipeline.registration.rigid import rotation_matrix
+from scene.common.config import Config, load_yaml, parse
+from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.geometry.point_planes import PointPlanes
+from scene.meshes.cleaning import weld
+from scene.meshes.winding import check_near, facing
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.imported import read_reference
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.effects.base import Sensor
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.signal_chain.surface_places import ShapedSurface
+
+FILE = "measurement.yaml"
+
+
+def _kind(values: Any) -> str:
+    return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
+
+
+class _ModelFile(Config):
+    sensor: Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_kind)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementBase(ABC):
+    """What was measured, with everything that predicts it; what a laser scan and a stereo pair have in common.
+
+    cloud: points in the wall frame; reference: wall frame; frame: the wall frame; stable_areas: outside of which the scene may
+    have changed, everywhere where there are none; notes: what should be said of the files.
+    """
+
+    sensor: ClassVar[Sensor]
+    cloud: PointCloud
+    reference: TriangleMesh
+    frame: WallFrame
+    model: TlsModel | StereoModel
+    stable_areas: tuple[Area, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def epochs(self) -> NDArray[np.int64]:
+        """(n,) the epoch of each point, from 0."""
+        return np.asarray(self.cloud.extra.get("epoch", np.zeros(len(self.cloud.points))), dtype=np.int64)
+
+    @property
+    def stable(self) -> NDArray[np.bool_]:
+        """(n,) points in the areas where nothing moved; all where none are given."""
+        x, y = self.cloud.points[:, :2].T
+        return in_areas(self.stable_areas, x, y) if self.stable_areas else np.ones(len(x), dtype=bool)
+
+    @cached_property
+    def scene(self) -> RayCaster:
+        return RayCaster(self.reference)
+
+    @property
+    @abstractmethod
+    def viewpoint(self) -> FloatArray:
+        """(3,) where the rays begin, wall frame, m: the scanner's centre, the left camera's."""
+
+    @property
+    def fit(self) -> PointFit:
+        """How the points lie against the reference."""
+        return PointFit.of(self.cloud.points, self.viewpoint, self.scene, self.sensor)
+
+    def check_near(self, where: str) -> None:
+        """Raise InputError where most points lie far from the reference, so that no pose or effect explains it."""
+        check_near_rays(self.fit, where)
+
+    def changed(self, **values: Any) -> Self:
+        """The same with other points, cameras or pose, in front of the same ray caster."""
+        other = replace(self, **values)
+        other.__dict__["scene"] = self.scene  # where cached_property keeps it
+        return other
+
+    def part(self, rows: NDArray[np.int64]) -> Self:
+        """Some of the points."""
+        return self.changed(cloud=self.cloud.part(rows))
+
+    def moved(self, pose: FloatArray) -> Self:
+        """The measurement with its sensor shifted (m) and turned (rad) by a pose (6,) in the wall frame, and its points with it.
+
+        What the sensor recorded stays as it is. A pair of cameras turns about the left one.
+        """
+        turn, centre = rotation_matrix(pose[3:]), self.viewpoint
+        points = (self.cloud.points - centre) @ turn.T + centre + pose[:3]
+        return self.changed(cloud=replace(self.cloud, points=points), **self._moved_sensor(turn, pose[:3]))
+
+    @abstractmethod
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        """The field that says where the sensor stands, with another value. turn: (3, 3), shift: (3,), wall frame, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TlsMeasurement(MeasurementBase):
+    """A laser scan, or epochs of it.
+
+    station: scanner to wall frame, of the first scan where there are several; face: in which it was scanned; scans: of several,
+    whose numbers are the points' channel `scan`, empty where there is one; pattern: the nominal directions, None where not known;
+    pulses: (m,) those of the pattern that the points are a part of, None for all of them; order: each point's scan line and share
+    of the scan's duration (n,), None where not known, once they were counted (see `with_order`); planes: through the
+    reference's vertices, to which rays are inclined, None where they are to its triangles; reference_error_m: standard deviation
+    of each vertex along the rays.
+    """
+
+    sensor = "tls"
+    model: TlsModel
+    station: Pose
+    face: Face = 1
+    scans: tuple[Scanned, ...] = ()
+    pattern: ScanPattern | None = None
+    pulses: NDArray[np.bool_] | None = None
+    order: tuple[FloatArray | None, FloatArray | None] | None = None
+    planes: PointPlanes | None = None
+    reference_error_m: float = 0.0
+
+    @property
+    def viewpoint(self) -> FloatArray:
+        return self.station[0]
+
+    @property
+    def scan_of(self) -> NDArray[np.int64]:
+        """(n,) number of each point's scan."""
+        return np.asarray(self.cloud.extra.get(SCAN, np.zeros(len(self.cloud.points))), dtype=np.int64)
+
+    def each_scan(self) -> Iterator[tuple[Scanned, NDArray[np.int64], Self]]:
+        """Of several scans each with its points' rows and its own measurement."""
+        for number, scan in enumerate(self.scans):
+            rows = np.flatnonzero(self.scan_of == number)
+            yield scan, rows, self.part(rows).changed(station=scan.pose, face=scan.face, scans=())
+
+    @property
+    def fit(self) -> PointFit:
+        several = self.each_scan()
+        fits = [PointFit.of(one.cloud.points, one.viewpoint, self.scene, self.sensor) for _, rows, one in several if len(rows)]
+        return min(fits, key=lambda each: (each.good, each.near)) if fits else super().fit
+
+    def moved(self, pose: FloatArray) -> Self:
+        """Of several scans each by the six values of its set-up: pose (6 k,)."""
+        if not self.scans:
+            return super().moved(pose)
+        points, scans = self.cloud.points.copy(), []
+        for scan, rows, one in self.each_scan():
+            there = one.moved(pose[6 * scan.set_up : 6 * scan.set_up + 6])
+            points[rows] = there.cloud.points
+            scans.append(replace(scan, pose=there.station))
+        return self.changed(cloud=replace(self.cloud, points=points), scans=tuple(scans), station=scans[0].pose)
+
+    def part(self, rows: NDArray[np.int64]) -> Self:
+        line, share = (None if values is None else values[rows] for values in self.order or (None, None))
+        return super().part(rows).changed(order=self.order and (line, share))
+
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        position, rotation = self.station
+        return {"station": (position + shift, turn @ rotation)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoMeasurement(MeasurementBase):
+    """A surface that a stereo pair gave.
+
+    cameras: the nominal calibration, world frame; shaped_px: (n,) what those of the model's effects that look at neighbouring
+    pixels add to each point's disparity, and surroundings: what lies about the places that the pixels see, each where that was
+    found once for cameras that stand about here, None where it was not.
+    """
+
+    sensor = "stereo"
+    model: StereoModel
+    cameras: CameraPair
+    shaped_px: FloatArray | None = None
+    surroundings: Surroundings | None = None
+
+    def part(self, rows: NDArray[np.int64]) -> Self:
+        shaped = None if self.shaped_px is None else self.shaped_px[rows]
+        return super().part(rows).changed(shaped_px=shaped, surroundings=self.surroundings and self.surroundings.part(rows))
+
+    @property
+    def viewpoint(self) -> FloatArray:
+        return self.frame.to_wall(self.cameras.left.position)
+
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        axes = self.frame.rotation
+        world, along = axes.T @ turn @ axes, axes.T @ shift
+        left = self.cameras.left.position
+
+        def each(camera: Camera) -> Camera:
+            return replace(camera, rotation=world @ camera.rotation, position=left + world @ (camera.position - left) + along)
+
+        return {"cameras": CameraPair(each(self.cameras.left), each(self.cameras.right))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceMeasurement(MeasurementBase):
+    """A surface out of photographs whose cameras are not known: points and nothing else, in a datum of shift, turn and scale.
+
+    Its points are noisy in metres along the normal of the reference.
+    """
+
+    sensor = "stereo"
+    model: StereoModel
+
+    @property
+    def centre(self) -> FloatArray:
+        """(3,) about which the cloud is turned and scaled, wall frame, m."""
+        return np.asarray(self.reference.bounds.mean(axis=0))
+
+    @property
+    def viewpoint(self) -> FloatArray:
+        """(3,) a place before the wall; nothing was seen from there."""
+        away = 2 * float(np.linalg.norm(np.ptp(self.reference.bounds, axis=0)))
+        return np.asarray(self.centre + np.array([0.0, 0.0, away]))
+
+    @cached_property
+    def shape(self) -> ShapedSurface:
+        """The reference with what its vertices' neighbourhoods tell."""
+        return ShapedSurface(self.reference)
+
+    @cached_property
+    def datum(self) -> FloatArray:
+        """(7, k) the parts of the cloud's datum that the reference tells, of shift, turn and stretch."""
+        vertices = np.arange(len(self.reference.vertices))
+        return told_datum(self.reference.vertices - self.centre, self.shape.normals(vertices))
+
+    @property
+    def surface_fit(self) -> SurfaceFit:
+        """How the points lie against the reference."""
+        return SurfaceFit.of(self.cloud.points, self.reference)
+
+    def check_near(self, where: str) -> None:
+        self.surface_fit.check(where)
+
+    def changed(self, **values: Any) -> Self:
+        other = super().changed(**values)
+        other.__dict__["shape"], other.__dict__["datum"] = self.shape, self.datum
+        return other
+
+    def moved(self, pose: FloatArray) -> Self:
+        """The points shifted (m), turned (rad) and stretched about the reference's middle by parts of the datum (k,)."""
+        whole = self.datum @ pose
+        turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
+        points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
+        return self.changed(cloud=replace(self.cloud, points=points))
+
+    def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
+        return {}
+
+
+Measurement = TlsMeasurement | StereoMeasurement | SurfaceMeasurement
+
+
+def read_model(path: Path) -> TlsModel | StereoModel:
+    """A file model.yaml. Raises InputError with the key that is wrong."""
+    return sensor_model(load_yaml(path), str(path))
+
+
+def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
+    """The sensor model that a mapping of keys describes; where: what errors call it."""
+    if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
+        raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo")
+    return parse(_ModelFile, {"sensor": values}, where).sensor
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a measurement is made of. reference: world frame; notes: on it; points: clouds by their files' names, an epoch each,
+    in the frame that the config says; cameras: world frame, of a pair that is known."""
+
+    reference: TriangleMesh
+    points: dict[str, PointCloud]
+    model: TlsModel | StereoModel
+    cameras: CameraPair | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_measurement(folder: Path) -> Measurement:
+    """Read a folder with measurement.yaml. Raises InputError that names the file and the key."""
+    path = folder / FILE if folder.is_dir() else folder
+    if not path.is_file():
+        raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
+    values = load_yaml(path)
+    config, base = parse(MeasurementConfig, values, str(path)), path.parent
+    model = read_model(base / config.model)
+    _check_sensor(config, model, str(path))
+    cameras = _cameras(config, base)
+    mesh, notes = read_reference(base / config.reference)
+    points = {str(base / name): read_points(base / name) for name in _files(config)}
+    notes = (*notes, *_mended(config, values))
+    return assembled(config, Material(mesh, points, model, cameras, notes), str(base / config.reference), str(path))
+
+
+def _mended(config: MeasurementConfig, values: Any) -> tuple[str, ...]:
+    """A word where the scanner's rotation is not the one that the file's `values` state."""
+    if config.scanner is None:
+        return ()
+    off = float(np.abs(np.array(config.scanner.rotation) - np.array(values["scanner"]["rotation"], dtype=float)).max())
+    return (f"the scanner's rotation has few digits and was made orthonormal, by up to {off:.1g}",) if off > 0 else ()
+
+
+def assembled(config: MeasurementConfig, material: Material, reference: str, where: str) -> Measurement:
+    """A measurement out of what is in memory; its paths are not read. reference, where: what errors call mesh and config.
+
+    Raises InputError for whatever does not fit together.
+    """
+    mesh, model, cameras = material.reference, material.model, material.cameras
+    _check_sensor(config, model, where)
+    viewpoints = _viewpoints(config, material, where)
+    check_near(mesh.vertices, viewpoints, reference)
+    frame = WallFrame.fit(mesh.vertices, np.mean([*viewpoints.values()], axis=0))
+    local = mesh.with_vertices(frame.to_wall(mesh.vertices))
+    local, words = facing(local, [frame.to_wall(position) for position in viewpoints.values()], reference)
+    clouds = [check_power(finite(cloud, name), name) for name, cloud in material.points.items()]
+    check_different(dict(zip(material.points, clouds, strict=True)))
+    if cameras is not None:
+        for name, each in zip(material.points, clouds, strict=True):
+            check_seen(cameras, each.points, name)
+            check_pixels(cameras.left, each, name)
+    said = [(reference, (*material.notes, words))]
+    for name, each in zip(material.points, clouds, strict=True):
+        said.append((name, _rounding(each.points, config, material, name)))
+    cloud = joined(clouds, SCAN if config.scanners else "epoch")
+    found = _of_sensor(
+        config,
+        material,
+        where,
+        cloud=_all_in_wall_frame(config, clouds, cloud, frame),
+        reference=local,
+        frame=frame,
+        stable_areas=config.stable_areas,
+        notes=(*config.notes, *(f"{Path(name).name}: {note}" for name, texts in said for note in texts if note)),
+    )
+    _check(found, cloud, config, where)
+    return found
+
+
+def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shared: Any) -> Measurement:
+    """A laser scan or a pair's surface. shared: the fields that both have."""
+    if isinstance(material.model, StereoModel):
+        if material.cameras is None:
+            check_in_metres(material.model, where)
+            return SurfaceMeasurement(model=material.model, **{**shared, "reference": weld(shared["reference"])[0]})
+        return StereoMeasurement(model=material.model, cameras=material.cameras, **shared)
+    pose, frame = _scanner_pose(config, where), shared["frame"]
+    scans = tuple(
+        Scanned(_to_wall(each, frame), each.face, number)
+        for each, number in zip(config.scanners, set_ups(config.scanners), strict=True)
+    )
+    station, vertices = _to_wall(pose, frame), shared["reference"].vertices
+    points = ReferencePoints.of(config, vertices, station[0], material.model.noise.range_sigma_m)
+    known: dict[str, Any] = {"planes": points.planes, "reference_error_m": points.error_m}
+    known["notes"] = (*shared.pop("notes"), *points.words)
+    return TlsMeasurement(model=material.model, station=station, scans=scans, pattern=config.pattern, **known, **shared)
+
+
+def _to_wall(pose: ScannerPose, frame: WallFrame) -> Pose:
+    return frame.to_wall(np.array(pose.position_m)), frame.rotation @ np.array(pose.rotation)
+
+
+def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
+    if config.scanners:
+        return config.scanners[0]
+    if config.scanner is None:
+        raise InputError("a TLS measurement needs `scanner`", where=where, remedy="give scanner: position_m and rotation")
+    return config.scanner
+
+
+def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, where: str) -> None:
+    if model.sensor != config.sensor:
+        raise InputError(f"model is of sensor {model.sensor}, the measurement of {config.sensor}", where=where)
+
+
+def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
+    """Raise InputError where the points (`cloud`: as read) fit neither pattern nor reference."""
+    if isinstance(found, SurfaceMeasurement):
+        found.check_near(where)
+        return
+    if config.pattern is not None:
+        check_pulses(config.pattern.azimuth_rad, config.pattern.zenith_rad, len(cloud.points), len(_files(config)), where)
+    here, other = found.fit, None
+    if not here.good and config.scanner is not None:
+        unsaid: Literal["scanner", "world"] = "world" if config.frame == "scanner" else "scanner"
+        other = found.changed(cloud=_in_wall_frame(cloud, unsaid, config.scanner, found.frame)).fit
+    check_frame(here, other, config.frame, where)
+    if config.pattern is not None and isinstance(found, TlsMeasurement):
+        position, rotation = found.station
+        local = np.einsum("ji,nj->ni", rotation, found.cloud.points - position)
+        check_inside(local, config.pattern.azimuth_rad, config.pattern.zenith_rad, where)
+
+
+def _files(config: MeasurementConfig) -> list[Path]:
+    return [config.points] if isinstance(config.points, Path) else config.points
+
+
+def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:
+    if config.sensor == "tls":
+        return None
+    if config.cameras is None:
+        return None
+    return nominal_pair(base / config.cameras)
+
+
+def nominal_pair(file: Path) -> CameraPair:
+    """The cameras of a file, world frame: cameras.yaml, or another one with two oriented cameras."""
+    found = read_oriented(file)
+    return read_cameras_yaml(file) if found is None else stereo_pair(found, None, None, str(file))
+
+
+def _viewpoints(config: MeasurementConfig, material: Material, where: str) -> dict[str, FloatArray]:
+    """Where the sensors stand, by name, world frame; of a cloud without cameras a place before the reference."""
+    cameras = material.cameras
+    if cameras is not None:
+        return {"left camera": cameras.left.position, "right camera": cameras.right.position}
+    if config.sensor == "stereo":
+        return {"the side that the reference shows": air_side(material.reference)}
+    scanners = {f"scanner {number}": np.array(each.position_m) for number, each in enumerate(config.scanners, start=1)}
+    return scanners or {"scanner": np.array(_scanner_pose(config, where).position_m)}
+
+
+def _rounding(points: FloatArray, config: MeasurementConfig, material: Material, where: str) -> tuple[str, ...]:
+    """What to say of the rounding of a file's points (n, 3), against the noise along the lines of sight."""
+    points = points[np.isfinite(points).all(axis=1)]
+    model, cameras = material.model, material.cameras
+    if not len(points):
+        return ()
+    if isinstance(model, StereoModel) and cameras is None:
+        spread = float(np.sqrt(model.noise.of_points.variance([None])[0]))
+        return check_rounded_points(points, air_side(material.reference), spread, where) if spread else ()
+    if isinstance(model, TlsModel) or cameras is None:
+        viewpoint = np.zeros(3) if config.frame == "scanner" else np.array(_scanner_pose(config, where).position_m)
+        noise = model.noise.range_sigma_m if isinstance(model, TlsModel) else np.inf
+        return check_rounded_points(points, viewpoint, noise, where)
+    left, right = cameras.left, cameras.right
+    depth = float(np.median((points - left.position) @ left.rotation[:, 2]))
+    disparity = np.hypot(model.noise.parallax_sigma_px, model.noise.regularization_sigma_px)
+    base = float(np.linalg.norm(right.position - left.position))
+    noise = depth**2 / (left.f_px * base) * disparity  # of Z = f B / d
+    return check_rounded_points(points, left.position, float(noise), where)
+
+
+def _all_in_wall_frame(config: MeasurementConfig, clouds: list[PointCloud], joined: PointCloud, frame: WallFrame) -> PointCloud:
+    """The joined cloud, of which each scan may be in a frame of its own."""
+    if not config.scanners:
+        return _in_wall_frame(joined, config.frame, config.scanner, frame)
+    parts = [_in_wall_frame(cloud, config.frame, pose, frame) for cloud, pose in zip(clouds, config.scanners, strict=True)]
+    return replace(joined, points=np.concatenate([part.points for part in parts]))
+
+
+def _in_wall_frame(
+    cloud: PointCloud, of: Literal["scanner", "world"], scanner: ScannerPose | None, frame: WallFrame
+) -> PointCloud:
+    points = cloud.points
+    if of == "scanner" and scanner is not None:
+        turn = frame.rotation @ np.array(scanner.rotation)
+        points = np.einsum("ij,nj->ni", turn, points) + frame.to_wall(np.array(scanner.position_m))
+    else:
+        points = frame.to_wall(points)
+    intensity = None if cloud.intensity is None else np.asarray(cloud.intensity, dtype=np.float64)
+    return PointCloud(points, intensity, cloud.gps_time, cloud.extra)

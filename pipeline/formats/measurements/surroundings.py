@@ -1,0 +1,37 @@
+"""What the reference is like about the places that the pixels of a stereo pair see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.geometry.mesh import FloatArray
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Of n pixels. point: (n, 3) the place that each sees, wall frame, m, NaN where that is not known; edge_px: (n,) departure of
+    the reference from its tangent plane there within some pixels, px of disparity; hidden: (n,) whether the right camera does not
+    see it."""
+
+    point: FloatArray
+    edge_px: FloatArray
+    hidden: NDArray[np.bool_]
+
+    @classmethod
+    def nowhere(cls, count: int) -> Surroundings:
+        """Of pixels that are not known to see anything."""
+        return cls(np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, dtype=bool))
+
+    def part(self, rows: Any) -> Surroundings:
+        """Those of some of the pixels, a mask or indices."""
+        return Surroundings(self.point[rows], self.edge_px[rows], self.hidden[rows])
+
+    def changed(self, rows: NDArray[np.int64], other: Surroundings) -> Surroundings:
+        """With others at some of the pixels."""
+        found = Surroundings(self.point.copy(), self.edge_px.copy(), self.hidden.copy())
+        found.point[rows], found.edge_px[rows], found.hidden[rows] = other.point, other.edge_px, other.hidden
+        return found

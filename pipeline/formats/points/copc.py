@@ -1,0 +1,180 @@
+"""COPC: LAZ whose chunks are the nodes of an octree, so that a viewer fetches only what it shows (copc.io, version 1.0)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import laspy
+import lazrs  # type: ignore[import-untyped]
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.files.atomic import writing
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.laz import LazHeader, PulseChannels, StoredCloud
+from scene.common.errors import InputError
+
+SUFFIX = ".copc.laz"
+_PLAIN, _USUAL = PulseChannels(), LazHeader()
+_CELLS_LOG2 = 7
+"""A node's cube is divided into 128^3 cells, of each of which it takes one point."""
+_WHOLE = 4**_CELLS_LOG2
+"""Points of which a node takes all: as many as a flat wall has cells, so that no tiny chunks arise."""
+_FINEST = 20
+"""Level of the finest cells, whose three numbers fit 60 bits."""
+_DEEPEST = _FINEST - _CELLS_LOG2
+_SPREAD = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that move the bits of a number two places apart (Morton 1966)."""
+_BATCH = 1_000_000
+_USER, _INFO, _HIERARCHY = "copc", 1, 1000
+_INFO_BYTES, _PAD = 160, 88
+_NODE = np.dtype([("key", "<i4", 4), ("offset", "<u8"), ("bytes", "<i4"), ("points", "<i4")])
+
+
+@dataclass(frozen=True)
+class Octree:
+    """low: (3,) and side: the root cube, in the coordinates' steps; keys: (m, 4) level, x, y, z of the nodes; counts: (m,)
+    points of each; order: (n,) the points node by node, within a node as they were given."""
+
+    low: NDArray[np.int64]
+    side: int
+    keys: NDArray[np.int32]
+    counts: NDArray[np.int64]
+    order: NDArray[np.int64]
+
+
+def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
+    """Write a point cloud as `write_laz` does, in the order of an octree; equal arguments give equal bytes.
+
+    Level k holds a point for each cell of side / (128 * 2^k), beside those of the levels above it; a node with at most 16,384
+    points left holds all of them. Raises InputError for a cloud without points, and where the file cannot be written.
+    """
+    if not len(cloud.points):
+        raise InputError("has no points to write", where=str(path), remedy="write LAZ")
+    stored = StoredCloud.of(cloud, pulses, header)
+    tree = octree(stored.steps())
+    with writing(path) as temporary, temporary.open("w+b") as file:
+        _write(file, stored, tree)
+
+
+def octree(steps: NDArray[np.integer]) -> Octree:
+    """The octree of points at integer coordinates (n, 3)."""
+    low = steps.min(axis=0).astype(np.int64)
+    from_low = steps - low
+    side = max(int(from_low.max()), 1)
+    finest = np.minimum((from_low << _FINEST) // side, 2**_FINEST - 1)
+    curve = _morton(finest)
+    left = np.argsort(curve, kind="stable")
+    keys, sizes, order = [], [], []
+    for level in range(_DEEPEST + 1):
+        taken = _taken(curve[left], level)
+        rows = left[taken]
+        starts = _starts(_at_level(curve[rows], level))
+        sizes.append(np.diff(starts, append=len(rows)))
+        keys.append(np.column_stack([np.full(len(starts), level), finest[rows[starts]] >> (_FINEST - level)]))
+        order += [np.sort(part) for part in np.split(rows, starts[1:])]
+        left = left[~taken]
+        if not len(left):
+            break
+    return Octree(low, side, np.concatenate(keys).astype(np.int32), np.concatenate(sizes), np.concatenate(order))
+
+
+def _taken(curve: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
+    """(n,) whether a level takes the point, of those left in the curve's order: the first of each cell, or all of its node."""
+    if level == _DEEPEST:
+        return np.ones(len(curve), dtype=bool)
+    starts = _starts(_at_level(curve, level))
+    size = np.diff(starts, append=len(curve))
+    taken = np.repeat(size <= _WHOLE, size)
+    taken[_starts(_at_level(curve, level + _CELLS_LOG2))] = True
+    return taken
+
+
+def _starts(values: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Where runs of equal values begin."""
+    return np.flatnonzero(np.diff(values, prepend=-1))
+
+
+def _at_level(curve: NDArray[np.int64], level: int) -> NDArray[np.int64]:
+    """The cubes of a level, numbered along the curve."""
+    return curve >> 3 * (_FINEST - level)
+
+
+def _morton(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n,) the places of cells (n, 3) on the Z-order curve: the bits of x, y, z by turns."""
+    curve = np.zeros(len(cells), dtype=np.int64)
+    for axis in range(3):
+        spread = cells[:, axis]
+        for shift, mask in _SPREAD:
+            spread = (spread | spread << shift) & mask
+        curve |= spread << (2 - axis)
+    return curve
+
+
+def _write(file: BinaryIO, stored: StoredCloud, tree: Octree) -> None:
+    las = stored.header
+    packer = lazrs.LazVlr.new_for_compression(las.point_format.id, las.point_format.num_extra_bytes, True)
+    las.vlrs.insert(0, laspy.VLR(_USER, _INFO, "COPC info VLR", bytes(_INFO_BYTES)))
+    las.vlrs.insert(1, laspy.vlrs.known.LasZipVlr(packer.record_data()))
+    las.are_points_compressed = True
+    las.partial_reset()
+    las.write_to(file)
+    compressor = lazrs.ParLasZipCompressor(file, packer)
+    for records, sizes in _batches(stored, tree):
+        las.grow(records)
+        compressor.compress_chunks(_chunks(records.array, sizes))
+    compressor.done()
+    las.start_of_first_evlr, las.number_of_evlrs = file.seek(0, 2), 1
+    nodes = _nodes(file, las, packer, tree)
+    file.seek(las.start_of_first_evlr)
+    file.write(struct.pack("<H16sHQ32s", 0, _USER.encode(), _HIERARCHY, nodes.nbytes, b"COPC hierarchy"))
+    las.vlrs[0].record_data = _info(las, tree, file.tell(), nodes.nbytes, stored.cloud.gps_time)
+    file.write(nodes.tobytes())
+    file.seek(0)
+    las.write_to(file, ensure_same_size=True)
+
+
+def _batches(stored: StoredCloud, tree: Octree) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.int64]]]:
+    """The points of whole nodes, about a million at a time, and how many of them each node has."""
+    ends = np.cumsum(tree.counts)
+    start = 0
+    while start < len(ends):
+        before = ends[start] - tree.counts[start]
+        stop = max(int(np.searchsorted(ends, before + _BATCH, side="right")), start + 1)
+        yield stored.records(tree.order[before : ends[stop - 1]]), tree.counts[start:stop]
+        start = stop
+
+
+def _chunks(array: NDArray[Any], sizes: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
+    """The bytes of consecutive rows, by their numbers."""
+    return [np.frombuffer(part, np.uint8) for part in np.split(array, np.cumsum(sizes)[:-1])]
+
+
+def _nodes(file: BinaryIO, las: laspy.LasHeader, packer: Any, tree: Octree) -> NDArray[np.void]:
+    """The hierarchy's entries: nodes with the places of their chunks, which the file's table of chunks knows."""
+    file.seek(las.offset_to_point_data)
+    table = np.array(lazrs.read_chunk_table(file, packer))[: len(tree.counts)]
+    nodes = np.empty(len(tree.counts), dtype=_NODE)
+    nodes["key"], nodes["points"], nodes["bytes"] = tree.keys, tree.counts, table[:, 1]
+    nodes["offset"] = las.offset_to_point_data + 8 + np.cumsum(table[:, 1]) - table[:, 1]
+    return nodes
+
+
+def _info(las: laspy.LasHeader, tree: Octree, place: int, size: int, time: NDArray[np.floating] | None) -> bytes:
+    """The info record: root cube, spacing of its points, place of the hierarchy, first and last time."""
+    scale = float(las.scales[0])
+    half = 0.5 * tree.side * scale
+    centre = tree.low * scale + las.offsets + half
+    first, last = (0.0, 0.0) if time is None else (float(np.min(time)), float(np.max(time)))
+    spacing = 2 * half / 2**_CELLS_LOG2
+    return struct.pack("<5d2Q2d", *centre, half, spacing, place, size, first, last) + bytes(_PAD)

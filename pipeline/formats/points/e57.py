@@ -1,0 +1,251 @@
+"""E57 point clouds (ASTM E2807): scans with their grid and pose, through libE57Format (pye57).
+
+Read are Cartesian and spherical scans; written are Cartesian ones in double precision, the points in the scanner's frame and the
+pose beside them. What E57 has no field for (channels of truth) is not written.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pye57 import libe57
+
+from pipeline.formats.files.atomic import writing
+from pipeline.formats.point_cloud import PointCloud
+from scene.common.errors import InputError
+from scene.common.regular_file import check_file
+from scene.geometry.mesh import FloatArray
+
+_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+_TYPES = {
+    "intensity": "f", "timeStamp": "d", "rowIndex": "q", "columnIndex": "q", "returnIndex": "q", "returnCount": "q",
+    "colorRed": "H", "colorGreen": "H", "colorBlue": "H",
+}  # fmt: skip
+_NAMES = {
+    "rowIndex": "row", "columnIndex": "column", "returnIndex": "return_index", "returnCount": "return_count",
+    "colorRed": "red", "colorGreen": "green", "colorBlue": "blue",
+}  # fmt: skip
+"""E57's fields that become extra channels, and the channels' names."""
+_PIECE = 1_000_000
+"""Points in memory at a time while reading, beside those that are read."""
+_GUIDS = uuid.UUID("7f5c9a52-9f0e-4f3c-9c2b-2f1f5e6f7c11")
+
+
+@dataclass(frozen=True)
+class E57Scan:
+    """One scan of a file. cloud: points in the scanner's frame, m; row and column of the scan's grid are extra channels.
+
+    position: (3,) m and rotation: (3, 3), scanner to the file's frame.
+    """
+
+    name: str
+    cloud: PointCloud
+    position: FloatArray
+    rotation: FloatArray
+
+    @property
+    def placed(self) -> PointCloud:
+        """The cloud in the file's frame."""
+        points = np.einsum("ij,nj->ni", self.rotation, self.cloud.points) + self.position
+        return PointCloud(points, self.cloud.intensity, self.cloud.gps_time, self.cloud.extra)
+
+
+def write_e57(path: Path, scans: Sequence[E57Scan]) -> None:
+    """Write scans; extra channels `row` and `column` (integers from 0) become the scan's grid, others are left out.
+
+    Equal arguments give equal bytes. Raises InputError where the file cannot be written, ValueError for a scan without points.
+    """
+    with writing(path) as temporary:
+        image = libe57.ImageFile(str(temporary), "w")
+        try:
+            data = _write_header(image)
+            for number, scan in enumerate(scans):
+                _write_scan(image, data, scan, number)
+        finally:
+            image.close()
+
+
+def read_e57(path: Path) -> list[E57Scan]:
+    """Read all scans; points that their scan marks as invalid are left out.
+
+    Raises InputError for a missing or damaged file and one without points.
+    """
+    check_file(path)
+    try:
+        image = libe57.ImageFile(str(path), "r")
+        try:
+            nodes = image.root()["data3D"]
+            scans = [_read_scan(image, nodes[number], number) for number in range(len(nodes))]
+        finally:
+            image.close()
+    except (libe57.E57Exception, RuntimeError, ValueError, KeyError) as error:
+        problem = " ".join(str(error).split())[:200]
+        raise InputError(f"is not a whole E57 file ({problem})", where=str(path), remedy="export it again") from None
+    if not any(len(scan.cloud.points) for scan in scans):
+        raise InputError("holds no points", where=str(path))
+    return scans
+
+
+# --- reading
+
+
+def _read_scan(image: Any, node: Any, number: int) -> E57Scan:
+    columns = _read_columns(image, node["points"])
+    valid = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
+    for name in _INVALID:
+        valid &= columns.pop(name) == 0 if name in columns else True
+    if not valid.all():
+        columns = {name: column[valid] for name, column in columns.items()}
+    points = _points(columns)
+    cloud = PointCloud(
+        points=points,
+        intensity=columns.get("intensity"),
+        gps_time=columns.get("timeStamp"),
+        extra={label: columns[name].astype(np.int32) for name, label in _NAMES.items() if name in columns},
+    )
+    position, rotation = _pose(node)
+    return E57Scan(node["name"].value() if node.isDefined("name") else f"scan {number}", cloud, position, rotation)
+
+
+def _read_columns(image: Any, points: Any) -> dict[str, NDArray[Any]]:
+    """The fields of a scan's points, read in pieces: memory is taken for what is there, not for what is said to be."""
+    count = points.childCount()
+    prototype = libe57.StructureNode(points.prototype())
+    fields = {prototype[number].elementName() for number in range(prototype.childCount())}
+    types = dict.fromkeys(_CARTESIAN + _SPHERICAL, "d") | dict.fromkeys(_INVALID, "b") | _TYPES
+    piece = min(count, _PIECE)
+    columns = {name: np.empty(piece, dtype=kind) for name, kind in types.items() if name in fields}
+    if count <= 0:
+        return columns
+    pieces: list[dict[str, NDArray[Any]]] = []
+    reader = points.reader(_buffers(image, columns, piece))
+    while read := reader.read():
+        pieces.append({name: column[:read].copy() for name, column in columns.items()})
+    reader.close()
+    found = sum(len(next(iter(each.values()), ())) for each in pieces)
+    if found != count:
+        raise ValueError(f"{found:,} points, where it says {count:,}")
+    return {name: np.concatenate([each[name] for each in pieces]) for name in columns}
+
+
+def _points(columns: dict[str, NDArray[Any]]) -> FloatArray:
+    """(n, 3) Cartesian points, m; spherical ones have an elevation above the horizon, not a zenith angle."""
+    if all(name in columns for name in _CARTESIAN):
+        return np.stack([columns[name] for name in _CARTESIAN], axis=1)
+    if not all(name in columns for name in _SPHERICAL):
+        raise ValueError("points without coordinates")
+    distance, azimuth, elevation = (columns[name] for name in _SPHERICAL)
+    level = distance * np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+
+
+def _pose(node: Any) -> tuple[FloatArray, FloatArray]:
+    from scipy.spatial.transform import Rotation
+
+    if not node.isDefined("pose"):
+        return np.zeros(3), np.eye(3)
+    pose = node["pose"]
+    position, rotation = np.zeros(3), np.eye(3)
+    if pose.isDefined("translation"):
+        position = np.array([pose["translation"][axis].value() for axis in "xyz"])
+    if pose.isDefined("rotation"):
+        rotation = Rotation.from_quat([pose["rotation"][axis].value() for axis in "xyzw"]).as_matrix()
+    return position, rotation
+
+
+# --- writing
+
+
+def _write_header(image: Any) -> Any:
+    """The file's own fields; returns the list of scans."""
+    image.extensionsAdd("", libe57.E57_V1_0_URI)
+    root = image.root()
+    root.set("formatName", libe57.StringNode(image, "ASTM E57 3D Imaging Data File"))
+    root.set("guid", libe57.StringNode(image, f"{{{uuid.uuid5(_GUIDS, 'file')}}}"))
+    root.set("versionMajor", libe57.IntegerNode(image, libe57.E57_FORMAT_MAJOR))
+    root.set("versionMinor", libe57.IntegerNode(image, libe57.E57_FORMAT_MINOR))
+    root.set("e57LibraryVersion", libe57.StringNode(image, libe57.E57_LIBRARY_ID))
+    root.set("coordinateMetadata", libe57.StringNode(image, ""))
+    data = libe57.VectorNode(image, True)
+    root.set("data3D", data)
+    root.set("images2D", libe57.VectorNode(image, True))
+    return data
+
+
+def _write_scan(image: Any, data: Any, scan: E57Scan, number: int) -> None:
+    from scipy.spatial.transform import Rotation
+
+    columns = _columns(scan.cloud)
+    node = libe57.StructureNode(image)
+    node.set("guid", libe57.StringNode(image, f"{{{uuid.uuid5(_GUIDS, f'{number} {scan.name}')}}}"))
+    node.set("name", libe57.StringNode(image, scan.name))
+    x, y, z, w = Rotation.from_matrix(scan.rotation).as_quat(canonical=True)
+    pose = _structure(image, rotation=_structure(image, w=w, x=x, y=y, z=z), translation=_structure(image, **_xyz(scan.position)))
+    node.set("pose", pose)
+    node.set("cartesianBounds", _bounds(image, {axis: columns[f"cartesian{axis.upper()}"] for axis in "xyz"}))
+    indices = {name.removesuffix("Index"): columns[name] for name in ("rowIndex", "columnIndex") if name in columns}
+    if indices:
+        node.set("indexBounds", _bounds(image, indices))
+    if "intensity" in columns:
+        node.set("intensityLimits", _bounds(image, {"intensity": columns["intensity"]}))
+    prototype = libe57.StructureNode(image)
+    for name, column in columns.items():
+        prototype.set(name, _field(image, column))
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    node.set("points", points)
+    data.append(node)
+    writer = points.writer(_buffers(image, columns, len(scan.cloud.points)))
+    writer.write(len(scan.cloud.points))
+    writer.close()
+
+
+def _columns(cloud: PointCloud) -> dict[str, NDArray[Any]]:
+    """The fields of the file in the types that libE57 takes."""
+    if not len(cloud.points):
+        raise ValueError("a scan without points cannot be written")
+    present: dict[str, Any] = dict(zip(_CARTESIAN, cloud.points.T, strict=True))
+    present |= {"intensity": cloud.intensity, "timeStamp": cloud.gps_time}
+    present |= {name: cloud.extra.get(label) for name, label in _NAMES.items() if label in ("row", "column")}
+    return {
+        name: np.ascontiguousarray(column, dtype=_TYPES.get(name, "d")) for name, column in present.items() if column is not None
+    }
+
+
+def _field(image: Any, column: NDArray[Any]) -> Any:
+    low, high = column.min().item(), column.max().item()
+    if column.dtype.kind == "f":
+        return libe57.FloatNode(image, low, libe57.E57_SINGLE if column.itemsize == 4 else libe57.E57_DOUBLE, low, high)
+    return libe57.IntegerNode(image, low, low, high)
+
+
+def _bounds(image: Any, columns: dict[str, NDArray[Any]]) -> Any:
+    limits = {f"{name}{end}": value for name, c in columns.items() for end, value in (("Minimum", c.min()), ("Maximum", c.max()))}
+    return _structure(image, **{name: value.item() for name, value in limits.items()})
+
+
+def _structure(image: Any, **values: Any) -> Any:
+    node = libe57.StructureNode(image)
+    for name, value in values.items():
+        kind = libe57.IntegerNode if isinstance(value, int) else libe57.FloatNode
+        node.set(name, kind(image, value) if isinstance(value, int | float) else value)
+    return node
+
+
+def _xyz(vector: FloatArray) -> dict[str, float]:
+    return {axis: float(value) for axis, value in zip("xyz", vector, strict=True)}
+
+
+def _buffers(image: Any, columns: dict[str, NDArray[Any]], count: int) -> Any:
+    """The columns as buffers to read into or write from; a buffer does not keep its column alive."""
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, column in columns.items():
+        buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
+    return buffers

@@ -1,0 +1,270 @@
+"""LAS and LAZ point clouds: LAS 1.4, point format 6, compressed by lazrs."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import laspy
+import numpy as np
+from lazrs import LazrsError  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+
+from pipeline.formats.files.atomic import writing
+from pipeline.formats.point_cloud import PointCloud
+from scene.common.errors import InputError
+from scene.common.regular_file import check_file
+from scene.geometry.mesh import FloatArray
+
+_CHUNK = 1_000_000
+"""Points in memory at a time while writing; a multiple of the 50,000 of a LAZ chunk."""
+_COUNTS = 65535
+_LARGEST = 2**31 - 1
+_USER, _FULL_SCALE_RECORD = "scarpsim", 1
+_MOST_RETURNS = 15
+_SCAN_ANGLE_STEP = math.radians(0.006)
+EXACT_INTENSITY = "intensity_relative"
+"""An extra dimension of this name is read as the intensity, in place of the 16-bit field."""
+
+
+_HEADER_BYTES = 375
+_CHUNK_SIZE_AT, _LARGEST_CHUNK, _VARIABLE_CHUNKS = 12, 10_000_000, 2**32 - 1
+"""Of a LAZ file: place of the chunks' size in LASzip's record, the largest that is believed, points, and what stands for any."""
+
+
+@dataclass(frozen=True)
+class PulseChannels:
+    """What LAS has places of its own for, beside intensity and time.
+
+    return_number, number_of_returns: (n,), 1 to 15, none: 1 of 1; scan_angle_rad: (n,) angle of the emitted direction from
+    straight down, as LAS has it (for a scanner pi - zenith).
+    """
+
+    return_number: NDArray[np.integer] | None = None
+    number_of_returns: NDArray[np.integer] | None = None
+    scan_angle_rad: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class LazHeader:
+    """scale_m: coordinates are stored as int32 multiples of it; date: of the file; wkt: of the coordinate system, where it is
+    known."""
+
+    scale_m: float = 1e-6
+    date: datetime.date = datetime.date(2000, 1, 1)
+    wkt: str = ""
+
+
+_PLAIN, _USUAL = PulseChannels(), LazHeader()
+
+
+@dataclass(frozen=True)
+class StoredCloud:
+    """A cloud as LAS stores it: the header with its records, as yet of no points, and the fields of the points by name."""
+
+    header: laspy.LasHeader
+    cloud: PointCloud
+    fields: Mapping[str, NDArray[Any]]
+    full_scale: float
+
+    @classmethod
+    def of(cls, cloud: PointCloud, pulses: PulseChannels, header: LazHeader) -> StoredCloud:
+        """As `write_laz` writes it. Raises ValueError for points that are not finite, and for return numbers unknown to LAS."""
+        fields = {"bit_fields": _return_bits(pulses.return_number, pulses.number_of_returns), "gps_time": cloud.gps_time}
+        if pulses.scan_angle_rad is not None:
+            fields["scan_angle"] = np.rint(pulses.scan_angle_rad / _SCAN_ANGLE_STEP)
+        full_scale = _full_scale(cloud.intensity)
+        las = _header(cloud, header, full_scale)
+        present = {name: values for name, values in fields.items() if values is not None}
+        return cls(las, cloud, present | dict(cloud.extra), full_scale)
+
+    def steps(self) -> NDArray[np.int64]:
+        """(n, 3) the coordinates as they are stored: in steps of the header's scale from its offset."""
+        return np.rint((self.cloud.points - self.header.offsets) / self.header.scales).astype(np.int64)
+
+    def records(self, rows: slice | NDArray[np.integer]) -> laspy.ScaleAwarePointRecord:
+        """The points in these rows."""
+        places, intensity = self.cloud.points[rows], self.cloud.intensity
+        record = laspy.ScaleAwarePointRecord.zeros(len(places), header=self.header)
+        _fill(record.array, self.header, places)
+        for name, values in self.fields.items():
+            record.array[name] = values if values.ndim == 0 else values[rows]
+        if intensity is not None:
+            record.array["intensity"] = np.rint(intensity[rows] * (_COUNTS / self.full_scale))
+        return record
+
+
+def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
+    """Write a point cloud as LAZ, or as LAS where `path` ends in .las; equal arguments give equal bytes.
+
+    cloud: finite points; its intensity, at least 0, is stored in 16 bits (see `_full_scale`), its extra channels as extra
+    dimensions in the type they have; scan angles are stored in steps of 0.006 degrees. Coordinates count from an offset in whole
+    metres at the middle of the cloud; a cloud wider than 4295 m takes the next power of ten of the scale. Raises InputError where
+    the file cannot be written.
+    """
+    stored = StoredCloud.of(cloud, pulses, header)
+    with writing(path) as temporary, temporary.open("wb") as file, _writer(file, stored.header, path.suffix != ".las") as writer:
+        for start in range(0, len(cloud.points), _CHUNK):
+            writer.write_points(stored.records(slice(start, start + _CHUNK)))
+
+
+def read_laz(path: Path) -> PointCloud:
+    """Read a LAS or LAZ file of any version.
+
+    Intensity is relative received power: of files of ours on the scale they hold, of others as counts / 65535. Intensity and
+    GPS time that are zero throughout count as not recorded. Where there are several returns of a pulse, or scan angles, the extra
+    channels `return_number` and `number_of_returns`, or `scan_angle_rad` (from straight down), hold them. Raises InputError for a
+    missing, truncated or foreign file.
+    """
+    check_file(path)
+    try:
+        _check_extent(path)
+        las = laspy.read(path)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
+    except (laspy.LaspyException, LazrsError, ValueError, struct.error, MemoryError, OverflowError) as error:
+        raise InputError(f"is not a whole LAS or LAZ file ({_line(error)})", where=str(path), remedy="export it again") from None
+    if len(las.points) < las.header.point_count:
+        problem = f"holds {len(las.points):,} of the {las.header.point_count:,} points it announces"
+        raise InputError(problem, where=str(path), remedy="export it again")
+    _check_quantisation(las.header, path)
+    extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names} | _standard_channels(las)
+    counts = las.points.array["intensity"]
+    intensity = counts.astype(np.float32) * np.float32(_stored_full_scale(las.header) / _COUNTS) if counts.any() else None
+    timed = "gps_time" in las.point_format.dimension_names and np.any(las.points.array["gps_time"])
+    return PointCloud(
+        points=np.ascontiguousarray(las.xyz),
+        intensity=extra.pop(EXACT_INTENSITY, intensity),
+        gps_time=np.array(las.points.array["gps_time"]) if timed else None,
+        extra=extra,
+    )
+
+
+def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
+    """Raise InputError for scales and offsets that make no coordinates out of the file's integers."""
+    scales, offsets = np.asarray(header.scales), np.asarray(header.offsets)
+    if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
+        problem = f"has scale factors {scales.tolist()} and offsets {offsets.tolist()}"
+        raise InputError(problem, where=str(path), allowed="finite ones, scales above 0", remedy="export it again")
+
+
+def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
+    """Returns and scan angles, where any were recorded; point formats below 6 hold angles in degrees."""
+    channels = {}
+    count = np.asarray(las["number_of_returns"], dtype=np.uint8)
+    if np.any(count > 1):
+        channels = {"return_number": np.asarray(las["return_number"], dtype=np.uint8), "number_of_returns": count}
+    name, step = ("scan_angle", _SCAN_ANGLE_STEP) if las.point_format.id >= 6 else ("scan_angle_rank", math.radians(1.0))
+    angle = np.asarray(las[name])
+    return channels | ({"scan_angle_rad": angle * step} if np.any(angle) else {})
+
+
+def _check_extent(path: Path) -> None:
+    """Raise ValueError for a file cut off in its header, or whose table of LAZ chunks is absurd (lazrs would abort on it)."""
+    with path.open("rb") as file:
+        _check_records(file.read(_HEADER_BYTES), path.stat().st_size)
+        file.seek(0)
+        header = laspy.LasHeader.read_from(file)
+        if path.stat().st_size < header.offset_to_point_data:
+            raise ValueError("cut off within the header")
+        if not header.are_points_compressed:
+            return
+        _check_chunk_size(header)
+        file.seek(header.offset_to_point_data)
+        (table,) = struct.unpack("<q", file.read(8))
+        if table < 0:  # written as a stream: the place of the table stands at the end
+            file.seek(-8, os.SEEK_END)
+            (table,) = struct.unpack("<q", file.read(8))
+        file.seek(table + 4)
+        (chunks,) = struct.unpack("<I", file.read(4))
+        if chunks > header.point_count:
+            raise ValueError(f"{chunks:,} chunks for {header.point_count:,} points")
+
+
+def _check_records(start: bytes, size: int) -> None:
+    """Raise ValueError for more variable-length records than the file has room for: laspy would look for each of them."""
+    (count,) = struct.unpack_from("<I", start, 100)
+    (extended,) = struct.unpack_from("<I", start, 243) if start[25] >= 4 and len(start) == _HEADER_BYTES else (0,)
+    if 54 * count + 60 * extended > size:
+        raise ValueError(f"{count + extended:,} records in {size:,} bytes")
+
+
+def _check_chunk_size(header: laspy.LasHeader) -> None:
+    """Raise ValueError for chunks far larger than any program makes: lazrs takes the memory of a whole one, or aborts."""
+    for record in header.vlrs.get("LasZipVlr"):
+        (size,) = struct.unpack_from("<I", record.record_data, _CHUNK_SIZE_AT)
+        if max(header.point_count, _LARGEST_CHUNK) < size < _VARIABLE_CHUNKS:
+            raise ValueError(f"chunks of {size:,} points for {header.point_count:,} points")
+
+
+def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.LasHeader:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.generating_software, header.system_identifier, header.creation_date = "scarpsim", "scarpsim", given.date
+    header.global_encoding.wkt = True  # point formats 6 and up know no other form of coordinate system
+    header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in cloud.extra.items()])
+    for record in header.vlrs.get("ExtraBytesVlr"):
+        for dimension in record.extra_bytes_structs:  # no extremes: laspy takes the first point of each piece for them
+            dimension.options &= ~(dimension.MIN_BIT_MASK | dimension.MAX_BIT_MASK)
+    header.scales, header.offsets = _quantisation(cloud.points, given.scale_m)
+    if given.wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(given.wkt))
+    if cloud.intensity is not None:
+        header.vlrs.append(laspy.VLR(_USER, _FULL_SCALE_RECORD, "intensity of 65535 counts", struct.pack("<d", full_scale)))
+    return header
+
+
+def _writer(file: BinaryIO, header: laspy.LasHeader, compress: bool) -> laspy.LasWriter:
+    """The parallel back end gives the same bytes as the serial one, whatever the number of threads."""
+    return laspy.LasWriter(file, header, do_compress=compress, laz_backend=laspy.LazBackend.LazrsParallel, closefd=False)
+
+
+def _quantisation(points: FloatArray, scale_m: float) -> tuple[FloatArray, FloatArray]:
+    """(3,) scales and (3,) offsets, m, with which the coordinates fit int32."""
+    if len(points) == 0:
+        return np.full(3, scale_m), np.zeros(3)
+    low, high = (np.array([extreme(column) for column in points.T]) for extreme in (np.min, np.max))
+    if not np.isfinite(low + high).all():
+        raise ValueError("points must be finite: leave out those without a return")
+    offsets = np.rint((low + high) / 2)
+    reach = float(np.maximum(high - offsets, offsets - low).max())
+    while reach / scale_m > _LARGEST:
+        scale_m *= 10
+    return np.full(3, scale_m), offsets
+
+
+def _fill(record: NDArray[np.void], header: laspy.LasHeader, points: FloatArray) -> None:
+    for name, coordinate, offset, scale in zip("XYZ", points.T, header.offsets, header.scales, strict=True):
+        counts = coordinate - offset
+        counts /= scale
+        record[name] = np.rint(counts, out=counts)
+
+
+def _return_bits(number: NDArray[np.integer] | None, count: NDArray[np.integer] | None) -> NDArray[np.uint8]:
+    """Return number and number of returns in the two half-bytes of point format 6, (n,) or one for all points."""
+    first, last = (np.asarray(1 if given is None else given) for given in (number, count))
+    if first.size and (first.min() < 1 or np.any(first > last) or last.max() > _MOST_RETURNS):
+        raise ValueError(f"return numbers run from 1 to the number of returns, at most {_MOST_RETURNS}")
+    return (first + last * (_MOST_RETURNS + 1)).astype(np.uint8)
+
+
+def _full_scale(intensity: NDArray[np.floating] | None) -> float:
+    """The power that is stored as 65535 counts: the smallest power of two that no point exceeds."""
+    brightest = float(np.max(intensity)) if intensity is not None and len(intensity) else 1.0
+    return float(2.0 ** np.ceil(np.log2(brightest))) if brightest > 0 else 1.0
+
+
+def _stored_full_scale(header: laspy.LasHeader) -> float:
+    for record in header.vlrs:
+        if record.user_id == _USER and record.record_id == _FULL_SCALE_RECORD:
+            return float(struct.unpack("<d", record.record_data)[0])
+    return 1.0
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

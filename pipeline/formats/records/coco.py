@@ -1,0 +1,229 @@
+"""COCO's JSON, annotations and detections: the one reader of all commands that take such files.
+
+What it gives is checked and complete: each image, annotation and detection is COCO's entry with all its keys, also those of other
+programs, its `segmentation` in compressed run lengths, and `bbox`, `area` and `iscrowd` filled in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pycocotools import mask as coco_mask
+from pydantic import ConfigDict, Field
+
+from pipeline.formats.files.plain_json import without_nan
+from pipeline.formats.rasters.geotiff import most_pixels
+from pipeline.formats.records.coco_masks import BEYOND_PX, FORMS, run_lengths
+from scene.common.config import Config, parse
+from scene.common.errors import InputError
+from scene.common.regular_file import read_json
+
+_REMEDY = "give the folder of a split, such as my_set/train, of a run, or a COCO file"
+Id = Annotated[int, Field(ge=0, lt=2**63)]
+Entry = dict[str, Any]
+
+
+class _Entry(Config):
+    """COCO lets entries have keys of anyone's own."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class _Category(_Entry):
+    id: Id
+
+
+class _NamedImage(_Entry):
+    id: Id
+    file_name: str = Field(min_length=1)
+
+
+class _Image(_NamedImage):
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+
+
+class _Annotation(_Entry):
+    id: Id
+    image_id: Id
+    category_id: Id
+    bbox: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+    area: float | None = Field(None, ge=0)
+    iscrowd: Literal[0, 1] = 0
+    segmentation: Any = None
+
+
+class _Detection(_Annotation):
+    id: Id | None = None  # type: ignore[assignment]  # COCO's results have none
+    score: float = Field(ge=0, le=1)
+
+
+EntryT = TypeVar("EntryT", bound=_Entry)
+
+
+@dataclass(frozen=True)
+class Coco:
+    """A data set as COCO holds it, checked; in the order of the file."""
+
+    images: list[Entry]
+    annotations: list[Entry]
+    categories: list[Entry]
+
+    def to_dict(self) -> dict[str, list[Entry]]:
+        """As pycocotools takes it."""
+        return {"images": self.images, "annotations": self.annotations, "categories": self.categories}
+
+
+def read_coco(path: Path, *, masks: bool = True) -> Coco:
+    """Read COCO annotations. masks: without one an annotation is wrong; else it needs a mask or a box.
+
+    Raises InputError, naming the annotation, for wrong types and numbers, ids that are there twice or belong to nothing, images
+    of more than `most_pixels`, boxes and polygons outside their image, and run lengths that are not its image's.
+    """
+    content = read_json(path, remedy=_REMEDY)
+    if not isinstance(content, Mapping):
+        raise _no_coco(path, "it is no mapping")
+    for name in ("images", "annotations", "categories"):
+        if not isinstance(content.get(name), list):
+            raise _no_coco(path, f"'{name}' is {'no list' if name in content else 'missing'}")
+    if not content["images"]:
+        raise InputError("names no image", where=str(path), remedy="give the annotations of the maps that are meant")
+    images = [entry for entry, _ in _parsed(_Image, content["images"], "image", path)]
+    for image in images:
+        _check_pixels(image, path)
+    _unique(images, "file_name", "image", path)
+    categories = [entry for entry, _ in _parsed(_Category, content["categories"], "category", path)]
+    reader = _Masks({image["id"]: image for image in images}, {each["id"] for each in categories}, masks)
+    annotations = _parsed(_Annotation, content["annotations"], "annotation", path)
+    return Coco(images, [reader.complete(entry, where) for entry, where in annotations], categories)
+
+
+def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entry]:
+    """Read COCO detections in the images of `truth`, whose image ids they get.
+
+    Detections that list their images are joined by file name, others (pycocotools' plain list) by image id. Raises InputError as
+    `read_coco` does, and for scores that are no numbers from 0 to 1, and images that the truth does not have.
+    """
+    content = read_json(path, remedy=_REMEDY)
+    entries = content.get("annotations") if isinstance(content, Mapping) else content
+    if not isinstance(entries, list):
+        raise InputError("is no list of COCO detections", where=str(path), remedy="give a detections.json of scarpsim detect")
+    if any(isinstance(entry, Mapping) and "score" not in entry for entry in entries):
+        raise InputError("has annotations without a score", where=str(path), remedy="give detections, not the truth")
+    ids = {image["id"]: image["id"] for image in truth.images}
+    if isinstance(content, Mapping):
+        known = {image["file_name"]: image["id"] for image in truth.images}
+        listed = content.get("images")
+        if not isinstance(listed, list):
+            raise _no_coco(path, f"'images' is {'no list' if 'images' in content else 'missing'}")
+        named = [entry for entry, _ in _parsed(_NamedImage, listed, "image", path)]
+        _unique(named, "file_name", "image", path)
+        ids = {image["id"]: known[image["file_name"]] for image in named if image["file_name"] in known}
+    found = list(_parsed(_Detection, entries, "detection", path))
+    strange = {entry["image_id"] for entry, _ in found} - set(ids)
+    if strange:
+        problem = f"has detections in {len(strange)} images that the truth does not have, such as id {min(strange)}"
+        raise InputError(problem, where=str(path), remedy="compare with the annotations of the same maps")
+    reader = _Masks({image["id"]: image for image in truth.images}, {each["id"] for each in truth.categories}, masks)
+    return [reader.complete({**entry, "image_id": ids[entry["image_id"]]}, where) for entry, where in found]
+
+
+@dataclass(frozen=True)
+class _Masks:
+    """Completes entries. images: by id; categories: ids that are known; needed: an entry without a mask is wrong."""
+
+    images: Mapping[int, Entry]
+    categories: set[int]
+    needed: bool
+
+    def complete(self, entry: Entry, where: str) -> Entry:
+        """The entry with its mask in run lengths, its box and the mask's area, px; the box's where there is no mask."""
+        image = self.images.get(entry["image_id"])
+        if image is None:
+            allowed = f"the id of one of the {len(self.images)} images"
+            raise InputError(
+                f"is of image {entry['image_id']}, which is not there", where=where, allowed=allowed, remedy="leave it out"
+            )
+        if entry["category_id"] not in self.categories:
+            problem = f"its category {entry['category_id']} is not listed"
+            allowed = ", ".join(map(str, sorted(self.categories)[:20])) or "none, as the list is empty"
+            raise InputError(problem, where=where, allowed=allowed, remedy="list it, or give the category that is meant")
+        height, width = image["height"], image["width"]
+        box, segmentation = entry.get("bbox"), entry.get("segmentation")
+        if box is not None:
+            _check_box(box, height, width, where)
+        if segmentation is None and box is not None and not self.needed:
+            return {"iscrowd": 0, **entry, "area": box[2] * box[3]}
+        if segmentation is None:
+            allowed = FORMS if self.needed else f"a bbox, or a segmentation of {FORMS}"
+            raise InputError("has no mask", where=where, allowed=allowed, remedy="draw its mask, or leave it out")
+        mask = run_lengths(segmentation, height, width, where)
+        box = coco_mask.toBbox(mask).tolist() if box is None else box
+        return {"iscrowd": 0, **entry, "segmentation": mask, "bbox": box, "area": int(coco_mask.area(mask))}
+
+
+def _no_coco(path: Path, problem: str) -> InputError:
+    allowed = "lists of images, annotations and categories"
+    return InputError(f"is no COCO annotation file ({problem})", where=str(path), allowed=allowed, remedy="make it again")
+
+
+def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) -> Iterable[tuple[Entry, str]]:
+    """Each entry, of the right types and with an id of its own, and what it is called in a message.
+
+    NaN and infinity in keys that are not COCO's become null: they have no place in what is written.
+    """
+    seen: set[int] = set()
+    for number, entry in enumerate(entries):
+        own = entry.get("id") if isinstance(entry, Mapping) else None
+        where = f"{path}: {kind} {own}" if isinstance(own, int) and own < 2**63 else f"{path}: {kind} {number} of the list"
+        if not isinstance(entry, Mapping):
+            allowed = f"a mapping with {', '.join(name for name, field in model.model_fields.items() if field.is_required())}"
+            raise InputError(f"is of the type {type(entry).__name__}", where=where, allowed=allowed, remedy="make the file again")
+        try:
+            parse(model, entry, where)
+        except InputError as error:
+            raise InputError(error.what, where=where, allowed=_allowed(model), remedy="mend it, or leave it out") from None
+        if own in seen:
+            raise InputError("its id is there twice", where=where, allowed="one of its own", remedy="number them anew")
+        if own is not None:
+            seen.add(own)
+        others = {key: without_nan(value) for key, value in entry.items() if key not in model.model_fields}
+        yield {**entry, **others}, where
+
+
+def _allowed(model: type[_Entry]) -> str:
+    """What the fields of an entry may be, in words."""
+    if issubclass(model, _Annotation):
+        score = ", a score from 0 to 1" if issubclass(model, _Detection) else ""
+        return f"whole numbers as ids, a bbox of 4 finite numbers{score}"
+    if issubclass(model, _NamedImage):
+        return "a whole number as id, a file_name, width and height in px"
+    return "a whole number as id"
+
+
+def _unique(entries: Sequence[Entry], key: str, kind: str, path: Path) -> None:
+    seen: set[Any] = set()
+    for entry in entries:
+        if entry[key] in seen:
+            where = f"{path}: {kind} {entry['id']}"
+            raise InputError(f"its {key} '{entry[key]}' is there twice", where=where, remedy="leave one of the two out")
+        seen.add(entry[key])
+
+
+def _check_pixels(image: Entry, path: Path) -> None:
+    height, width = image["height"], image["width"]
+    if height * width > (most := most_pixels()):
+        allowed = f"at most {most:,} px"
+        where = f"{path}: image {image['id']}"
+        raise InputError(f"has {height} x {width} px", where=where, allowed=allowed, remedy="cut it into tiles")
+
+
+def _check_box(box: Sequence[float], height: int, width: int, where: str) -> None:
+    x, y, across, down = box
+    inside = min(x, y) >= -BEYOND_PX and x + across <= width + BEYOND_PX and y + down <= height + BEYOND_PX
+    if min(across, down) < 0 or not inside:
+        allowed = f"x, y, width, height inside the image of {width} x {height} px"
+        raise InputError(f"its bbox is {list(box)}", where=where, allowed=allowed, remedy="give the corner, then the lengths")

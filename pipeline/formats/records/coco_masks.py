@@ -1,0 +1,110 @@
+"""Masks as COCO writes them, polygons or run lengths, read as compressed run lengths.
+
+All is checked before pycocotools' C code sees it, which reads and writes past its memory where run lengths do not fit the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+
+from scene.common.errors import InputError
+
+FORMS = "polygons [[x, y, x, y, x, y, ...], ...] or run lengths {size, counts}"
+BEYOND_PX = 1.0
+"""What points and boxes may lie outside their image, px: some programs count the last pixel's far edge from one."""
+_LONGEST_NUMBER = 7
+"""Characters, of 5 bits each, of a run length."""
+
+
+def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[str, Any]:
+    """The mask of an image (height, width), px, as {size, counts}, with `counts` as pycocotools compresses them.
+
+    Raises InputError, with `where` at its front, for what is no mask of that image.
+    """
+    if isinstance(segmentation, Mapping):
+        return _checked(segmentation, height, width, where)
+    if not isinstance(segmentation, Sequence) or isinstance(segmentation, str):
+        raise InputError(f"its segmentation is {_kind(segmentation)}", where=where, allowed=FORMS, remedy="draw the mask again")
+    return _of_polygons(segmentation, height, width, where)
+
+
+def _of_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -> dict[str, Any]:
+    if not polygons:
+        raise InputError("its segmentation has no polygon", where=where, allowed=FORMS, remedy="leave the annotation out")
+    remedy = "draw the outline again, in pixels from the image's top-left corner"
+    for number, polygon in enumerate(polygons, start=1):
+        points = _numbers(polygon)
+        if points is None or points.size < 6 or points.size % 2 or not np.isfinite(points).all():
+            allowed = "x, y, x, y, ... of at least 3 points, finite numbers"
+            raise InputError(f"polygon {number} of its segmentation is none", where=where, allowed=allowed, remedy=remedy)
+        beyond = points.reshape(-1, 2) - (width, height)
+        if points.min() < -BEYOND_PX or beyond.max() > BEYOND_PX:
+            allowed = f"x from 0 to {width}, y from 0 to {height}"
+            problem = f"polygon {number} of its segmentation goes beyond the image"
+            raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
+    merged = coco_mask.merge(coco_mask.frPyObjects([list(map(float, polygon)) for polygon in polygons], height, width))
+    return {"size": [height, width], "counts": merged["counts"].decode("ascii")}
+
+
+def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: str) -> dict[str, Any]:
+    size, counts = segmentation.get("size"), segmentation.get("counts")
+    if size != [height, width]:
+        allowed = f"[{height}, {width}], the image's height and width"
+        remedy = "give the masks and the images of one data set"
+        raise InputError(f"the size of its run lengths is {_kind(size)}", where=where, allowed=allowed, remedy=remedy)
+    lengths = _decompressed(counts) if isinstance(counts, str) else _plain(counts)
+    if lengths is None or (lengths < 0).any() or lengths.sum() != height * width:
+        allowed = f"run lengths, plain or as pycocotools compresses them, of {height * width} pixels in all"
+        raise InputError("its run lengths cannot be decoded", where=where, allowed=allowed, remedy="encode the mask again")
+    plain = {"size": [height, width], "counts": lengths.tolist()}
+    counts = counts if isinstance(counts, str) else coco_mask.frPyObjects(plain, height, width)["counts"].decode("ascii")
+    return {"size": [height, width], "counts": counts}
+
+
+def _decompressed(counts: str) -> NDArray[np.int64] | None:
+    """The run lengths behind pycocotools' string, None where it is none.
+
+    Characters hold 5 bits each, the lowest first, and a sixth that says that the number goes on; the fifth of the last is the
+    sign. From the fourth number on they are differences to the last but one (`rleFrString` of pycocotools' maskApi.c).
+    """
+    codes = np.frombuffer(counts.encode("utf-8"), np.uint8).astype(np.int64) - 48
+    if not codes.size or codes.min() < 0 or codes.max() > 63 or codes[-1] & 32:
+        return None
+    ends = np.flatnonzero(codes & 32 == 0)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    characters = ends - starts + 1
+    if characters.max() > _LONGEST_NUMBER:
+        return None
+    place = np.arange(codes.size) - np.repeat(starts, characters)
+    numbers = np.add.reduceat((codes & 31) << (5 * place), starts)
+    numbers -= np.where(codes[ends] & 16, 1 << (5 * characters), 0)
+    numbers[1::2] = np.cumsum(numbers[1::2])
+    numbers[2::2] = np.cumsum(numbers[2::2])
+    return numbers
+
+
+def _plain(counts: Any) -> NDArray[np.int64] | None:
+    values = _numbers(counts)
+    return values.astype(np.int64) if values is not None and values.dtype.kind == "i" else None
+
+
+def _numbers(values: Any) -> NDArray[Any] | None:
+    """A list of numbers as an array (n,), None where it is none."""
+    if not isinstance(values, list) or not all(isinstance(value, int | float) for value in values):
+        return None
+    try:
+        array = np.array(values)
+    except (ValueError, OverflowError):
+        return None
+    return array if array.dtype.kind in "if" else None
+
+
+def _kind(value: Any) -> str:
+    """A value as a message shows it."""
+    text = "missing" if value is None else repr(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."

@@ -1,0 +1,165 @@
+"""run.json and gap.json as commands read them: of the right types, as far as they are used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+
+from scene.common.config import parse
+from scene.common.regular_file import read_json
+
+RUN_FILE, GAP_FILE = "run.json", "gap.json"
+_FARTHEST_M, _FEW_DIGITS = 1e8, 1e-6
+"""No coordinate system of a survey reaches farther; and how far a rotation may be from orthonormal."""
+_Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+_Box = Annotated[list[_Coordinate], Field(min_length=6, max_length=6)]
+_Vector = Annotated[list[_Coordinate], Field(min_length=3, max_length=3)]
+
+
+class _Record(BaseModel):
+    """Part of a file that holds more."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True)
+
+
+def _orthonormal(rotation: list[list[float]]) -> list[list[float]]:
+    rows = np.array(rotation)
+    if np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS or np.linalg.det(rows) < 0:
+        raise ValueError("is no rotation matrix")
+    return rotation
+
+
+_Rotation = Annotated[list[_Vector], Field(min_length=3, max_length=3), AfterValidator(_orthonormal)]
+_Row = Annotated[list[_Coordinate], Field(min_length=4, max_length=4)]
+
+
+class _Registration(_Record):
+    rotation: _Rotation
+    translation_m: _Vector
+    rms_m: float | None = None
+
+
+class _Differences(_Record):
+    """None: of no pixel."""
+
+    count: int
+    median_m: float | None
+    nmad_m: float | None
+
+
+class _Statistics(_Record):
+    sigma_m: float = Field(gt=0, le=_FARTHEST_M)
+    outside_blocks: _Differences | None = None
+
+
+class _Block(_Record):
+    label: int
+    shape: str
+    size_m: _Vector
+    volume_m3: float
+    bbox_m: _Box
+    position_m: _Vector
+    world_position_m: _Vector | None = None
+    measured_area_m2: float
+    measured_volume_m3: float
+    measured_mean_depth_m: float | None
+
+
+class _WallFrame(_Record):
+    matrix_world_to_wall: Annotated[list[_Row], Field(min_length=4, max_length=4)]
+    rotation: _Rotation
+    origin_m: _Vector
+
+
+class _EpochRecord(_Record):
+    epoch: int = Field(ge=0, le=9999)
+    points: int = Field(0, ge=0)
+    registration: _Registration | None = None
+    statistics: _Statistics | None = None
+    blocks: list[_Block] = []
+
+
+class _Wall(_Record):
+    name: str
+
+
+class _Products(_Record):
+    crs: str | None = None
+
+
+class _Config(_Record):
+    products: _Products | None = None
+
+
+class _RunRecord(_Record):
+    """schema: of the file; products: checksums of each finished epoch's files."""
+
+    sensor: Literal["stereo", "tls"]
+    config: _Config
+    wall: _Wall | None = None
+    wall_frame: _WallFrame | None = None
+    epochs: list[_EpochRecord] = Field([], max_length=10_000)
+    products: dict[Annotated[str, StringConstraints(pattern=r"^epoch_\d+$")], dict[str, str]] = {}
+
+
+class _RunImage(_Record):
+    id: int
+    epoch: int
+
+
+class _RunAnnotation(_Record):
+    image_id: int
+    block: int
+
+
+class _RunAnnotations(_Record):
+    images: list[_RunImage]
+    annotations: list[_RunAnnotation]
+
+
+class _Change(_Record):
+    bbox_m: _Box
+    volume_m3: float
+
+
+class _Effect(_Record):
+    name: str
+
+
+class _Gap(_Record):
+    sensor: Literal["stereo", "tls"]
+    verdict: str
+    scene_changes: list[_Change] = Field([], max_length=10_000)
+    effects: list[_Effect] = Field([], max_length=100)
+
+
+def read_run(path: Path, remedy: str) -> dict[str, Any]:
+    """The record of a run, finished or not; an epoch without a list of blocks has none, and what is null is not there.
+
+    Raises InputError, which ends with `remedy`, for a file that is none.
+    """
+    values = read_json(path, remedy=remedy)
+    parse(_RunRecord, values, str(path))
+    epochs = [{"blocks": [], **_without_null(each, "statistics")} for each in values.get("epochs", [])]
+    return {**_without_null(values, "wall", "wall_frame"), "epochs": epochs}
+
+
+def read_annotations(path: Path) -> dict[str, Any]:
+    """annotations.json of a run, whose images know their epoch and annotations their block; raises InputError for others."""
+    values = read_json(path, remedy="make the run again")
+    parse(_RunAnnotations, values, str(path))
+    return dict(values)
+
+
+def _without_null(values: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key not in names or value is not None}
+
+
+def read_gap(path: Path) -> dict[str, Any]:
+    """The record of a diagnosis; raises InputError for a file that is none."""
+    values = read_json(path, remedy="run scarpsim gap again")
+    parse(_Gap, values, str(path))
+    return dict(values)

@@ -1,0 +1,324 @@
+"""Blocks that fall from a wall: primitives made irregular by three transformers in cascade, then placed on the relief."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Discriminator, Field, Tag
+
+from scene.blocks.distributions import Distribution, Gaussian
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.walls.contour import highest_under, highest_vertex_under, median_under
+from scene.walls.safe_zone import SafeZone, safe_zone
+
+_BATCH = 16
+"""Positions tried at a time."""
+
+_LEAST_DEPTH = 0.1
+"""How far a block must reach into the rock, as a fraction of its height along z; one that does not is placed anew."""
+
+_RADIAL_LIMITS = (0.3, 3.0)
+"""Bounds of a vertex's radial factor: positive, so that the block stays star-shaped and never cuts itself."""
+
+
+def _per_axis(value: Any) -> str:
+    return "per axis" if isinstance(value, list | tuple) else "all axes"
+
+
+AxisDistributions = Annotated[
+    Annotated[Distribution, Tag("all axes")] | Annotated[tuple[Distribution, Distribution, Distribution], Tag("per axis")],
+    Discriminator(_per_axis),
+]
+"""One distribution from which each axis draws its own value, or a list of three, one per axis (x, y, z)."""
+
+
+MOST_BLOCKS = 20_000
+"""Of an epoch; placing them takes some twenty seconds, carving minutes."""
+
+
+class RockfallConfig(Config):
+    """How many blocks fall, how they look and where they may lie."""
+
+    count: int = Field(40, ge=1, le=MOST_BLOCKS, description="number of blocks")
+    shape: Literal["cube", "sphere", "mixed"] = Field("mixed", description="primitive; mixed draws one for each block")
+    size_m: AxisDistributions = Field(
+        Gaussian(mean=0.4, sigma=0.1, minimum=0.15), description="lengths of a block's three axes; a list gives each axis its own"
+    )
+    rotation_rad: AxisDistributions = Field(
+        Gaussian(mean=0.0, sigma=0.5), description="rotations about x, then y, then z; a list gives each axis its own"
+    )
+    irregularity: Distribution = Field(
+        Gaussian(mean=0.0, sigma=0.04), description="radial offset of each vertex, as a fraction of its distance from the centre"
+    )
+    subdivisions: int = Field(
+        2, ge=0, le=4, description="fineness: a sphere has 20 * 4^n triangles (2: 320), a cube about as many"
+    )
+    placement: Literal["relief", "highest_vertex", "mean_surface"] = Field(
+        "relief",
+        description="a block's centre lies at the highest relief within its contour, at the highest of the wall's vertices "
+        "there, which lies lower on a coarser mesh, or on the median surface, which makes niches about twice as deep",
+    )
+    safe_zone_offset_m: float = Field(0.5, ge=0, description="distance that blocks keep from the wall's border and its holes")
+    minimum_distance_m: float = Field(0.1, ge=0, description="distance between the bounding boxes of two blocks, in x or in y")
+    maximum_attempts: int = Field(2000, ge=1, description="positions tried for a block before giving up")
+
+
+_HEIGHTS = {"relief": highest_under, "highest_vertex": highest_vertex_under, "mean_surface": median_under}
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """k closed blocks in the wall frame, packed one after the other; the block of index i has the label i + 1.
+
+    vertices: (n, 3), m; faces: (m, 3) int32 into them, outside counter-clockwise; vertex_start, face_start: (k + 1,) int32,
+    where each block's vertices and faces begin; shape: k names; size_m: (k, 3) lengths of the axes before rotation;
+    position_m: (k, 3) the centres.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    vertex_start: IntArray
+    face_start: IntArray
+    shape: tuple[str, ...]
+    size_m: FloatArray
+    position_m: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.shape)
+
+    @cached_property
+    def bbox(self) -> FloatArray:
+        """(k, 2, 3) smallest and largest coordinates of each block, wall frame, m."""
+        low = np.minimum.reduceat(self.vertices, self.vertex_start[:-1], axis=0)
+        return np.stack([low, np.maximum.reduceat(self.vertices, self.vertex_start[:-1], axis=0)], axis=1)
+
+    @cached_property
+    def face_label(self) -> IntArray:
+        """(m,) the label, 1 .. k, of each face's block."""
+        return np.repeat(np.arange(1, len(self) + 1, dtype=np.int32), np.diff(self.face_start))
+
+    def mesh(self, index: int) -> TriangleMesh:
+        """The block of this index (0 .. k - 1) alone."""
+        vertices = slice(self.vertex_start[index], self.vertex_start[index + 1])
+        faces = self.faces[self.face_start[index] : self.face_start[index + 1]] - self.vertex_start[index]
+        return TriangleMesh(self.vertices[vertices], faces)
+
+    def only(self, index: int) -> Blocks:
+        """The block of this index as the only one."""
+        mesh, one = self.mesh(index), slice(index, index + 1)
+        vertex_start, face_start = (np.array([0, len(array)], dtype=np.int32) for array in (mesh.vertices, mesh.faces))
+        placed = self.shape[one], self.size_m[one], self.position_m[one]
+        return Blocks(mesh.vertices, mesh.faces, vertex_start, face_start, *placed)
+
+
+@dataclass(frozen=True)
+class _Solid:
+    """A block around the origin, before placement: its middle height is 0."""
+
+    shape: str
+    size_m: FloatArray
+    vertices: FloatArray
+    faces: IntArray
+
+    @cached_property
+    def bbox(self) -> FloatArray:
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom, caster: RayCaster | None = None) -> Blocks:
+    """Draw `config.count` blocks and place them on the wall.
+
+    mesh: the wall, wall frame; random: each block draws from its own child, so that the outcome depends on nothing else;
+    caster: of this mesh, where one exists already. A block keeps its shape and is tried at positions drawn uniformly from the
+    safe zone until its bounding box lies in the zone and far enough from the others'; large blocks come first, so that
+    small ones do not take their room. Its height follows the thesis, 3.3, with the sign mended: the middle of its z range
+    lies at the largest z of the wall within its contour (`placement: relief`), of the wall's vertices alone (`highest_vertex`),
+    or at the median z there (`mean_surface`). Where it would then not reach into the rock it is placed anew.
+    Raises InputError where blocks are larger than the wall or find no room.
+    """
+    caster = caster or RayCaster(mesh)
+    with np.errstate(over="ignore", invalid="ignore"):  # of sizes that are no block's, which is said next
+        solids = [_shaped(config, random.child("block", index)) for index in range(config.count)]
+    _require_fit(solids, mesh)
+    zone = safe_zone(caster, config.safe_zone_offset_m)
+    search = _Placing(config, zone, solids, random)
+    surface_under = _HEIGHTS[config.placement]
+    position = np.zeros((len(solids), 3))
+    area = np.array([np.ptp(solid.bbox[:, :2], axis=0).prod() for solid in solids])
+    _require_room(area, zone)
+    pending = np.argsort(-area, kind="stable")
+    while len(pending):
+        for index in pending:
+            position[index, :2] = search.place(int(index))
+        outlines = [solids[index].vertices[:, :2] + position[index, :2] for index in pending]
+        position[pending, 2] = surface_under(caster, outlines)
+        pending = pending[~_reach_rock([solids[index] for index in pending], position[pending], caster)]
+        search.take_back(pending)
+    return _packed(solids, position)
+
+
+def given_blocks(position_m: FloatArray, size_m: FloatArray, rotation_rad: FloatArray, shape: str, subdivisions: int) -> Blocks:
+    """Regular blocks at given places, wall frame. position_m, size_m, rotation_rad (about x, then y, then z): (k, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    unit, faces = _primitive(shape, subdivisions)
+    found = [
+        _Solid(shape, size, Rotation.from_euler("xyz", turn).apply(unit * size), faces)
+        for size, turn in zip(size_m, rotation_rad, strict=True)
+    ]
+    return _packed(found, position_m)
+
+
+class _Placing:
+    """Rejection sampling of positions. boxes: (k, 2, 2) what is placed so far in x and y, NaN where not."""
+
+    def __init__(self, config: RockfallConfig, zone: SafeZone, solids: Sequence[_Solid], random: KeyedRandom) -> None:
+        self._config, self._zone, self._solids = config, zone, solids
+        self._generators = [random.child("block", index, "position").generator() for index in range(len(solids))]
+        self._attempts = np.zeros(len(solids), dtype=int)
+        self._hung = np.zeros(len(solids), dtype=int)
+        self.boxes = np.full((len(solids), 2, 2), np.nan)
+
+    def place(self, index: int) -> FloatArray:
+        """(2,) the next admissible position of a block, m."""
+        shape = self._solids[index].bbox[:, :2]
+        while self._attempts[index] < self._config.maximum_attempts:
+            self._attempts[index] += _BATCH
+            positions = self._zone.sample(self._generators[index], _BATCH)
+            boxes = positions[:, None] + shape
+            for good in np.flatnonzero(self._zone.holds(boxes)):
+                if self._is_apart(boxes[good]):
+                    self.boxes[index] = boxes[good]
+                    return positions[good]
+        raise self._no_room(index)
+
+    def _is_apart(self, box: FloatArray) -> bool:
+        gap = np.maximum(box[0] - self.boxes[:, 1], self.boxes[:, 0] - box[1])  # in x and in y
+        apart = np.maximum(gap[:, 0], gap[:, 1])
+        return not np.any((apart < self._config.minimum_distance_m) | (apart <= 0))
+
+    def take_back(self, indices: NDArray[np.intp]) -> None:
+        """Free the room of blocks that do not reach into the rock where they were placed."""
+        self.boxes[indices] = np.nan
+        self._hung[indices] += 1
+
+    def _no_room(self, index: int) -> InputError:
+        placed, (width, height) = int(np.isfinite(self.boxes[:, 0, 0]).sum()), np.ptp(self._solids[index].bbox[:, :2], axis=0)
+        steep = f" ({self._hung[index]} times it would have hung in front of a steep wall)" if self._hung[index] else ""
+        return InputError(
+            f"no room for a block of {width:.2f} x {height:.2f} m in {self._config.maximum_attempts} attempts{steep}, "
+            f"{placed} of {len(self._solids)} blocks are placed",
+            where="rockfall",
+            remedy="lower count, size_m, minimum_distance_m or safe_zone_offset_m, or raise maximum_attempts",
+        )
+
+
+def _require_room(area: FloatArray, zone: SafeZone) -> None:
+    """Bounding boxes do not overlap and lie in the safe zone, so that their sum cannot exceed its area."""
+    room = zone.free.sum() * zone.grid.gsd**2
+    if area.sum() > room:
+        raise InputError(
+            f"{len(area)} blocks take {area.sum():,.0f} m2, the safe zone of the wall has {room:,.0f} m2",
+            where="rockfall",
+            remedy="lower count, size_m or safe_zone_offset_m",
+        )
+
+
+def _shaped(config: RockfallConfig, random: KeyedRandom) -> _Solid:
+    """The cascade: a primitive of unit size, scaled along its axes, rotated, then moved radially vertex by vertex."""
+    from scipy.spatial.transform import Rotation
+
+    generator = random.child("shape").generator()
+    shape = ("cube", "sphere")[generator.integers(2)] if config.shape == "mixed" else config.shape
+    size = _drawn(config.size_m, generator)
+    if not size.min() > 0:
+        raise InputError(f"drew a length of {size.min():.3g} m", where="size_m", allowed="above 0", remedy="give it a minimum")
+    unit, faces = _primitive(shape, config.subdivisions)
+    vertices = Rotation.from_euler("xyz", _drawn(config.rotation_rad, generator)).apply(unit * size)
+    factor = np.clip(1 + config.irregularity.sample(generator, len(vertices)), *_RADIAL_LIMITS)
+    vertices = vertices * factor[:, None]
+    vertices[:, 2] -= (vertices[:, 2].max() + vertices[:, 2].min()) / 2
+    return _Solid(shape, size, vertices, faces)
+
+
+def _drawn(distributions: AxisDistributions, generator: np.random.Generator) -> FloatArray:
+    axes = distributions if isinstance(distributions, tuple) else (distributions,) * 3
+    return np.concatenate([axis.sample(generator, 1) for axis in axes])
+
+
+@lru_cache
+def _primitive(shape: str, subdivisions: int) -> tuple[FloatArray, IntArray]:
+    """Vertices and faces of a sphere or cube of diameter or side 1 around the origin."""
+    import trimesh
+
+    if shape == "sphere":
+        mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.5)
+        return np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int32)
+    return _cube(round(np.sqrt(20 / 12 * 4**subdivisions)))
+
+
+def _cube(segments: int) -> tuple[FloatArray, IntArray]:
+    """A cube of side 1 around the origin, each side cut into segments x segments squares of two triangles."""
+    steps = np.arange(segments + 1)
+    quads = []
+    for axis in range(3):
+        for side in (0, segments):
+            first, second = np.meshgrid(steps, steps, indexing="ij")
+            grid = np.empty((segments + 1, segments + 1, 3), dtype=int)
+            grid[..., axis], grid[..., (axis + 1) % 3], grid[..., (axis + 2) % 3] = side, first, second
+            squares = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
+            quads.append(squares if side else squares[:, ::-1])
+    corners, number = np.unique(np.concatenate(quads).reshape(-1, 3), axis=0, return_inverse=True)
+    quad = number.reshape(-1, 4)
+    faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]).astype(np.int32)
+    return corners / segments - 0.5, faces
+
+
+def _require_fit(solids: Sequence[_Solid], mesh: TriangleMesh) -> None:
+    """Raise where a block's bounding box is larger than the wall's."""
+    wall = np.ptp(mesh.bounds[:, :2], axis=0)
+    extents = np.array([np.ptp(solid.bbox[:, :2], axis=0) for solid in solids])
+    too_large = np.any(extents >= wall, axis=1)
+    if too_large.any():
+        width, height = extents[too_large].max(axis=0)
+        raise InputError(
+            f"{too_large.sum()} of {len(solids)} blocks are larger than the wall (up to {width:.3g} x {height:.3g} m)",
+            where="size_m",
+            allowed=f"below {wall[0]:.3g} x {wall[1]:.3g} m",
+            remedy="give sizes in metres or lower them",
+        )
+
+
+def _reach_rock(solids: Sequence[_Solid], position: FloatArray, caster: RayCaster) -> NDArray[np.bool_]:
+    """(k,) whether some vertex of each block at its position lies under the surface by the least depth or more."""
+    counts = np.array([len(solid.vertices) for solid in solids])
+    points = np.concatenate([solid.vertices for solid in solids]) + np.repeat(position, counts, axis=0)
+    start = points.copy()
+    start[:, 2] = caster.mesh.bounds[1, 2] + 1.0
+    distance, _ = caster.cast(start, np.tile([0.0, 0.0, -1.0], (len(points), 1)))
+    depth = start[:, 2] - distance - points[:, 2]  # NaN where there is no surface
+    deepest = np.fmax.reduceat(depth, np.concatenate([[0], np.cumsum(counts)[:-1]]))
+    height = np.array([np.ptp(solid.bbox[:, 2]) for solid in solids])
+    return deepest >= _LEAST_DEPTH * height
+
+
+def _packed(solids: Sequence[_Solid], position: FloatArray) -> Blocks:
+    vertex_start = _starts([len(solid.vertices) for solid in solids])
+    face_start = _starts([len(solid.faces) for solid in solids])
+    vertices = np.concatenate([solid.vertices + place for solid, place in zip(solids, position, strict=True)])
+    faces = np.concatenate([solid.faces + start for solid, start in zip(solids, vertex_start[:-1], strict=True)])
+    shapes, sizes = tuple(solid.shape for solid in solids), np.stack([solid.size_m for solid in solids])
+    return Blocks(vertices, faces, vertex_start, face_start, shapes, sizes, position)
+
+
+def _starts(counts: Sequence[int]) -> IntArray:
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)

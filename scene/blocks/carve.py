@@ -1,0 +1,231 @@
+"""Carving blocks out of a wall with Manifold, on the patches under the blocks; the rest of the wall is passed through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.blocks.block import Blocks
+from scene.blocks.slivers import mend
+from scene.blocks.solid import Piece, boundary, close, piece, prism_volumes, solid, split
+from scene.common.errors import InputError
+from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh, area_normals
+from scene.geometry.under_boxes import faces_under
+
+FRESH_ALBEDO = 0.6
+"""Albedo of rock that no weather has darkened yet."""
+
+_HALO_M = 1e-3
+"""Added around the blocks' boxes, so that the mending of the rims always has whole neighbourhoods to work on."""
+
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Carved:
+    """A wall without its blocks.
+
+    mesh: the surface; face_block is the label (1 .. k) of the block whose niche a face belongs to, WALL elsewhere; vertex_block
+    likewise for the vertices inside niches, while those on a rim, which lie on the old surface too, are WALL;
+    removed_volume_m3: (k,) rock that each block took along (the boolean's, corrected for the mending of its rim);
+    wall_volume_m3: volume of the wall before, of an open one above its lowest point;
+    balance_m3: wall before - wall after - sum of the removed volumes, 0 but for rounding.
+    """
+
+    mesh: TriangleMesh
+    removed_volume_m3: FloatArray
+    wall_volume_m3: float
+    balance_m3: float
+
+
+@dataclass(frozen=True)
+class BlockMeshes:
+    """The four meshes of one block (thesis, 3.3), wall frame.
+
+    wall_difference: the wall around the block, with the hole; intersection: the closed solid that is removed (face_block tells
+    the wall's skin, WALL, from the block's side); niche: the surface left in the wall; removed_block: the closed part of the
+    block that protrudes from the wall and plays no further role.
+    """
+
+    wall_difference: TriangleMesh
+    intersection: TriangleMesh
+    niche: TriangleMesh
+    removed_block: TriangleMesh
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """The carved patches, before they are put back. origin: (n,) the wall's vertex that each vertex is, -1 for new ones."""
+
+    vertices: FloatArray
+    faces: IntArray
+    label: IntArray
+    origin: IntArray
+    albedo: NDArray[np.float32] | None
+
+
+def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO) -> Carved:
+    """Carve all blocks out of a wall, open or closed; an open one keeps its boundary loops.
+
+    mesh: wall frame; labels it has from an earlier carving count as wall; blocks: disjoint; fresh_albedo: of the niches, where
+    the wall has an albedo. Raises InputError where the wall is not manifold near a block or a block removes nothing.
+    """
+    rows = faces_under(mesh, blocks.bbox, _HALO_M)
+    wall, corners = close(mesh, rows, float(blocks.bbox[:, 0, 2].min()))
+    removed, left = split(wall, solid(blocks.vertices, blocks.faces, "blocks"))
+    surface, gain = _mended(_surface(mesh, rows, corners, left, blocks, fresh_albedo))
+    volumes = _removed_volumes(removed, blocks) - gain[1:]
+    carved = _put_back(mesh, rows, surface)
+    low = float(mesh.vertices[:, 2].min())
+    before = _volume(mesh.vertices, mesh.faces, low)
+    return Carved(carved, volumes, before, before - _volume(carved.vertices, carved.faces, low) - float(volumes.sum()))
+
+
+def carved_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[str, Any]]:
+    """One record per block for blocks.json: label, shape, size, removed volume, bounding box and position, wall frame, SI."""
+    return [
+        {
+            "label": index + 1,
+            "shape": blocks.shape[index],
+            "size_m": blocks.size_m[index].tolist(),
+            "volume_m3": float(removed_volume_m3[index]),
+            "bbox_m": blocks.bbox[index].ravel().tolist(),
+            "position_m": blocks.position_m[index].tolist(),
+        }
+        for index in range(len(blocks))
+    ]
+
+
+def block_meshes(mesh: TriangleMesh, blocks: Blocks, index: int) -> BlockMeshes:
+    """The four meshes of the block of this index (label index + 1), cut from the patch of the wall around it."""
+    block = blocks.only(index)
+    rows = faces_under(mesh, block.bbox, _HALO_M)
+    wall, _ = close(mesh, rows, float(block.bbox[0, 0, 2]))
+    cutter = solid(block.vertices, block.faces, "blocks")
+    removed, left = split(wall, cutter)
+    outside = piece(cutter.manifold - wall.manifold, cutter)
+    label = index + 1
+    return BlockMeshes(
+        wall_difference=_part(left, left.first & (left.source < len(rows)), WALL),
+        intersection=_part(removed, np.ones(len(removed.faces), dtype=bool), np.where(removed.first, WALL, label)),
+        niche=_part(left, ~left.first, label),
+        removed_block=_part(outside, np.ones(len(outside.faces), dtype=bool), np.where(outside.first, label, WALL)),
+    )
+
+
+def _part(whole: Piece, chosen: NDArray[np.bool_], label: int | IntArray) -> TriangleMesh:
+    labels = np.broadcast_to(np.asarray(label, dtype=np.int32), len(chosen))
+    return TriangleMesh(whole.vertices, whole.faces, face_block=labels).submesh(chosen)
+
+
+def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
+    """(k,) volume of the intersection, block by block; raises InputError where there is none."""
+    from scipy import sparse
+
+    links = removed.faces[:, [0, 1]].T, removed.faces[:, [1, 2]].T
+    rows, columns = np.concatenate(links, axis=1)
+    graph = sparse.coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(removed.vertices),) * 2)
+    count, component = sparse.csgraph.connected_components(graph, directed=False)
+    component = component[removed.faces[:, 0]]
+    label = np.zeros(count, dtype=np.int64)
+    label[component[~removed.first]] = blocks.face_label[removed.source[~removed.first]]
+    whole = np.flatnonzero(label == 0)  # pieces of wall that float inside a block: no face of the block is in them
+    label[whole] = _containing(blocks, removed, component, whole)
+    parts = prism_volumes(removed.vertices, removed.faces)
+    volumes = np.bincount(label[component], parts, minlength=len(blocks) + 1)[1:].astype(np.float64)
+    nothing = np.flatnonzero(volumes <= 0)
+    if len(nothing):
+        x, y, z = blocks.position_m[nothing[0]]
+        raise InputError(
+            f"{len(nothing)} of {len(blocks)} blocks remove no rock, the first of them at ({x:.2f}, {y:.2f}, {z:.2f}) m",
+            where="carving",
+            remedy="place the blocks on the surface; its faces must look towards the sensors (+z)",
+        )
+    return volumes
+
+
+def _containing(blocks: Blocks, removed: Piece, component: IntArray, wanted: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The label of the block in whose bounding box each wanted component lies."""
+    example = np.array([removed.faces[np.argmax(component == number), 0] for number in wanted], dtype=np.intp)
+    points = removed.vertices[example][:, None]
+    inside = np.all((points >= blocks.bbox[None, :, 0]) & (points <= blocks.bbox[None, :, 1]), axis=2)
+    return inside.argmax(axis=1) + 1
+
+
+def _surface(
+    mesh: TriangleMesh, rows: IntArray, corners: FloatArray, left: Piece, blocks: Blocks, fresh_albedo: float
+) -> _Surface:
+    """What is left of the patches and the niches, without the closure: the wall's vertices found again by their source face."""
+    is_wall = left.first & (left.source < len(rows))
+    chosen = is_wall | ~left.first
+    faces, source, is_wall = left.faces[chosen], left.source[chosen], is_wall[chosen]
+    label = np.full(len(faces), WALL, dtype=np.int32)
+    label[~is_wall] = blocks.face_label[source[~is_wall]]
+    wall_faces, source = faces[is_wall], source[is_wall]
+    position = left.vertices[wall_faces]
+    origin = np.full(len(left.vertices), -1, dtype=np.int32)
+    for number in range(3):
+        face, corner = np.nonzero(np.all(position == corners[source, None, number], axis=2))
+        origin[wall_faces[face, corner]] = mesh.faces[rows[source[face]], number]
+    if mesh.vertex_albedo is None:
+        return _Surface(left.vertices, faces, label, origin, None)
+    albedo = np.full(len(origin), fresh_albedo, dtype=np.float32)
+    face, corner = np.nonzero(origin[wall_faces] < 0)
+    weights = _barycentric(corners[source[face]], position[face, corner])
+    albedo[wall_faces[face, corner]] = np.einsum("ni,ni->n", weights, mesh.vertex_albedo[mesh.faces[rows[source[face]]]])
+    return _Surface(left.vertices, faces, label, origin, albedo)
+
+
+def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """(n, 3) weights of the corners (n, 3, 3) at points (n, 3) in their triangles, within [0, 1]."""
+    to_corner = corners - points[:, None]
+    normal = area_normals(corners)
+    parts = np.cross(np.roll(to_corner, -1, axis=1), np.roll(to_corner, -2, axis=1))
+    weights = np.clip(np.einsum("nij,nj->ni", parts, normal), 0.0, None)
+    return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+
+
+def _mended(surface: _Surface) -> tuple[_Surface, FloatArray]:
+    """The surface without slivers along the rims, and the volume this adds by label; vertices on the patches' boundary stay."""
+    of_wall, of_niche = (_used(surface, is_wall) for is_wall in (True, False))
+    rank = np.ones(len(surface.vertices), dtype=np.int8)
+    rank[of_wall & (of_niche | (surface.origin < 0))] = 2
+    rank[boundary(surface.faces)[0]] = 0
+    mended = mend(surface.vertices, surface.faces, surface.label, rank)
+    return replace(surface, faces=mended.faces, label=mended.label), mended.gain_m3
+
+
+def _used(surface: _Surface, is_wall: bool) -> NDArray[np.bool_]:
+    used = np.zeros(len(surface.vertices), dtype=bool)
+    used[surface.faces[(surface.label == WALL) == is_wall].ravel()] = True
+    return used
+
+
+def _put_back(mesh: TriangleMesh, rows: IntArray, surface: _Surface) -> TriangleMesh:
+    """The untouched faces, in their order, followed by those of the carved patches, on the vertices that are still in use."""
+    untouched = np.ones(len(mesh.faces), dtype=bool)
+    untouched[rows] = False
+    on_wall, on_niche = _used(surface, True), _used(surface, False)
+    new = np.flatnonzero((on_wall | on_niche) & (surface.origin < 0))
+    number = surface.origin.copy()
+    number[new] = len(mesh.vertices) + np.arange(len(new), dtype=np.int32)
+    faces = np.concatenate([mesh.faces[untouched], number[surface.faces]])
+    face_block = np.full(len(faces), WALL, dtype=np.int32)
+    face_block[len(faces) - len(surface.faces) :] = surface.label
+    vertex_block = np.full(len(mesh.vertices) + len(new), WALL, dtype=np.int32)
+    niche = surface.label != WALL
+    vertex_block[number[surface.faces[niche]]] = surface.label[niche, None]
+    vertex_block[number[on_wall]] = WALL  # the rims
+    vertices, albedo = np.concatenate([mesh.vertices, surface.vertices[new]]), None
+    if surface.albedo is not None and mesh.vertex_albedo is not None:
+        albedo = np.concatenate([mesh.vertex_albedo, surface.albedo[new]])
+    return TriangleMesh(vertices, faces, albedo, vertex_block, face_block).submesh()
+
+
+def _volume(vertices: FloatArray, faces: IntArray, base_m: float) -> float:
+    """Volume between a surface and z = base_m; of a closed surface its volume, whatever the base."""
+    starts = range(0, len(faces), _CHUNK)
+    return float(sum(prism_volumes(vertices, faces[start : start + _CHUNK], base_m).sum() for start in starts))

@@ -1,0 +1,166 @@
+"""Solids for Manifold: patches of a wall closed at the back, and what a boolean leaves of them, triangle by triangle.
+
+A patch is closed by vertical sides below its boundary and a fan far below, so a point under the patch is inside wherever the
+surface above it faces up once more than down. Where patches overlap themselves in XY (overhangs, the back of a closed wall)
+this count stays right, which is all that Manifold's boolean needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import Error, Manifold, Mesh64
+from numpy.typing import NDArray
+
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, renumbered
+
+_MARGIN_M = 1.0
+"""Distance from the lowest point of patch and blocks to the closure's bottom."""
+
+_SPREAD_M, _IRRATIONAL = 2e-6, (0.6180339887498949, 0.7548776662466927)
+"""How far the foot of each side stands from below its top: where a straight boundary folds back on itself, sides in one plane
+would overlap, which Manifold takes for one flat face and retriangulates, the neighbours included."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A Manifold solid whose triangles keep their row number through booleans."""
+
+    manifold: Manifold
+    identity: int
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of the result of a boolean.
+
+    vertices: (n, 3), m; faces: (m, 3) int32; source: (m,) row of the triangle that each face is a part of, in the solid that
+    it came from; first: (m,) whether that is the first solid.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    source: NDArray[np.int64]
+    first: NDArray[np.bool_]
+
+
+def solid(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
+    """A solid of closed triangles; raises InputError, naming it by `name`, where they do not close."""
+    identity = Manifold.reserve_ids(1)
+    manifold = Manifold(
+        Mesh64(
+            np.ascontiguousarray(vertices),
+            faces.astype(np.uint64),
+            run_index=np.array([0, 3 * len(faces)], dtype=np.uint64),
+            run_original_id=np.array([identity], dtype=np.uint32),
+            face_id=np.arange(len(faces), dtype=np.uint64),
+        )
+    )
+    if manifold.status() != Error.NoError or manifold.num_tri() != len(faces):
+        status = manifold.status().name if manifold.status() != Error.NoError else "degenerate triangles"
+        raise InputError(
+            f"the triangles make no solid ({status})",
+            where=name,
+            allowed="finite vertices; each edge in one triangle or in two of opposite direction; no triangles without area",
+            remedy="weld and clean the mesh",
+        )
+    return Solid(manifold, identity)
+
+
+def split(wall: Solid, blocks: Solid) -> tuple[Piece, Piece]:
+    """Cut the blocks out of the wall: what is removed, and what is left with the blocks' imprint."""
+    removed, left = wall.manifold.split(blocks.manifold)
+    return piece(removed, wall), piece(left, wall)
+
+
+def piece(result: Manifold, first: Solid) -> Piece:
+    """Read the result of a boolean of `first` with another solid."""
+    mesh = result.to_mesh64()
+    run_end = np.asarray(mesh.run_index).astype(np.int64) // 3
+    runs = run_end[1:] - run_end[:-1]
+    is_first = np.repeat(np.asarray(mesh.run_original_id)[: len(runs)] == first.identity, runs)
+    vertices, faces = np.asarray(mesh.vert_properties), np.asarray(mesh.tri_verts).astype(np.int32)
+    return Piece(vertices, faces, np.asarray(mesh.face_id).astype(np.int64), is_first)
+
+
+def close(mesh: TriangleMesh, rows: IntArray, bottom_m: float) -> tuple[Solid, FloatArray]:
+    """Close the patch of `mesh` made of the faces `rows`; triangle i < len(rows) of the solid is the face rows[i].
+
+    bottom_m: a z that the closure's bottom has to lie below. Returns the solid and the corners (r, 3, 3) of the patch's faces.
+    """
+    used, faces = renumbered(mesh.faces[rows])
+    vertices = mesh.vertices[used]
+    start, end = boundary(faces)
+    pinched = np.bincount(start, minlength=len(vertices)) > 1
+    if pinched.any():
+        vertices, faces = _split_pinched(vertices, faces, pinched)
+        start, end = boundary(faces)
+    corners = vertices[faces]
+    bottom = min(bottom_m, float(vertices[:, 2].min(initial=bottom_m))) - _MARGIN_M
+    return solid(*_closed(vertices, faces, start, end, bottom), name="wall mesh"), corners
+
+
+def boundary(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Start and end vertex of the directed edges that have no face on their other side."""
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    key = np.minimum(start, end).astype(np.int64) << 32 | np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    differs = np.concatenate([[True], np.diff(key[order]) != 0, [True]])
+    alone = order[differs[:-1] & differs[1:]]
+    return start[alone], end[alone]
+
+
+def _closed(vertices: FloatArray, faces: IntArray, start: IntArray, end: IntArray, bottom: float) -> tuple[FloatArray, IntArray]:
+    """Vertices and faces with the sides below the boundary edges start -> end, and a fan below the sides."""
+    rim, place = np.unique(np.concatenate([start, end]), return_inverse=True)
+    start_low, end_low = (place + len(vertices)).astype(np.int32).reshape(2, -1)
+    spread = (np.arange(len(rim))[:, None] * _IRRATIONAL % 1.0 - 0.5) * _SPREAD_M
+    low = np.column_stack([vertices[rim, :2] + spread, np.full(len(rim), bottom)])
+    loop, apex = _apexes(low, *place.reshape(2, -1))
+    top = (len(vertices) + len(rim) + loop).astype(np.int32)
+    sides = [(end, start, start_low), (end, start_low, end_low), (end_low, start_low, top)]
+    closure = [np.stack(side, axis=1) for side in sides]
+    return np.concatenate([vertices, low, apex]), np.concatenate([faces, *closure])
+
+
+def _apexes(low: FloatArray, start: IntArray, end: IntArray) -> tuple[IntArray, FloatArray]:
+    """The loop that each edge start -> end belongs to, and for each loop a point below its middle."""
+    from scipy import sparse
+
+    graph = sparse.coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(low), len(low)))
+    count, loop = sparse.csgraph.connected_components(graph, directed=False)
+    size = np.bincount(loop, minlength=count)
+    apex = np.stack([np.bincount(loop, low[:, axis], minlength=count) / size for axis in range(3)], axis=1)
+    return loop[start], apex - [0.0, 0.0, _MARGIN_M]
+
+
+def _split_pinched(vertices: FloatArray, faces: IntArray, pinched: NDArray[np.bool_]) -> tuple[FloatArray, IntArray]:
+    """Give each fan of faces around a vertex where several boundary loops meet a vertex of its own."""
+    from scipy import sparse
+
+    face, corner = np.nonzero(pinched[faces])
+    centre = faces[face, corner].astype(np.int64)
+    spokes = [centre << 32 | faces[face, (corner + step) % 3] for step in (1, 2)]
+    key, node = np.concatenate(spokes), np.tile(np.arange(len(face)), 2)
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)
+    links = node[order[same]], node[order[same + 1]]
+    graph = sparse.coo_array((np.ones(len(same), dtype=bool), links), shape=(len(face), len(face)))
+    _, fan = sparse.csgraph.connected_components(graph, directed=False)
+    _, example = np.unique(fan, return_index=True)
+    owner = centre[example]
+    number = len(vertices) + np.arange(len(owner), dtype=np.int32)
+    _, keeps = np.unique(owner, return_index=True)
+    number[keeps] = owner[keeps]
+    faces = faces.copy()
+    faces[face, corner] = number[fan]
+    return np.concatenate([vertices, vertices[owner]]), faces
+
+
+def prism_volumes(vertices: FloatArray, faces: IntArray, base_m: float = 0.0) -> FloatArray:
+    """(m,) signed volume of the vertical prism between each face and z = base_m (divergence theorem, field (0, 0, z))."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    u, v = b - a, c - a
+    return (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * ((a[:, 2] + b[:, 2] + c[:, 2]) / 3 - base_m) / 2

@@ -1,0 +1,51 @@
+"""The ray-tracing backend: Mitsuba's CUDA variant where there is a GPU, else LLVM; chosen once per process.
+
+Everything that uses Mitsuba imports `mi` and `dr` from here, so that a variant is set before any Mitsuba type is touched.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from scene.common.errors import InputError
+
+if "tensorflow" in sys.modules and "drjit" not in sys.modules:
+    raise InputError(
+        "TensorFlow is loaded already, and the names of LLVM in it would crash the ray tracer",
+        where="scarpsim",
+        remedy="import scarpsim's scene, sensors or pipeline before tensorflow, or use two processes",
+    )
+
+import drjit as dr
+import mitsuba as mi
+
+CUDA, LLVM = "cuda_ad_mono", "llvm_ad_mono"
+_VARIANT_VARIABLE = "SCARPSIM_VARIANT"
+
+
+def _choose() -> str:
+    wanted = os.environ.get(_VARIANT_VARIABLE)
+    if wanted:
+        if wanted not in (CUDA, LLVM):
+            raise InputError(f"got '{wanted}'", where=_VARIANT_VARIABLE, allowed=f"{CUDA}, {LLVM}")
+        return wanted
+    return CUDA if dr.has_backend(dr.JitBackend.CUDA) else LLVM
+
+
+def _activate() -> str:
+    variant = _choose()
+    backend = dr.JitBackend.CUDA if variant == CUDA else dr.JitBackend.LLVM
+    if not dr.has_backend(backend):
+        raise InputError(
+            "no CUDA device was found" if variant == CUDA else "the system library libLLVM is missing",
+            where=f"Mitsuba variant {variant}",
+            remedy="run `scarpsim doctor`" if variant == CUDA else "install it (Debian, Ubuntu: apt-get install libllvm15)",
+        )
+    mi.set_variant(variant)
+    return variant
+
+
+VARIANT = _activate()
+
+__all__ = ["CUDA", "LLVM", "VARIANT", "dr", "mi"]

@@ -1,0 +1,51 @@
+"""Random numbers keyed by (seed, purpose, element): the same whatever the threads, chunks or workers.
+
+A generator is never advanced: every number is a pure function of its key. On the device the counter-based Philox 4x32 of
+Salmon et al. (2011) is evaluated at the element's index; on the host NumPy's Philox is seeded with the hashed key.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from scene.common.backend import dr, mi
+
+
+@dataclass(frozen=True)
+class KeyedRandom:
+    """A source of random numbers for one seed and a path of purposes, such as ("epoch", 3, "tls", "range_noise")."""
+
+    seed: int
+    path: tuple[str | int, ...] = ()
+
+    def child(self, *purpose: str | int) -> KeyedRandom:
+        """The source for a narrower purpose; children of different purposes are independent."""
+        return KeyedRandom(self.seed, self.path + purpose)
+
+    @property
+    def key(self) -> int:
+        """The 64-bit key that this seed and path hash to (BLAKE2b)."""
+        text = repr((self.seed, self.path)).encode()
+        return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little")
+
+    def generator(self) -> np.random.Generator:
+        """A fresh NumPy generator, at the start of this key's stream each time it is asked for."""
+        return np.random.Generator(np.random.Philox(key=self.key))
+
+    def normals(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
+        """Four independent standard normal numbers per element, on the device.
+
+        index: (n,) element numbers; field: a second number of the key, one or (n,). Returns a Dr.Jit Array4f of (n,) each.
+        """
+        return self._philox(index, field).next_float32x4_normal()
+
+    def uniforms(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
+        """Four independent numbers in [0, 1) per element, on the device; arguments as in `normals`."""
+        return self._philox(index, field).next_float32x4()
+
+    def _philox(self, index: mi.UInt32, field: int | mi.UInt32) -> mi.Philox4x32:
+        # The key is opaque, so that one compiled kernel serves every seed and purpose.
+        return mi.Philox4x32(seed=dr.opaque(mi.UInt64, self.key), counter_0=index, counter_1=mi.UInt32(field))

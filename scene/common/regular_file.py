@@ -1,0 +1,124 @@
+"""The door for every file that a person names: it is looked at first, as a pipe or a device would be read without end."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, AnyStr
+
+from scene.common.errors import InputError
+
+MOST_TEXT_BYTES = 512_000_000
+"""Of a text file that is read into memory as a whole."""
+MOST_JSON_GB = 1.7
+"""What a JSON file may take in memory."""
+READ_LIMIT = "SCARPSIM_READ_GB"
+"""The variable of the environment that allows any file that is read to take more, in GB."""
+
+
+def check_file(
+    path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str = "give a smaller one"
+) -> Path:
+    """`path` itself, if it is a file with data in it or none; InputError for what is not there, a folder, a pipe, a device, a
+    loop of links, a name that cannot be, and a file of more than `most_bytes`, whose remedy is `smaller`."""
+    where = str(path)
+    try:
+        state = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a null character
+        problem = getattr(error, "strerror", None) or "a null character in its name"
+        raise InputError(f"cannot be read ({problem})", where=where, remedy=remedy) from None
+    if stat.S_ISDIR(state.st_mode):
+        raise InputError("cannot be read (Is a directory)", where=where, allowed="a file", remedy=remedy)
+    if not stat.S_ISREG(state.st_mode):
+        raise InputError(
+            "is a pipe, a device or a socket", where=where, allowed="a file", remedy="copy what it gives into a file"
+        )
+    if most_bytes is not None and state.st_size > most_bytes:
+        problem = f"has {state.st_size / 1e6:,.0f} MB"
+        raise InputError(problem, where=where, allowed=f"up to {most_bytes / 1e6:,.0f} MB", remedy=smaller)
+    return path
+
+
+def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str | None = None) -> str:
+    """The text of a file in UTF-8; raises InputError as `check_file` does, and for other encodings. most_bytes: none: as many
+    as MOST_TEXT_BYTES or the variable READ_LIMIT allow."""
+    most = max(MOST_TEXT_BYTES, int(raised_gb() * 1e9)) if most_bytes is None else most_bytes
+    check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller one, or set the variable {READ_LIMIT}")
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
+    except UnicodeDecodeError as error:
+        problem = f"is no text in UTF-8 (byte {error.start:,}: {error.reason})"
+        raise InputError(problem, where=str(path), remedy="save it in UTF-8, or give the file that is meant") from None
+
+
+def read_json(path: Path, *, remedy: str = "make it again") -> Any:
+    """The value that a JSON file holds.
+
+    Raises InputError as `read_text` does, where the file is not JSON, and before it is read where it may take more than
+    MOST_JSON_GB of memory, or than the variable READ_LIMIT says.
+    """
+    most = max(MOST_JSON_GB, raised_gb())
+    size = check_file(path, remedy=remedy).stat().st_size
+    try:
+        needed = _json_gb(path, size, most)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
+    if needed > most:
+        problem = f"holds so much that it may take {needed:.1f} GB of memory"
+        smaller = f"cut it into parts, or set the variable {READ_LIMIT}={math.ceil(1.1 * needed)}"
+        raise InputError(problem, where=str(path), allowed=f"up to {most:g} GB", remedy=smaller)
+    text = read_text(path, most_bytes=int(most * 1e9), remedy=remedy)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        problem = " ".join(str(error).split()) or "nested too deeply"
+        raise InputError(f"is not JSON ({problem})", where=str(path), remedy=remedy) from None
+
+
+def raised_gb() -> float:
+    """What the variable READ_LIMIT says, 0 without it."""
+    given = os.environ.get(READ_LIMIT)
+    if not given:
+        return 0.0
+    try:
+        most = float(given)
+    except ValueError:
+        most = math.nan
+    if not most > 0:
+        raise InputError(f"got '{given}'", where=READ_LIMIT, allowed="gigabytes, above 0")
+    return most
+
+
+def _json_gb(path: Path, size: int, enough: float) -> float:
+    """What a JSON file of `size` bytes takes in memory at most, as bytes, text and values; from its first part where that alone
+    takes more than `enough`.
+
+    In CPython 3.11 a value and its place take up to 72 bytes, a list 96 more, a mapping 190 more, a key that no other mapping has
+    100 more; a text with one letter beyond the first 256 takes up to four bytes a letter.
+    """
+    values, letter, read = 0, 1, 0
+    with path.open("rb") as file:
+        while piece := file.read(2**24):
+            read += len(piece)
+            letter = 1 if letter == 1 and piece.isascii() and b"\\u" not in piece else 4
+            values += 72 * piece.count(b",") + 96 * piece.count(b"[") + 190 * piece.count(b"{") + 100 * piece.count(b":")
+            if (2 * letter * size + values) / 1e9 > enough:
+                break
+    return (2 * letter * size + values * size / max(read, 1)) / 1e9
+
+
+def bounded_lines(file: IO[AnyStr], count: int, longest: int = 65_536) -> Iterator[AnyStr]:
+    """At most `count` lines of an open file; raises ValueError for a longer one, which would be taken into memory as a whole."""
+    for _ in range(count):
+        line = file.readline(longest)
+        if len(line) == longest:
+            raise ValueError(f"a line of more than {longest:,} bytes")
+        if not line:
+            return
+        yield line

@@ -1,0 +1,61 @@
+"""Which faces of a wall lie under boxes: a raster of the boxes and its integral image answer for millions of faces."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh
+
+_MOST_CELLS = 4e6
+_CELLS_PER_BOX = 8
+"""Cells along the shortest side of the smallest box, where the number of cells allows it."""
+
+_CHUNK = 1 << 19
+"""Faces looked up at a time, which bounds the memory of the intermediates."""
+
+
+def faces_under(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0) -> IntArray:
+    """Indices, increasing, of all faces that lie under one of the boxes, and of a few beside them (to a raster cell).
+
+    boxes: (k, 2, 2 or 3) smallest and largest coordinates, m; halo_m: added around each box. A face lies under a box where
+    their projections on XY overlap, at whatever height.
+    """
+    low, high = boxes[:, 0, :2] - halo_m, boxes[:, 1, :2] + halo_m
+    corner, extent = low.min(axis=0), high.max(axis=0) - low.min(axis=0)
+    cell = max(float((high - low).min()) / _CELLS_PER_BOX, float(np.sqrt(extent.prod() / _MOST_CELLS)))
+    shape = (extent / cell).astype(np.int64) + 3  # a rim of free cells takes all that lies outside
+    free = np.zeros(tuple(shape), dtype=np.int32)
+    first, last = _cells(low, corner, cell, shape), _cells(high, corner, cell, shape)
+    for (x0, y0), (x1, y1) in zip(first.tolist(), last.tolist(), strict=True):
+        free[x0 : x1 + 1, y0 : y1 + 1] = 1
+    count = integral(free).ravel()
+    width = int(shape[1]) + 1
+    x_cell, y_cell = (_cells(mesh.vertices[:, axis], corner[axis], cell, shape[axis]) for axis in (0, 1))
+    found = []
+    for start in range(0, len(mesh.faces), _CHUNK):
+        a, b, c = mesh.faces[start : start + _CHUNK].T
+        x0, x1 = _span(x_cell[a], x_cell[b], x_cell[c])
+        y0, y1 = _span(y_cell[a], y_cell[b], y_cell[c])
+        under = (
+            count[(x1 + 1) * width + y1 + 1] - count[x0 * width + y1 + 1] - count[(x1 + 1) * width + y0] + count[x0 * width + y0]
+        )
+        found.append((np.flatnonzero(under) + start).astype(np.int32))
+    return np.concatenate(found) if found else np.empty(0, dtype=np.int32)
+
+
+def integral(raster: NDArray[np.generic]) -> IntArray:
+    """(h + 1, w + 1) integral image: entry (i, j) is the sum over the raster's rows below i and columns below j."""
+    sums = np.zeros((raster.shape[0] + 1, raster.shape[1] + 1), dtype=np.int32)
+    np.cumsum(raster, axis=0, dtype=np.int32, out=sums[1:, 1:])
+    np.cumsum(sums[1:, 1:], axis=1, out=sums[1:, 1:])
+    return sums
+
+
+def _cells(positions: FloatArray, corner: FloatArray, cell: float, shape: NDArray[np.int64]) -> IntArray:
+    """Cell numbers along one or both axes; 0 and shape - 1 hold all that lies outside the boxes' common rectangle."""
+    return np.clip(np.floor((positions - corner) / cell) + 1, 0, shape - 1).astype(np.int32)
+
+
+def _span(a: IntArray, b: IntArray, c: IntArray) -> tuple[IntArray, IntArray]:
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)

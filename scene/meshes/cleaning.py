@@ -1,0 +1,308 @@
+"""Mending a triangle mesh: welded, without degenerate or doubled faces, manifold, consistently wound.
+
+Every step returns the mended mesh and says in words what it did ("" for nothing). All are vectorised sorts and gathers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.common.errors import InputError
+from scene.common.threads import side_by_side
+from scene.geometry.mesh import FloatArray, TriangleMesh
+
+Mended = tuple[TriangleMesh, str]
+Index = NDArray[np.int64]
+
+WELD_M = 1e-6
+"""Vertices nearer to one another than this are one, m."""
+_FLAT_M = 1e-9
+"""A triangle of a smaller height than this has no area, m."""
+_FACES_AT_ONCE = 1 << 14
+_DIRECTION = np.array([0.5377, 0.6349, 0.5548])
+
+
+def clean(mesh: TriangleMesh, where: str) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """The mended mesh and what was mended. Coordinates should be local (float64 with micrometres to spare).
+
+    Raises InputError where nothing with an area is left, or where the surface has only one side.
+    """
+    steps: tuple[Callable[[TriangleMesh], Mended], ...] = (weld, drop_flat, drop_doubled, part_edges)
+    repairs = []
+    for step in steps:
+        mesh, words = step(mesh)
+        repairs.append(words)
+        if not len(mesh.faces):
+            raise InputError(
+                "no triangle has an area: all vertices lie on lines or points", where=where, remedy="export the surface anew"
+            )
+    mesh, words = rewind(mesh, where)
+    repairs.append(words)
+    for step in (part_vertices, drop_unused):
+        mesh, words = step(mesh)
+        repairs.append(words)
+    return mesh, tuple(text for text in (*repairs, pieces(mesh)) if text)
+
+
+def weld(mesh: TriangleMesh) -> Mended:
+    """Join vertices that are the same or within WELD_M of one another (chains of such vertices too); the first one stays."""
+    first, inverse = unique_rows(mesh.vertices + 0.0)  # + 0.0: minus zero is zero
+    near = _near_pairs(mesh.vertices[first])
+    if len(near):
+        group = groups(near, len(first))
+        first, inverse = first[np.unique(group, return_index=True)[1]], group[inverse]
+    removed = len(mesh.vertices) - len(first)
+    if not removed:
+        return mesh, ""
+    albedo = None if mesh.vertex_albedo is None else mesh.vertex_albedo[first]
+    welded = replace(mesh, vertices=mesh.vertices[first], faces=inverse[mesh.faces].astype(np.int32), vertex_albedo=albedo)
+    return welded, f"{removed} duplicate vertices welded"
+
+
+def drop_flat(mesh: TriangleMesh) -> Mended:
+    """Remove triangles without an area: two corners the same, or all three on one line."""
+    keep = _by_parts(mesh, _has_area, bool)
+    return _keep(mesh, keep, "degenerate triangles removed")
+
+
+def drop_doubled(mesh: TriangleMesh) -> Mended:
+    """Remove all but the first of the triangles over the same three vertices, whatever their winding."""
+    first, _ = unique_rows(np.sort(mesh.faces, axis=1))
+    keep = np.zeros(len(mesh.faces), bool)
+    keep[first] = True
+    return _keep(mesh, keep, "duplicate triangles removed")
+
+
+def part_edges(mesh: TriangleMesh) -> Mended:
+    """Where more than two triangles share an edge, keep the two largest."""
+    edges = mesh.edges
+    ordered = edges[mesh.edge_order]
+    crowded = np.zeros(len(edges), bool)
+    crowded[2:] = ordered[2:] == ordered[:-2]
+    if not crowded.any():
+        return mesh, ""
+    fin = np.flatnonzero(np.isin(edges, ordered[crowded]))
+    face = fin % len(mesh.faces)
+    ranked = np.lexsort((-areas(mesh)[face], edges[fin]))
+    place = np.zeros(len(ranked), bool)
+    place[2:] = edges[fin][ranked][2:] == edges[fin][ranked][:-2]
+    keep = np.ones(len(mesh.faces), bool)
+    keep[face[ranked[place]]] = False
+    return _keep(mesh, keep, f"triangles removed at {len(np.unique(ordered[crowded]))} edges shared by more than two")
+
+
+def rewind(mesh: TriangleMesh, where: str) -> Mended:
+    """Flip the triangles wound against the larger part of their piece of surface."""
+    odd = wound_otherwise(mesh, where)
+    return (flipped(mesh, odd), f"{int(odd.sum())} triangles wound the other way round") if odd.any() else (mesh, "")
+
+
+def wound_otherwise(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
+    """(m,) the triangles wound against the larger part of their piece of surface; vertices must be welded.
+
+    Each triangle stands twice in a graph, as it is and flipped; neighbours are joined so that the windings agree. A piece
+    whose two copies are connected has only one side. Triangles are no neighbours over an edge that more than two share.
+    """
+    count = len(mesh.faces)
+    pair, same = _neighbours(mesh)
+    if not same.any():
+        return np.zeros(count, bool)
+    flip, none = same * count, np.zeros(len(same), np.int64)
+    links = np.concatenate([pair + np.stack([none, flip], axis=1), pair + np.stack([none + count, count - flip], axis=1)])
+    label = groups(links, 2 * count)
+    if np.any(label[:count] == label[count:]):
+        raise InputError("the surface has only one side (a Moebius strip), so it has no outside", where=where)
+    size = np.bincount(label[:count], minlength=label.max() + 1)
+    minor = size[label[:count]] < size[label[count:]]
+    tie = (size[label[:count]] == size[label[count:]]) & (label[:count] > label[count:])
+    return minor | tie
+
+
+def part_vertices(mesh: TriangleMesh) -> Mended:
+    """Where fans of triangles touch only in a vertex, keep the largest fan; repeated, as that may bare another such vertex.
+
+    The mesh must be manifold along its edges and consistently wound.
+    """
+    removed = 0
+    while (pinched := _pinched(mesh)).any():
+        lesser = _lesser_fans(mesh, pinched)
+        removed += int(lesser.sum())
+        mesh = replace(mesh, faces=mesh.faces[~lesser])
+    return mesh, f"{removed} triangles removed where the surface touched itself in a vertex" if removed else ""
+
+
+def drop_unused(mesh: TriangleMesh) -> Mended:
+    """Remove the vertices that no triangle uses."""
+    kept = mesh.submesh()
+    unused = len(mesh.vertices) - len(kept.vertices)
+    return (kept, f"{unused} unused vertices removed") if unused else (mesh, "")
+
+
+def pieces(mesh: TriangleMesh) -> str:
+    """What a report should say about pieces that are not connected to the main one; "" if there is one."""
+    label = groups(mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
+    sizes = np.sort(np.bincount(label[mesh.faces[:, 0]]))
+    if len(sizes) == 1:
+        return ""
+    return f"kept {len(sizes) - 1} pieces apart from the main surface, of {sizes[0]} to {sizes[-2]} triangles"
+
+
+def flipped(mesh: TriangleMesh, which: NDArray[np.bool_]) -> TriangleMesh:
+    """The mesh with the triangles `which` wound the other way round."""
+    return replace(mesh, faces=np.where(which[:, None], mesh.faces[:, ::-1], mesh.faces))
+
+
+def areas(mesh: TriangleMesh) -> FloatArray:
+    """(m,) areas of the triangles, m2."""
+    return _by_parts(mesh, _areas, float)
+
+
+def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]], kind: type) -> NDArray[Any]:
+    """(m,) `evaluate` of the (k, 3, 3) corners of the triangles, some at a time, which stay in the cache."""
+    result: NDArray[Any] = np.empty(len(mesh.faces), kind)
+
+    def fill(start: int) -> None:
+        part = slice(start, start + _FACES_AT_ONCE)
+        result[part] = evaluate(mesh.vertices[mesh.faces[part]])
+
+    side_by_side(fill, range(0, len(result), _FACES_AT_ONCE))
+    return result
+
+
+def _areas(corners: FloatArray) -> FloatArray:
+    """(k,) areas of the triangles, m2."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.sqrt(_squared(np.cross(first, second))) / 2
+
+
+def _has_area(corners: FloatArray) -> NDArray[np.bool_]:
+    sides = (_squared(corners[:, start] - corners[:, end]) for start, end in ((0, 1), (1, 2), (2, 0)))
+    return 2 * _areas(corners) > _FLAT_M * np.sqrt(reduce(np.maximum, sides))
+
+
+def _squared(vectors: FloatArray) -> FloatArray:
+    """(k,) squared lengths of (k, 3) vectors."""
+    return np.einsum("ki,ki->k", vectors, vectors)
+
+
+def unique_rows(rows: NDArray[np.generic]) -> tuple[Index, Index]:
+    """Index of the first of each group of equal rows, in order of appearance, and the group of every row.
+
+    rows: (n, 3). They are sorted by a 64-bit hash; should two different ones share a hash, they are sorted in full.
+    """
+    key = np.zeros(len(rows), np.uint64)
+    for column in rows.T.astype(f"{rows.dtype.kind}8"):
+        key = (key ^ (key >> np.uint64(29)) ^ column.view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+    ordered = np.sort(key)
+    if np.all(ordered[1:] != ordered[:-1]):
+        return np.arange(len(rows)), np.arange(len(rows))
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    if not np.array_equal(rows[first][inverse], rows):
+        _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return first[order], place[inverse.ravel()]
+
+
+def _near_pairs(vertices: FloatArray) -> Index:
+    """(k, 2) pairs of vertices within WELD_M, found as neighbours along one skew direction."""
+    along = np.einsum("ni,i->n", vertices, _DIRECTION)
+    order = np.argsort(along, kind="stable")
+    along = along[order]
+    candidate = np.arange(len(order) - 1)
+    found = [np.empty((0, 2), np.int64)]
+    for lag in range(1, len(order)):
+        candidate = candidate[: np.searchsorted(candidate, len(order) - lag)]
+        candidate = candidate[along[candidate + lag] - along[candidate] <= WELD_M]
+        if not len(candidate):
+            break
+        pair = order[np.stack([candidate, candidate + lag], axis=1)]
+        distance = vertices[pair[:, 0]] - vertices[pair[:, 1]]
+        found.append(pair[np.sum(distance**2, axis=1) <= WELD_M**2])
+    return np.concatenate(found)
+
+
+def groups(pairs: NDArray[np.integer], count: int) -> Index:
+    """(count,) number of the connected group of each element, in order of first appearance.
+
+    Every element points to the smallest of its group known so far. A round hooks the groups that a pair joins to the smaller
+    one, then follows the pointers to their ends (Shiloach and Vishkin 1982). SciPy takes as long, and its import longer still.
+    """
+    smallest = np.arange(count)
+    start, end = pairs.T
+    while len(start):
+        low, high = np.minimum(smallest[start], smallest[end]), np.maximum(smallest[start], smallest[end])
+        np.minimum.at(smallest, high, low)
+        while not np.array_equal(further := smallest[smallest], smallest):
+            smallest = further
+        apart = low != high
+        start, end = start[apart], end[apart]
+    return (np.cumsum(smallest == np.arange(count)) - 1)[smallest]
+
+
+def _twins(mesh: TriangleMesh) -> tuple[Index, Index]:
+    """The two places of each edge that stands twice, and no oftener, in `mesh.edges`."""
+    order, ordered = mesh.edge_order, mesh.edges[mesh.edge_order]
+    again = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])
+    twin = np.flatnonzero(again[1:-1] & ~again[:-2] & ~again[2:])
+    return order[twin], order[twin + 1]
+
+
+def _neighbours(mesh: TriangleMesh) -> tuple[Index, NDArray[np.bool_]]:
+    """(k, 2) triangles that share an edge, and whether both run along it in the same direction (a winding that disagrees)."""
+    start = mesh.faces.T.ravel()
+    one, other = _twins(mesh)
+    return np.stack([one, other], axis=1) % len(mesh.faces), start[one] == start[other]
+
+
+def _pinched(mesh: TriangleMesh) -> NDArray[np.bool_]:
+    """(n,) vertices whose triangles are not one fan: a walk about the vertex, edge by edge, does not meet them all."""
+    count, corners = len(mesh.faces), mesh.faces.T.ravel()  # half-edge k m + f leaves corner k of triangle f
+    one, other = _twins(mesh)
+    twin = np.full(3 * count, -1)
+    twin[one], twin[other] = other, one
+    rim = np.flatnonzero(twin < 0)
+    start = np.full(len(mesh.vertices), -1)
+    start[corners] = np.arange(3 * count)
+    start[corners[rim]] = rim  # an open fan is walked from its rim
+    unmet = np.bincount(corners, minlength=len(mesh.vertices))
+    vertex = np.flatnonzero(start >= 0)
+    edge = start[vertex]
+    while len(vertex):
+        unmet[vertex] -= 1
+        edge = twin[(edge + 2 * count) % (3 * count)]  # the twin of the edge that ends here leaves here too
+        onwards = (edge >= 0) & (edge != start[vertex])
+        vertex, edge = vertex[onwards], edge[onwards]
+    return unmet > 0
+
+
+def _lesser_fans(mesh: TriangleMesh, pinched: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(m,) the triangles in all but the largest fan about each vertex in `pinched`."""
+    near = np.flatnonzero(pinched[mesh.faces].any(axis=1))
+    patch = replace(mesh, faces=mesh.faces[near])
+    corners, count = patch.faces.T.ravel(), len(near)
+    one, other = _twins(patch)  # wound alike, so that one leaves where the other arrives
+    links = np.concatenate([np.stack([one, (other + count) % (3 * count)], 1), np.stack([(one + count) % (3 * count), other], 1)])
+    fan = groups(links, 3 * count)
+    first, size = np.unique(fan, return_index=True, return_counts=True)[1:]
+    centre = corners[first]
+    ranked = np.lexsort((-size, centre))
+    lesser = np.zeros(len(ranked), bool)
+    lesser[ranked[1:]] = centre[ranked[1:]] == centre[ranked[:-1]]
+    shed = lesser[fan] & pinched[corners]
+    result = np.zeros(len(mesh.faces), bool)
+    result[near[np.flatnonzero(shed) % count]] = True
+    return result
+
+
+def _keep(mesh: TriangleMesh, keep: NDArray[np.bool_], words: str) -> Mended:
+    if keep.all():
+        return mesh, ""
+    return replace(mesh, faces=mesh.faces[keep]), f"{int(np.sum(~keep))} {words}"

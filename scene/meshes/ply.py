@@ -1,0 +1,158 @@
+"""The elements and properties of PLY files, binary and ASCII, as arrays."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.common.errors import InputError
+from scene.common.regular_file import bounded_lines, check_file
+
+_LONGEST_HEADER = 65536
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+@dataclass
+class _Element:
+    """One element of a header. properties: name to (type of the value, type of the list's count or "")."""
+
+    name: str
+    count: int
+    properties: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+
+def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
+    """The elements of a file, up to the one called `only`: their properties by name, (n,) or, for lists of one length k, (n, k).
+
+    Raises InputError for a missing or damaged file and for lists of different lengths.
+    """
+    check_file(path)
+    try:
+        with path.open("rb") as file:
+            order, elements = _header(file)
+            wanted = itertools.islice(elements, _last(elements, only))
+            return {element.name: _columns(file, element, order) for element in wanted}
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
+    except (ValueError, IndexError, KeyError, OverflowError) as error:
+        raise InputError(f"is not a whole PLY file ({error})", where=str(path), remedy="export it again") from None
+
+
+def _last(elements: list[_Element], only: str) -> int:
+    return next((index + 1 for index, element in enumerate(elements) if element.name == only), len(elements))
+
+
+def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
+    """Byte order ("" for ASCII) and elements; leaves the file at the first byte of the data."""
+    elements: list[_Element] = []
+    order = None
+    for words in _header_lines(file):
+        match words:
+            case ["format", kind, "1.0"]:
+                order = _ORDERS[kind]
+            case ["element", name, count]:
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", counter, kind, name]:
+                elements[-1].properties[name] = (_TYPES[kind], _TYPES[counter])
+            case ["property", kind, name]:
+                elements[-1].properties[name] = (_TYPES[kind], "")
+            case ["comment" | "obj_info", *_] | []:
+                pass
+            case _:
+                raise ValueError(f"header line '{' '.join(words)[:80]}'")
+    if order is None or any(element.count < 0 for element in elements):
+        raise ValueError("the header names no format" if order is None else "a negative count")
+    return order, elements
+
+
+def _header_lines(file: BinaryIO) -> Iterator[list[str]]:
+    if file.readline(16).strip() != b"ply":
+        raise ValueError("it does not begin with 'ply'")
+    while (line := file.readline(_LONGEST_HEADER)).strip() != b"end_header":
+        if not line.endswith(b"\n") or file.tell() > _LONGEST_HEADER:
+            raise ValueError("the header has no end")
+        yield line.decode("ascii", errors="replace").split()
+
+
+def _columns(file: BinaryIO, element: _Element, order: str) -> Columns:
+    """Read one element, views of one array of records; lists must have one length throughout. Leaves the file after it."""
+    if not element.count or not element.properties:
+        return {name: np.empty((0, 3) if counter else 0, kind) for name, (kind, counter) in element.properties.items()}
+    rows = _binary_rows(file, element, order) if order else _ascii_rows(file, element)
+    for name, (_, counter) in element.properties.items():
+        if counter and np.any(rows[f"count {name}"] != rows[name].shape[1]):
+            raise ValueError(f"{element.name} lists of different lengths, only triangles can be read")
+    return {name: rows[name] for name in element.properties}
+
+
+def _binary_rows(file: BinaryIO, element: _Element, order: str) -> NDArray[Any]:
+    record = np.dtype(_fields(element, order, _binary_lengths(file, element, order)))
+    left = _size(file) - file.tell()
+    if element.count * record.itemsize > left:
+        raise ValueError(f"{element.count:,} {element.name} records of {record.itemsize} bytes, {left:,} bytes are left")
+    return np.fromfile(file, dtype=record, count=element.count)
+
+
+def _binary_lengths(file: BinaryIO, element: _Element, order: str) -> dict[str, int]:
+    """Length of each list in the first record; the file stays where it is."""
+    start, lengths = file.tell(), {}
+    for name, (kind, counter) in element.properties.items():
+        if counter:
+            lengths[name] = int(np.frombuffer(file.read(np.dtype(counter).itemsize), dtype=order + counter)[0])
+        file.seek(lengths.get(name, 1) * np.dtype(kind).itemsize, 1)
+    file.seek(start)
+    return lengths
+
+
+def _fields(element: _Element, order: str, lengths: Mapping[str, int]) -> list[Any]:
+    fields: list[Any] = []
+    for name, (kind, counter) in element.properties.items():
+        if counter:
+            fields += [(f"count {name}", order + counter), (name, order + kind, (lengths[name],))]
+        else:
+            fields.append((name, order + kind))
+    return fields
+
+
+def _ascii_rows(file: BinaryIO, element: _Element) -> NDArray[Any]:
+    table = np.loadtxt(bounded_lines(file, element.count), ndmin=2, comments=None, encoding="ascii")
+    if len(table) < element.count:
+        raise ValueError(f"{len(table):,} of {element.count:,} {element.name} lines")
+    lengths, column = {}, 0
+    for name, (_, counter) in element.properties.items():
+        if counter:
+            lengths[name] = int(table[0, column])
+        column += lengths.get(name, 0) + 1
+    rows = np.empty(len(table), dtype=_fields(element, "<", lengths))
+    return _filled(rows, table)
+
+
+def _filled(rows: NDArray[Any], table: NDArray[np.float64]) -> NDArray[Any]:
+    """Fill records field by field from the columns of an ASCII table; raises ValueError where there are too few or too many."""
+    column = 0
+    for name in rows.dtype.names or ():
+        width = rows[name].shape[1] if rows[name].ndim == 2 else 1
+        rows[name] = table[:, column : column + width] if rows[name].ndim == 2 else table[:, column]
+        column += width
+    if column != table.shape[1]:
+        raise ValueError(f"{table.shape[1]} numbers a line, {column} properties")
+    return rows
+
+
+def _size(file: BinaryIO) -> int:
+    here = file.tell()
+    size = file.seek(0, 2)
+    file.seek(here)
+    return size

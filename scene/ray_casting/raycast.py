@@ -1,0 +1,263 @@
+"""The ray-casting interface: rays against one triangle mesh, with hits refined in float64.
+
+Embree and OptiX trace in single precision (6 um rms at 100 m). The triangle that was hit is known, so the distance is computed
+again in float64 against that triangle's plane; which of two triangles a ray within some micrometres of their common edge meets is
+settled in float64 on request. All arrays stay on the device, lazily, so that a sensor's whole chain fuses
+into one kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.common.backend import dr, mi
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.ray_casting.upload import on_device, vectors_on_device
+
+DEFAULT_ALBEDO = 0.5
+_LARGEST_COORDINATE = 1e4
+"""Metres from the frame's origin beyond which float32 leaves less than a millimetre."""
+
+_EDGE_SHARE = 3e-4
+"""Barycentric coordinate below which a hit counts as near an edge: 15 um on a triangle 5 cm high, as float32 errs at 100 m."""
+_ASIDE = 3e-7
+"""Offset of the rays beside a ray, over its length: 30 um at 100 m, more than its direction's rounding to float32."""
+_AROUND = ((1.0, 0.0), (-0.5, 0.75**0.5), (-0.5, -(0.75**0.5)))
+"""Directions of the rays beside a ray: on both sides of any line through it."""
+_ROUNDING = 1e-11
+"""Of barycentric coordinates in float64: a ray through an edge goes through at least one of its faces."""
+
+_SIGHTS = 4096
+"""Lines of sight that tell which side of a surface is seen."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What n rays hit, as lazy device arrays; entries of rays that hit nothing are meaningless where `valid` is False.
+
+    valid: (n,) bool; distance: (n,) float64, in lengths of the direction vector (m for unit directions); face: (n,) uint32;
+    normal: 3 x (n,) float32 unit vectors, outside; albedo: (n,) float32; block: (n,) int32 label of the face, WALL for a miss.
+    """
+
+    valid: mi.Bool
+    distance: mi.Float64
+    face: mi.UInt32
+    normal: mi.Vector3f
+    albedo: mi.Float32
+    block: mi.Int32
+
+
+class RayCaster:
+    """A mesh prepared for ray casting, in a frame whose origin is near (the wall frame).
+
+    mesh: as given; bare: Mitsuba's own scene of it, which casts in single precision and refines nothing.
+    """
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        if len(mesh.faces) == 0:
+            raise InputError("the mesh has no triangles", where="ray casting")
+        if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
+            raise InputError(
+                f"coordinates reach {np.abs(mesh.bounds).max():.0f} m", where="ray casting", remedy="work in the wall frame"
+            )
+        self.mesh = mesh
+        shape = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))
+        parameters = mi.traverse(shape)
+        self._vertices = on_device(mi.Float64, mesh.vertices)
+        self._face_vertices = on_device(mi.UInt32, mesh.faces)
+        parameters["vertex_positions"] = on_device(mi.Float32, mesh.vertices)
+        parameters["faces"] = self._face_vertices
+        parameters.update()
+        self.bare = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "surface": shape})
+
+    @cached_property
+    def _records(self) -> mi.Float32:
+        """(8 m,) float32, one record per face, half a cache line, so that a hit costs one visit to memory.
+
+        The face's plane is n . x = d with n scaled so that its largest component, along `axis`, is +-1; the other two (cyclic
+        order after the axis) and d are sums of two float32, which keep 48 bits. In order: n_1 high, n_1 low, n_2 high, n_2 low,
+        d high, d low, albedo, 6 block + 2 axis + (1 where n's largest component is negative).
+        """
+        index = dr.arange(mi.UInt32, len(self.mesh.faces))
+        blocks = self.mesh.face_block
+        labels = mi.Int32(WALL) if blocks is None else on_device(mi.Int32, blocks)
+        vertex = [dr.gather(mi.UInt32, self._face_vertices, 3 * index + corner) for corner in range(3)]
+        corner, second, third = (dr.gather(mi.Array3f64, self._vertices, number) for number in vertex)
+        normal = dr.cross(second - corner, third - corner)
+        axis, largest = _largest_component(normal)
+        normal /= dr.abs(largest)  # NaN for a face without area, which is never hit
+        following = dr.select(axis == 0, normal.y, dr.select(axis == 1, normal.z, normal.x))
+        last = dr.select(axis == 0, normal.z, dr.select(axis == 1, normal.x, normal.y))
+        code = mi.Float32(6 * labels + 2 * mi.Int32(axis) + dr.select(largest < 0, 1, 0))  # exact below 2^24: 2.7 million blocks
+        columns = [part for value in (following, last, dr.dot(normal, corner)) for part in _split(value)]
+        records = dr.empty(mi.Float32, 8 * len(self.mesh.faces))
+        columns += [self._albedo(vertex), code]
+        dr.eval(columns)
+        for half in (0, 1):
+            dr.scatter(records, mi.Array4f(*columns[4 * half : 4 * half + 4]), 2 * index + half)
+        dr.eval(records)
+        return records
+
+    def _albedo(self, vertex: list[mi.UInt32]) -> mi.Float32:
+        """Mean albedo of each face's three vertices."""
+        if self.mesh.vertex_albedo is None:
+            return mi.Float32(DEFAULT_ALBEDO)
+        albedo = on_device(mi.Float32, self.mesh.vertex_albedo)
+        return sum((dr.gather(mi.Float32, albedo, number) for number in vertex), mi.Float32(0)) / 3
+
+    def intersect(self, origin: mi.Array3f64, direction: mi.Array3f64, *, coherent: bool = True, exact: bool = False) -> Hits:
+        """Cast rays; origin, direction: 3 x (n,) float64, m. The direction need not be of unit length.
+
+        exact: decide in float64 which face a ray near an edge meets, instead of leaving that to the single precision.
+        """
+        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+        found = self.bare.ray_intersect_preliminary(ray, coherent=coherent)
+        valid, face = found.is_valid(), found.prim_index
+        if exact:
+            u, v = found.prim_uv
+            at_edge = valid & ((u < _EDGE_SHARE) | (v < _EDGE_SHARE) | (1 - u - v < _EDGE_SHARE))
+            face = self._settle(face, origin, direction, at_edge)
+        first = dr.gather(mi.Array4f, self._records, 2 * face, valid)
+        second = dr.gather(mi.Array4f, self._records, 2 * face + 1, valid)
+        code = mi.UInt32(second.w)
+        block, rest = code // 6, code % 6
+        normal = _plane_normal(rest >> 1, (rest & 1) == 1, _joined(first.x, first.y), _joined(first.z, first.w))
+        distance = (_joined(second.x, second.y) - dr.dot(normal, origin)) / dr.dot(normal, direction)
+        return Hits(valid, distance, face, dr.normalize(mi.Vector3f(normal)), second.z, mi.Int32(block))
+
+    def _settle(self, face: mi.UInt32, origin: mi.Array3f64, direction: mi.Array3f64, at_edge: mi.Bool) -> mi.UInt32:
+        """The face that the ray meets first in float64, of the one found and those that three rays beside it meet.
+
+        face: (n,) as found; at_edge: (n,) the rays to settle, a small share; the others keep their face.
+        """
+        ahead = dr.normalize(mi.Vector3f(direction))
+        side, other = mi.coordinate_system(ahead)
+        reach = mi.Float64(_ASIDE) * dr.norm(direction)
+        distance, inside = self._meets(face, origin, direction, at_edge)
+        nearest = dr.select(at_edge & inside & (distance < np.inf), distance, np.inf)
+
+        def beside(number: mi.UInt32, nearest: mi.Float64, settled: mi.UInt32) -> tuple[mi.UInt32, mi.Float64, mi.UInt32]:
+            (right, *rights), (up, *ups) = zip(*_AROUND, strict=True)
+            right = dr.select(number == 0, mi.Float32(right), dr.select(number == 1, *(mi.Float32(each) for each in rights)))
+            up = dr.select(number == 0, mi.Float32(up), dr.select(number == 1, *(mi.Float32(each) for each in ups)))
+            aside = mi.Array3f64(right * side + up * other)
+            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction + reach * aside))
+            found = self.bare.ray_intersect_preliminary(ray, active=at_edge)
+            candidate = dr.select(found.is_valid(), found.prim_index, face)
+            distance, inside = self._meets(candidate, origin, direction, at_edge)
+            better = inside & (distance < nearest)
+            return number + 1, dr.select(better, distance, nearest), dr.select(better, candidate, settled)
+
+        start = (mi.UInt32(0), nearest, face)
+        return dr.while_loop(start, lambda number, *_: at_edge & (number < len(_AROUND)), beside)[2]
+
+    def _meets(
+        self, face: mi.UInt32, origin: mi.Array3f64, direction: mi.Array3f64, active: mi.Bool
+    ) -> tuple[mi.Float64, mi.Bool]:
+        """Distance to the plane of `face` and whether the ray goes through the face, in float64 (Moeller and Trumbore 1997)."""
+        numbers = (dr.gather(mi.UInt32, self._face_vertices, 3 * face + corner, active) for corner in range(3))
+        a, b, c = (dr.gather(mi.Array3f64, self._vertices, number, active) for number in numbers)
+        b, c, offset = b - a, c - a, origin - a
+        across, around = dr.cross(direction, c), dr.cross(offset, b)
+        scale = 1 / dr.dot(b, across)
+        u, v, distance = scale * dr.dot(offset, across), scale * dr.dot(direction, around), scale * dr.dot(c, around)
+        return distance, (u >= -_ROUNDING) & (v >= -_ROUNDING) & (u + v <= 1 + _ROUNDING) & (distance > 0)
+
+    def occluded(self, origin: mi.Array3f64, direction: mi.Array3f64, length: mi.Float64, *, coherent: bool = True) -> mi.Bool:
+        """Whether something lies on each ray before `length` (n,), m for unit directions."""
+        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+        ray.maxt = mi.Float(length)
+        return self.bare.ray_test(ray, coherent=coherent)
+
+    def nearest_vertex_label(self, hits: Hits, point: mi.Array3f64, labels: mi.Int32) -> mi.Int32:
+        """(n,) the label, out of one per vertex, of the hit face's vertex that is nearest to `point` (3 x (n,), m)."""
+        nearest, result = mi.Float32(np.inf), mi.Int32(WALL)
+        for corner in range(3):
+            vertex = dr.gather(mi.UInt32, self._face_vertices, 3 * hits.face + corner, hits.valid)
+            position = dr.gather(mi.Array3f64, self._vertices, vertex, hits.valid)
+            distance = mi.Float32(dr.squared_norm(position - point))
+            nearer = distance < nearest
+            result = dr.select(nearer, dr.gather(mi.Int32, labels, vertex, hits.valid), result)
+            nearest = dr.select(nearer, distance, nearest)  # dr.minimum aborts in LLVM 15
+        return dr.select(hits.valid, result, WALL)
+
+    def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Cast rays given as NumPy arrays, (n, 3) each, m; returns distance and face (n,); a miss is NaN and -1."""
+        rays = (vectors_on_device(np.broadcast_to(array, directions.shape)) for array in (origins, directions))
+        hits = self.intersect(*rays, coherent=False)
+        distance = dr.select(hits.valid, hits.distance, np.nan)
+        face = dr.select(hits.valid, mi.Int32(hits.face), -1)
+        dr.eval(distance, face)
+        return np.array(distance), np.array(face)
+
+    def sides_seen(self, position: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+        """The faces that lines of sight from `position` (3,) meet first, and which of them are met from behind.
+
+        The lines go to some thousands of the mesh's vertices.
+        """
+        vertices = self.mesh.vertices[:: max(len(self.mesh.vertices) // _SIGHTS, 1)]
+        sight = vertices - position
+        _, face = self.cast(position, sight)
+        met = face >= 0
+        return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
+
+    def labels_down(self, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
+        """(h, w) the label of the face seen along -z from each pixel's centre minus `shift_m` ((h, w, 2) in x and y)."""
+        hits, _ = self.look_down(grid, shift_m)
+        return np.array(hits.block).reshape(grid.shape)
+
+    def look_down(self, grid: Grid, shift_m: NDArray[np.float32] | None = None) -> tuple[Hits, mi.Array3f64]:
+        """Cast one ray per pixel centre of `grid` along -z from above the mesh, row by row; returns hits and points.
+
+        shift_m: (h, w, 2) by which the rays stand aside, towards -x and -y.
+        """
+        index = dr.arange(mi.UInt32, grid.width * grid.height)
+        row, column = index // grid.width, index % grid.width
+        top = float(self.mesh.bounds[1, 2]) + 1.0
+        x_min, y_max, gsd, start = (dr.opaque(mi.Float64, value) for value in (grid.x_min, grid.y_max, grid.gsd, top))
+        x, y = x_min + (column + 0.5) * gsd, y_max - (row + 0.5) * gsd
+        if shift_m is not None:
+            x, y = (place - on_device(mi.Float64, shift_m[..., axis]) for axis, place in enumerate((x, y)))
+        origin = mi.Array3f64(x, y, start)
+        hits = self.intersect(origin, mi.Array3f64(0.0, 0.0, -1.0))
+        return hits, mi.Array3f64(origin.x, origin.y, origin.z - hits.distance)
+
+
+def _largest_component(vector: mi.Array3f64) -> tuple[mi.UInt32, mi.Float64]:
+    """Axis and value of the component that is largest in magnitude."""
+    size = dr.abs(vector)
+    axis = dr.select(size.x >= size.y, dr.select(size.x >= size.z, 0, 2), dr.select(size.y >= size.z, 1, 2))
+    return mi.UInt32(axis), dr.select(axis == 0, vector.x, dr.select(axis == 1, vector.y, vector.z))
+
+
+def _split(value: mi.Float64) -> tuple[mi.Float32, mi.Float32]:
+    """`value` as the sum of two float32."""
+    high = mi.Float32(value)
+    return high, mi.Float32(value - mi.Float64(high))
+
+
+def _joined(high: mi.Float32, low: mi.Float32) -> mi.Float64:
+    return mi.Float64(high) + mi.Float64(low)
+
+
+def _plane_normal(axis: mi.UInt32, negative: mi.Bool, following: mi.Float64, last: mi.Float64) -> mi.Array3f64:
+    """The vector whose component along `axis` is +-1; `following` and `last` are the next two in cyclic order."""
+    largest = dr.select(negative, mi.Float64(-1.0), mi.Float64(1.0))
+    return mi.Array3f64(
+        dr.select(axis == 0, largest, dr.select(axis == 1, last, following)),
+        dr.select(axis == 1, largest, dr.select(axis == 2, last, following)),
+        dr.select(axis == 2, largest, dr.select(axis == 0, last, following)),
+    )
+
+
+def heights(caster: RayCaster, grid: Grid) -> NDArray[np.float32]:
+    """(height, width) raster of the highest z of the mesh at each pixel centre, m; NaN where there is no surface."""
+    hits, point = caster.look_down(grid)
+    z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
+    return np.array(z).reshape(grid.shape)

@@ -1,0 +1,103 @@
+"""The wall's surface within the contours of blocks: its relief and its median height.
+
+A contour is the convex hull of a block's vertices in the wall's plane; a block is convex but for its irregularity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.geometry.under_boxes import faces_under
+from scene.ray_casting.raycast import RayCaster
+
+_SIDE = 16
+"""Heights are looked up at so many places across a contour and along it, and at four times as many on its edge."""
+
+
+def highest_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
+    """(k,) the largest z of the wall within each contour, m; -inf where there is no wall.
+
+    outlines: of each block points (n, 2) whose hull is its contour, m.
+    """
+    hulls = [_Hull(points) for points in outlines]
+    tops = np.array([values.max(initial=-np.inf) for values in _heights(caster, hulls)])
+    return np.maximum(tops, _highest_vertex(caster.mesh, hulls))
+
+
+def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
+    """(k,) the largest z of the wall's vertices within each contour, m; where it holds none, as `highest_under`."""
+    tops = _highest_vertex(caster.mesh, [_Hull(points) for points in outlines])
+    bare = np.flatnonzero(np.isneginf(tops))
+    if bare.size:
+        tops[bare] = highest_under(caster, [outlines[index] for index in bare.tolist()])
+    return tops
+
+
+def median_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
+    """(k,) the median z of the wall over each contour, m; -inf where there is no wall. outlines: as in `highest_under`."""
+    found = _heights(caster, [_Hull(points) for points in outlines], edges=False)
+    return np.array([np.median(values) if values.size else -np.inf for values in found])
+
+
+class _Hull:
+    """The convex hull of (n, 2) points: corners (m, 2), and (m, 3) lines a x + b y + c that are at most 0 inside."""
+
+    def __init__(self, points: FloatArray) -> None:
+        from scipy.spatial import ConvexHull
+
+        hull = ConvexHull(points)
+        self.corners: FloatArray = points[hull.vertices]
+        self._lines: FloatArray = hull.equations
+
+    @property
+    def box(self) -> FloatArray:
+        """(2, 2) smallest and largest x and y."""
+        return np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
+
+    def holds(self, points: FloatArray) -> NDArray[np.bool_]:
+        """(n,) whether points (n, 2) lie in it."""
+        return np.asarray((points @ self._lines[:, :2].T + self._lines[:, 2] <= 0).all(axis=1))
+
+    def edge(self) -> FloatArray:
+        """(n, 2) the corners and even places between them."""
+        ends = np.concatenate([self.corners, self.corners[:1]])
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
+        places = np.concatenate([along[:-1], np.linspace(0, along[-1], 4 * _SIDE, endpoint=False)])
+        return np.column_stack([np.interp(places, along, ends[:, axis]) for axis in (0, 1)])
+
+    def grid(self) -> FloatArray:
+        """(n, 2) even places in it."""
+        low, high = self.box
+        steps = (np.arange(_SIDE) + 0.5) / _SIDE
+        places = low + (high - low) * np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        return places[self.holds(places)]
+
+
+def _heights(caster: RayCaster, hulls: Sequence[_Hull], *, edges: bool = True) -> list[FloatArray]:
+    """Of each hull the heights of the wall, seen along -z, at even places in it and, if asked for, on its edge."""
+    places = [np.concatenate([hull.grid(), hull.edge()]) if edges else hull.grid() for hull in hulls]
+    flat = np.concatenate(places)
+    start = np.column_stack([flat, np.full(len(flat), caster.mesh.bounds[1, 2] + 1.0)])
+    distance, _ = caster.cast(start, np.tile([0.0, 0.0, -1.0], (len(flat), 1)))
+    parts = np.split(start[:, 2] - distance, np.cumsum([len(each) for each in places])[:-1])
+    return [part[np.isfinite(part)] for part in parts]
+
+
+def _highest_vertex(mesh: TriangleMesh, hulls: Sequence[_Hull]) -> FloatArray:
+    """(k,) the largest z of the vertices within each hull, -inf where there are none."""
+    boxes = np.stack([hull.box for hull in hulls])
+    near = np.unique(mesh.faces[faces_under(mesh, boxes)])
+    vertices = mesh.vertices[near]
+    vertices = vertices[np.argsort(vertices[:, 0], kind="stable")]
+    first = np.searchsorted(vertices[:, 0], boxes[:, 0, 0], side="left")
+    last = np.searchsorted(vertices[:, 0], boxes[:, 1, 0], side="right")
+    tops = np.full(len(hulls), -np.inf)
+    for number, (hull, (low, high)) in enumerate(zip(hulls, boxes[:, :, 1], strict=True)):
+        strip = vertices[first[number] : last[number]]
+        strip = strip[(strip[:, 1] >= low) & (strip[:, 1] <= high)]
+        tops[number] = strip[hull.holds(strip[:, :2]), 2].max(initial=-np.inf)
+    return tops

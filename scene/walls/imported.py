@@ -1,0 +1,230 @@
+"""Surfaces read from mesh files: rock walls, which are mended, and references, which stay as they are."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from scene.common.config import Config
+from scene.common.errors import InputError, nearest
+from scene.common.regular_file import check_file
+from scene.geometry.mesh import TriangleMesh
+from scene.meshes.cleaning import clean, drop_unused, flipped
+from scene.meshes.ply import read_elements
+from scene.meshes.rounding import check_rounding
+
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it cannot do comes as an exception, or is a texture
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+_SMALLEST_M, _LARGEST_M = 0.5, 5000.0
+"""A wall smaller or larger than this is likely to be in another unit."""
+_FARTHEST_M = 1e8
+"""No coordinate system of the earth reaches so far: geocentric coordinates are up to 6.4e6 m, northings up to 1e7 m."""
+_MOST_BYTES = 2_000_000_000
+"""Of a file that trimesh reads, which takes it into memory as a whole, and several times that for its parts."""
+_ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
+_COLOURS = ("red", "green", "blue")
+_TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
+"""Names of vertices' colours in a PLY file, and of what textures hang on."""
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""ITU-R BT.709, of linear red, green and blue."""
+
+
+class ImportedWall(Config):
+    """A wall from a mesh file in any format that trimesh reads."""
+
+    mesh: Path = Field(description="mesh file (ply, obj, stl, off, glb, ...), in the survey's coordinates")
+    unit: Literal["m", "cm", "mm", "ft"] = Field("m", description="of the file's coordinates")
+    flipped: bool = Field(
+        False,
+        description="the file's triangles are clockwise seen from the sensors' side; told by itself where the sensor's place is "
+        "given in coordinates",
+    )
+    albedo: float | None = Field(
+        None, ge=0.0, le=1.0, description="of the whole wall; if not given the file's own, or the luminance of its vertex colours"
+    )
+
+    def load(self) -> tuple[TriangleMesh, tuple[str, ...]]:
+        """The cleaned mesh in the world frame, m, and what was mended. Raises InputError where the file cannot be used."""
+        where = str(self.mesh)
+        mesh, notes = read_mesh(self.mesh, self.unit)
+        self._check_extent(mesh)
+        origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres: taken off and added again without loss
+        mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where)
+        if self.flipped:
+            mesh = flipped(mesh, np.ones(len(mesh.faces), bool))
+        if self.albedo is not None:
+            mesh = replace(mesh, vertex_albedo=np.full(len(mesh.vertices), self.albedo, np.float32))
+        return mesh.with_vertices(mesh.vertices + origin), (*repairs, *notes)
+
+    def _check_extent(self, mesh: TriangleMesh) -> None:
+        extent = _extent(mesh)
+        if not _SMALLEST_M <= extent <= _LARGEST_M:
+            likely = [unit for unit, metres in _METRES.items() if 2 <= extent / _METRES[self.unit] * metres <= 1000]
+            remedy = f"set `unit` to {' or '.join(likely)} if that is the file's unit" if likely else "check the file"
+            raise InputError(
+                f"the wall is {extent:.4g} m in size with `unit: {self.unit}`",
+                where=str(self.mesh),
+                allowed=f"{_SMALLEST_M} m to {_LARGEST_M:.0f} m",
+                remedy=remedy,
+            )
+
+
+def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """A surface as known, m, and notes. Its vertices are as in the file: cleaning would move what is measured against it.
+
+    Raises InputError where the file cannot be used.
+    """
+    mesh, notes = read_mesh(path)
+    if (extent := _extent(mesh)) > _LARGEST_M:
+        size = f"the surface is {extent:.4g} m in size"
+        raise InputError(size, where=str(path), allowed=f"up to {_LARGEST_M:.0f} m", remedy="give it in metres, cut to the scene")
+    mesh, words = drop_unused(mesh)
+    return mesh, (*notes, *([words] if words else []))
+
+
+def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...]]:
+    """The triangles of a file, m, and notes on their coordinates.
+
+    Raises InputError where the file cannot be read, and for coordinates that are not finite, no place on earth or rounded away.
+    """
+    where, metres = str(path), _METRES[unit]
+    mesh = _read(path)
+    _check_coordinates(mesh, metres, where)
+    notes = check_rounding(mesh, metres, where)
+    return (mesh if metres == 1 else mesh.with_vertices(mesh.vertices * metres)), notes
+
+
+def _extent(mesh: TriangleMesh) -> float:
+    """The longest side of the box about all triangles, m."""
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces] = True
+    return max(float(np.ptp(column[used])) for column in mesh.vertices.T)
+
+
+def _read(path: Path) -> TriangleMesh:
+    """The file's triangles as they are, in the file's unit; all meshes of a scene joined."""
+    where, kind = str(path), _format(path)
+    if not path.exists():
+        raise InputError("there is no such file", where=where, remedy="check the path")
+    check_file(path)
+    if kind == "ply" and (plain := _plain_ply(path)) is not None:
+        return plain
+    check_file(path, most_bytes=_MOST_BYTES, smaller="export it as a binary PLY of triangles, which can have any size")
+    import trimesh
+
+    options = {"skip_materials": True} if kind == "obj" else {}
+    try:
+        loaded = trimesh.load(str(path), file_type=kind, process=False, resolver=_beside(path), **options)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the permissions") from None
+    except Exception as error:  # trimesh's readers raise whatever their parsing meets
+        problem = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"is not a valid {kind} file: {problem}", where=where, remedy="export it anew") from None
+    faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
+    if not len(faces):
+        raise InputError(
+            "holds no triangles",
+            where=where,
+            remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
+        )
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
+        raise InputError(problem, where=where, allowed="3 and 3", remedy="export it anew, as triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
+    return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
+
+
+def _beside(path: Path) -> Any:
+    """trimesh's way to what a mesh file names, such as its buffers: files of its folder, no pipes and none too large."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Beside(FilePathResolver):
+        def absolute(self, name: str) -> Path:
+            found: Path = super().absolute(name)
+            return check_file(found, most_bytes=_MOST_BYTES) if found.exists() else found
+
+    return Beside(str(path))
+
+
+def _plain_ply(path: Path) -> TriangleMesh | None:
+    """A PLY file of triangles, at most with an albedo or colours of 8 bits per vertex; None where there is more to it.
+
+    That is for trimesh to read; the same mesh as trimesh's, without the second that the import of trimesh takes.
+    """
+    try:
+        elements = read_elements(path)
+        vertex, face = elements["vertex"], elements["face"]
+        faces = face["vertex_indices" if "vertex_indices" in face else "vertex_index"]
+        vertices = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    except (InputError, KeyError):
+        return None
+    colours = [vertex[name] for name in _COLOURS if name in vertex]
+    more = "edge" in elements or not {*vertex, *face}.isdisjoint(_TEXTURE) or not set(face).isdisjoint(_COLOURS)
+    if more or any(colour.dtype != np.uint8 for colour in colours):
+        return None
+    if faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+        return None
+    albedo = vertex["albedo"].astype(np.float32) if "albedo" in vertex else None
+    albedo = _luminance(np.stack(colours, axis=1)) if albedo is None and len(colours) == 3 else albedo
+    return TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), albedo)
+
+
+def _format(path: Path) -> str:
+    """The file's format by its suffix; InputError where trimesh has no mesh reader for it."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "ply":
+        return kind
+    import trimesh
+
+    known = sorted(set(trimesh.available_formats()) - _ARCHIVES)
+    if kind not in known:
+        raise InputError(
+            f"'{path.suffix}' is no mesh format that can be read",
+            where=str(path),
+            allowed=", ".join(known),
+            remedy=nearest(kind, known),
+        )
+    return kind
+
+
+def _check_coordinates(mesh: TriangleMesh, metres: float, where: str) -> None:
+    finite = np.all(np.isfinite(mesh.vertices), axis=1)
+    _require(finite, mesh, "are not finite", where, "finite coordinates")
+    near = np.all(np.abs(mesh.vertices) <= _FARTHEST_M / metres, axis=1)
+    _require(near, mesh, "are no place on earth", where, f"coordinates of up to {_FARTHEST_M:.0e} m")
+
+
+def _require(good: NDArray[Any], mesh: TriangleMesh, problem: str, where: str, allowed: str) -> None:
+    """Raise InputError that names the first vertex that is not good (n,)."""
+    if not good.all():
+        first = int(np.argmin(good))
+        coordinates = ", ".join(f"{value:g}" for value in mesh.vertices[first])
+        raise InputError(
+            f"{int(np.sum(~good))} of {len(good)} vertices {problem}, the first is vertex {first} at ({coordinates})",
+            where=where,
+            allowed=allowed,
+            remedy="remove these vertices and the triangles that use them",
+        )
+
+
+def _albedo(mesh: Any) -> NDArray[np.float32] | None:
+    """(n,) relative luminance of the vertex colours (sRGB, IEC 61966-2-1), None where there are none."""
+    if getattr(mesh.visual, "kind", None) != "vertex":
+        return None
+    return _luminance(np.asarray(mesh.visual.vertex_colors)[:, :3])
+
+
+def _luminance(colours: NDArray[np.integer]) -> NDArray[np.float32]:
+    """(n,) relative luminance of (n, 3) sRGB colours of 8 bits."""
+    colour = colours / 255.0
+    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    return np.einsum("nc,c->n", linear, _LUMINANCE).astype(np.float32)

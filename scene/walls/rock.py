@@ -1,0 +1,226 @@
+"""What a procedural rock wall is made of: smooth noise, bedded and jointed blocks, erosional notches.
+
+Each part is a function of the position (u along the wall, v up its slope, m) drawn on lattices of fixed size, so that the same
+rock comes out at every sampling. Parts return float32 arrays; positions are regular axes, or arrays bent by other parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+
+Field = NDArray[np.float32]
+Size = tuple[float, float]
+"""Width and height of the wall plane, m."""
+
+_MARGIN_M = 6.0
+"""How far the tables of blocks reach beyond the wall, so that bent coordinates stay inside them."""
+_TABLE_STEP_M = 0.01
+_NOTCH_STEP_M = 0.05
+_RAMP_PER_STEP = 0.25
+"""Width of a step between blocks over its height: steep, but nowhere upright."""
+
+
+@dataclass(frozen=True)
+class SplineNoise:
+    """Smooth noise of unit standard deviation: a uniform cubic B-spline over a lattice of keyed normal numbers.
+
+    lattice: (rows, columns) control values, row k at v = (k - 1) step_v_m.
+    """
+
+    lattice: Field
+    step_u_m: float
+    step_v_m: float
+
+    @classmethod
+    def make(cls, random: KeyedRandom, size: Size, step_u_m: float, step_v_m: float | None = None) -> SplineNoise:
+        step_v_m = step_u_m if step_v_m is None else step_v_m
+        shape = int(size[1] / step_v_m) + 5, int(size[0] / step_u_m) + 5
+        deviation = 0.4795  # of the spline between knots, as the mean square over a cell is (151/315)^2
+        return cls(random.generator().standard_normal(shape, dtype=np.float32) / deviation, step_u_m, step_v_m)
+
+    def at(self, u: FloatArray, v: FloatArray) -> Field:
+        """(len(v), len(u)) values on the regular grid of the axes u and v."""
+        column, weight_u = _spline_weights(u, self.step_u_m)
+        row, weight_v = _spline_weights(v, self.step_v_m)
+        lattice = self.lattice[row[0] : row[-1] + 4]
+        along = sum(lattice[:, column + k] * weight_u[k] for k in range(4))
+        return sum(along[row - row[0] + k] * weight_v[k][:, None] for k in range(4))
+
+
+def _spline_weights(x: FloatArray, step: float) -> tuple[NDArray[np.intp], Field]:
+    """First lattice index (n,) and the four cubic B-spline weights (4, n) of each position."""
+    cell = np.floor(x / step)
+    f = x / step - cell
+    weights = np.stack([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3]) / 6
+    return cell.astype(np.intp), weights.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Fractal:
+    """Noise summed over octaves whose amplitude follows amplitude_m (step / 1 m)^hurst: self-affine roughness."""
+
+    octaves: tuple[tuple[float, SplineNoise], ...]
+
+    @classmethod
+    def make(
+        cls, random: KeyedRandom, size: Size, amplitude: float, hurst: float, steps_m: tuple[float, float], aspect: float
+    ) -> Fractal:
+        """Octaves from the coarsest step halved down to the finest; aspect: how much longer the grain is up the wall."""
+        coarsest, finest = steps_m
+        steps = [coarsest / 2**k for k in range(round(np.log2(coarsest / finest)) + 1)]
+        noises = (SplineNoise.make(random.child(k), size, step, step * aspect) for k, step in enumerate(steps))
+        return cls(tuple((amplitude * step**hurst, noise) for step, noise in zip(steps, noises, strict=True)))
+
+    def at(self, u: FloatArray, v: FloatArray) -> Field:
+        total = np.zeros((len(v), len(u)), np.float32)
+        for amplitude, noise in self.octaves:
+            total += np.float32(amplitude) * noise.at(u, v)
+        return total
+
+
+@dataclass(frozen=True)
+class Table:
+    """A function of one coordinate, sampled every centimetre from `start` and interpolated linearly; constant beyond its ends."""
+
+    start: float
+    values: Field
+
+    @classmethod
+    def through(cls, knots: FloatArray, values: FloatArray) -> Table:
+        """The piecewise linear function through (knots, values), knots ascending."""
+        x = np.arange(knots[0], knots[-1] + _TABLE_STEP_M, _TABLE_STEP_M)
+        return cls(float(knots[0]), np.interp(x, knots, values).astype(np.float32))
+
+    def at(self, x: Field) -> Field:
+        column = (x - np.float32(self.start)) / np.float32(_TABLE_STEP_M)
+        return _look_up(self.values[None], column, np.zeros_like(column))
+
+
+@dataclass(frozen=True)
+class BlockRule:
+    """How rock is parted: beds across s, joints across t, and how far the blocks between them stand out.
+
+    bed_m, joint_m: mean spacings; offset_m: scale of the blocks' offsets (Laplace: most stay, few stick out or are gone); tilt:
+    standard deviation of the slope of a block's face; dip: slope of the beds along the wall; lean: slope of the joints from the
+    line of greatest slope; ramp_m: width over which a step between beds climbs; spread: log-standard deviation of the
+    spacings.
+    """
+
+    bed_m: float
+    joint_m: float
+    offset_m: float
+    tilt: float = 0.03
+    dip: float = 0.0
+    lean: float = 0.0
+    ramp_m: float = 0.05
+    spread: float = 0.45
+
+
+@dataclass(frozen=True)
+class JointedBlocks:
+    """Blocks between beds and joints: tables over (bed, t) of the face's height, its slope across the bed and its tone.
+
+    row: the table row of s, whole inside a bed and running to the next over the ramp, so that bilinear interpolation of the
+    tables makes the steps between beds; across: distance of s from the middle of its bed, m; start: t of the first column, m.
+    """
+
+    rule: BlockRule
+    row: Table
+    across: Table
+    start: float
+    height: Field
+    slope: Field
+    tone: Field
+
+    @classmethod
+    def make(cls, random: KeyedRandom, size: Size, rule: BlockRule) -> JointedBlocks:
+        draw = random.generator()
+        reach_s, reach_t = _MARGIN_M + abs(rule.dip) * size[0], _MARGIN_M + abs(rule.lean) * size[1]
+        beds = partings(draw, -reach_s, size[1] + reach_s, rule.bed_m, rule.spread)
+        t = np.arange(-reach_t, size[0] + reach_t, _TABLE_STEP_M)
+        height, slope, tone = np.stack([_bed_profile(draw, t, thickness, rule) for thickness in np.diff(beds)], axis=1)
+        knots = ramp_knots(beds[1:-1], rule.ramp_m)
+        row, middle = np.arange(len(beds) - 1.0), (beds[1:] + beds[:-1]) / 2
+        row_table = Table.through(knots, np.repeat(row, 2)[1:-1])
+        middles = np.repeat(middle, 2)[1:-1]
+        return cls(rule, row_table, Table.through(knots, knots - middles), float(t[0]), height, slope, tone)
+
+    def at(self, u: Field, v: Field) -> tuple[Field, Field]:
+        """Offset of the face, m, and tone (standard normal per block) at bent positions u, v, m."""
+        s = v - np.float32(self.rule.dip) * u
+        t = u - np.float32(self.rule.lean) * v
+        column = (t - np.float32(self.start)) / np.float32(_TABLE_STEP_M)
+        row = self.row.at(s)
+        height = _look_up(self.height, column, row)
+        height += self.across.at(s) * _look_up(self.slope, column, row)
+        return height, _look_up(self.tone, column, row)
+
+
+@dataclass(frozen=True)
+class Notches:
+    """Concave erosional notches on a 5 cm lattice: a steep roof above, a longer floor below, depth in m (positive inwards)."""
+
+    depth: Field
+
+    @classmethod
+    def make(cls, random: KeyedRandom, size: Size, per_m2: float, median_m: float) -> Notches:
+        draw = random.generator()
+        u, v = (np.arange(0.0, extent + _NOTCH_STEP_M, _NOTCH_STEP_M) for extent in size)
+        depth = np.zeros((len(v), len(u)), np.float32)
+        for _ in range(round(per_m2 * size[0] * size[1])):
+            centre_u, centre_v = draw.uniform(0, size)
+            half = median_m / 2 * np.exp(0.5 * draw.standard_normal())
+            stretch = np.exp(0.4 * draw.standard_normal())
+            columns = slice(*np.searchsorted(u, centre_u + half * stretch * np.array([-1, 1])))
+            rows = slice(*np.searchsorted(v, centre_v + half * np.array([-1, 0.5])))
+            q_v = (v[rows] - centre_v) / np.where(v[rows] > centre_v, 0.5 * half, half)
+            q = ((u[columns] - centre_u) / (half * stretch)) ** 2 + q_v[:, None] ** 2
+            bowl = 0.35 * half * np.sqrt(np.maximum(1 - q, 0))
+            depth[rows, columns] = np.maximum(depth[rows, columns], bowl)
+        return cls(depth)
+
+    def at(self, u: Field, v: Field) -> Field:
+        return _look_up(self.depth, u / np.float32(_NOTCH_STEP_M), v / np.float32(_NOTCH_STEP_M))
+
+
+def partings(draw: np.random.Generator, start: float, stop: float, mean: float, spread: float) -> FloatArray:
+    """Ascending positions from `start` to past `stop` with lognormal spacings of the given mean, m."""
+    count = int(2 * (stop - start) / mean) + 8
+    spacing = mean * np.exp(spread * draw.standard_normal(count) - spread**2 / 2)
+    edges = start - mean * draw.uniform() + np.concatenate([[0.0], np.cumsum(spacing)])
+    return edges[: np.searchsorted(edges, stop) + 2]
+
+
+def ramp_knots(edges: FloatArray, ramp: float | FloatArray) -> FloatArray:
+    """Two knots about each edge, `ramp` apart, or less where the edges are close: where a step begins and where it ends."""
+    half = np.broadcast_to(np.asarray(ramp) / 2, edges.shape).copy()
+    gap = np.diff(edges)
+    half[1:] = np.minimum(half[1:], 0.4 * gap)
+    half[:-1] = np.minimum(half[:-1], 0.4 * gap)
+    return np.stack([edges - half, edges + half], axis=1).ravel()
+
+
+def _bed_profile(draw: np.random.Generator, t: FloatArray, thickness: float, rule: BlockRule) -> Field:
+    """(3, n) height, slope and tone of one bed's blocks along t; no tilt lifts an edge by more than the offsets' scale."""
+    joints = partings(draw, t[0], t[-1], rule.joint_m, rule.spread)
+    offset, tilt, slope, tone = draw.standard_normal((4, len(joints) - 1))
+    offset = rule.offset_m * np.clip(offset * np.abs(offset), -3, 3)
+    lift = np.clip(rule.tilt * tilt * np.diff(joints) / 2, -rule.offset_m, rule.offset_m)
+    steepest = min(rule.tilt, 2 * rule.offset_m / thickness)
+    face = np.stack([offset - lift, offset + lift], axis=1)
+    ramp = np.clip(_RAMP_PER_STEP * np.abs(face[1:, 0] - face[:-1, 1]), 0.01, 0.12)
+    knots = ramp_knots(joints[1:-1], ramp)
+    ends = face.ravel()[1:-1], np.repeat(steepest * slope, 2)[1:-1], np.repeat(tone, 2)[1:-1]
+    return np.stack([np.interp(t, knots, values) for values in ends]).astype(np.float32)
+
+
+def _look_up(table: Field, column: Field, row: Field) -> Field:
+    """The table, bilinearly interpolated at fractional columns and rows; its edge values beyond it."""
+    return cv2.remap(table, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

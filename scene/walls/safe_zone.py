@@ -1,0 +1,76 @@
+"""The part of a wall where blocks may fall: a binary raster of the mesh, eroded by an offset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray, IntArray
+from scene.geometry.under_boxes import integral
+from scene.ray_casting.raycast import RayCaster, heights
+
+_CELLS = 2e6
+"""Cells of the raster; on a wall of 70 x 45 m they measure 4 cm."""
+
+
+@dataclass(frozen=True)
+class SafeZone:
+    """A raster over the wall frame's XY plane; free: (height, width) bool, True where a block's bounding box may lie."""
+
+    grid: Grid
+    free: NDArray[np.bool_]
+
+    @cached_property
+    def cells(self) -> NDArray[np.intp]:
+        """Flat indices of the free cells."""
+        return np.flatnonzero(self.free)
+
+    @cached_property
+    def _blocked(self) -> IntArray:
+        return integral(~self.free)
+
+    def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
+        """(size, 2) points drawn uniformly from the zone, m."""
+        row, column = np.divmod(self.cells[generator.integers(len(self.cells), size=size)], self.grid.width)
+        within = generator.random((2, size))
+        x = self.grid.x_min + (column + within[0]) * self.grid.gsd
+        y = self.grid.y_max - (row + within[1]) * self.grid.gsd
+        return np.stack([x, y], axis=1)
+
+    def holds(self, boxes: FloatArray) -> NDArray[np.bool_]:
+        """(n,) whether each box (n, 2, 2), smallest and largest x and y in m, touches free cells only."""
+        column, row = self.grid.columns(boxes[:, :, 0]), self.grid.rows(boxes[:, ::-1, 1])
+        inside = (column[:, 0] >= 0) & (row[:, 0] >= 0) & (column[:, 1] < self.grid.width) & (row[:, 1] < self.grid.height)
+        (x0, x1), (y0, y1) = (np.clip(np.floor(index), 0, n - 1).astype(int).T for index, n in self._axes(column, row))
+        sums = self._blocked
+        blocked = sums[y1 + 1, x1 + 1] - sums[y0, x1 + 1] - sums[y1 + 1, x0] + sums[y0, x0]
+        return inside & (blocked == 0)
+
+    def _axes(self, column: FloatArray, row: FloatArray) -> tuple[tuple[FloatArray, int], tuple[FloatArray, int]]:
+        return (column, self.grid.width), (row, self.grid.height)
+
+
+def safe_zone(caster: RayCaster, offset_m: float) -> SafeZone:
+    """Rasterise the wall as seen along -z and erode it by `offset_m` from its border and its holes.
+
+    caster: the wall, wall frame. Raises InputError where nothing is left.
+    """
+    bounds = caster.mesh.bounds
+    extent = bounds[1, :2] - bounds[0, :2]
+    grid = Grid.over(bounds, float(np.sqrt(extent.prod() / _CELLS)))
+    covered = np.pad(np.isfinite(heights(caster, grid)), 1)  # beyond the raster there is no wall
+    distance = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    free = (covered & (distance * grid.gsd > offset_m))[1:-1, 1:-1]
+    if not free.any():
+        raise InputError(
+            f"{offset_m:g} m leave nothing of a wall of {extent[0]:.3g} x {extent[1]:.3g} m",
+            where="safe_zone_offset_m",
+            remedy="make it smaller",
+        )
+    return SafeZone(grid, free)

@@ -1,0 +1,244 @@
+"""The frame camera: Agisoft Metashape's model, its exact inverse, and a pair of cameras.
+
+With (X, Y, Z) in the camera's frame (x right, y down, z forward), x = X/Z, y = Y/Z, r2 = x^2 + y^2:
+    x' = x (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + p1 (r2 + 2 x^2) + 2 p2 x y
+    y' = y (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + p2 (r2 + 2 y^2) + 2 p1 x y
+    u  = width/2 + cx + x' f + x' b1 + y' b2,   v = height/2 + cy + y' f
+(Metashape user manual, appendix D). The centre of the top-left pixel is (0.5, 0.5). Against OpenCV: p1 and p2 change places,
+pixel centres differ by 0.5, k4 and b2 have no counterpart.
+
+The equations use arithmetic only, so they serve NumPy arrays and Dr.Jit arrays alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from scene.common.backend import dr, mi
+from scene.common.config import Config, parse
+from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
+
+_FARTHEST_M = 1e8
+"""No coordinate system of a survey reaches farther."""
+Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+Pixels = Annotated[float, Field(ge=-100_000, le=100_000)]
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+Pose = tuple[FloatArray, FloatArray]
+"""Position (3,), m, and rotation (3, 3), camera to the frame of the position."""
+Side = Literal["left", "right", "both"]
+
+NEWTON_STEPS = 6
+"""Newton steps of the inverse distortion: they converge quadratically, four reach 1e-15 for a lens with 10 % distortion."""
+
+INTERIOR = ("f_px", "cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+"""The interior orientation, in Metashape's names with units (b1, b2 in px)."""
+
+
+class CameraConfig(Config):
+    """One camera: interior orientation in Metashape's model, and exterior orientation in the world frame."""
+
+    width: int = Field(gt=0, le=100_000, description="frame width [px]")
+    height: int = Field(gt=0, le=100_000, description="frame height [px]")
+    f_px: float = Field(gt=0, le=1e7, description="principal distance [px]")
+    cx_px: Pixels = Field(0.0, description="principal point, from the frame's centre [px]")
+    cy_px: Pixels = Field(0.0, description="principal point, from the frame's centre [px]")
+    b1: Pixels = Field(0.0, description="affinity [px]")
+    b2: Pixels = Field(0.0, description="skew [px]")
+    k1: float = Field(0.0, description="radial distortion, r^2")
+    k2: float = Field(0.0, description="radial distortion, r^4")
+    k3: float = Field(0.0, description="radial distortion, r^6")
+    k4: float = Field(0.0, description="radial distortion, r^8")
+    p1: float = Field(0.0, description="tangential distortion, Metashape's order")
+    p2: float = Field(0.0, description="tangential distortion, Metashape's order")
+    position_m: Vector3 = Field(description="perspective centre, world frame [m]")
+    rotation: Matrix3 = Field(description="camera to world (camera x right, y down, z forward)")
+
+    @field_validator("rotation")
+    @classmethod
+    def _orthonormal(cls, rotation: Matrix3) -> Matrix3:
+        return check_rotation(rotation)
+
+    def camera(self) -> Camera:
+        """The camera, world frame. Raises InputError where the distortion cannot be inverted over the frame."""
+        interior = {name: getattr(self, name) for name in INTERIOR}
+        position, rotation = np.array(self.position_m), np.array(self.rotation)
+        camera = Camera(self.width, self.height, **interior, position=position, rotation=rotation)
+        camera.check_invertible()
+        return camera
+
+
+def checked_camera(where: str, size: tuple[float, float], interior: Mapping[str, float], pose: Pose) -> Camera:
+    """A camera out of another program's file, held to the same bounds as our own files (`CameraConfig`).
+
+    size: width and height, px; interior: by the names of INTERIOR, those that are left out are 0; where: what errors call it.
+    """
+    position, rotation = (np.asarray(part, dtype=float).tolist() for part in pose)
+    values = {"width": size[0], "height": size[1], **interior, "position_m": position, "rotation": rotation}
+    return parse(CameraConfig, values, where).camera()
+
+
+def check_rotation(rotation: Matrix3) -> Matrix3:
+    """The rotation itself, or ValueError where it is not orthonormal (1e-6) with determinant +1."""
+    matrix = np.array(rotation)
+    if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
+        raise ValueError("is no rotation matrix (rows must be orthonormal, determinant +1)")
+    return rotation
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with interior orientation (Metashape's model; px) and pose.
+
+    position: (3,) perspective centre, m; rotation: (3, 3), camera to the frame of `position`. On the device (`on_device`) the
+    interior orientation holds Dr.Jit scalars instead of floats, so that one compiled kernel serves all values.
+    """
+
+    width: int
+    height: int
+    f_px: Any
+    cx_px: Any
+    cy_px: Any
+    b1: Any
+    b2: Any
+    k1: Any
+    k2: Any
+    k3: Any
+    k4: Any
+    p1: Any
+    p2: Any
+    position: FloatArray
+    rotation: FloatArray
+
+    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Ideal image coordinates (tangents) to distorted ones; arrays of any one shape."""
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
+        return (
+            x * radial + self.p1 * (r2 + 2 * x * x) + 2 * self.p2 * x * y,
+            y * radial + self.p2 * (r2 + 2 * y * y) + 2 * self.p1 * x * y,
+        )
+
+    def undistort(self, xd: Any, yd: Any) -> tuple[Any, Any]:
+        """Distorted image coordinates to ideal ones, by Newton's method with the analytic Jacobian."""
+        x, y = xd, yd
+        for _ in range(NEWTON_STEPS):
+            fx, fy = self.distort(x, y)
+            jxx, jxy, jyy = self._jacobian(x, y)
+            ex, ey, determinant = fx - xd, fy - yd, jxx * jyy - jxy * jxy
+            x, y = x - (jyy * ex - jxy * ey) / determinant, y - (jxx * ey - jxy * ex) / determinant
+        return x, y
+
+    def _jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Elements xx, xy (= yx) and yy of the Jacobian of `distort`, which is symmetric."""
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
+        slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * (3 * self.k3 + r2 * 4 * self.k4)))  # d radial = slope (x dx + y dy)
+        return (
+            radial + slope * x * x + 6 * self.p1 * x + 2 * self.p2 * y,
+            slope * x * y + 2 * self.p1 * y + 2 * self.p2 * x,
+            radial + slope * y * y + 6 * self.p2 * y + 2 * self.p1 * x,
+        )
+
+    def pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Ideal image coordinates (tangents X/Z, Y/Z) to pixels (u, v)."""
+        xd, yd = self.distort(x, y)
+        u = self.width / 2 + self.cx_px + xd * self.f_px + xd * self.b1 + yd * self.b2
+        return u, self.height / 2 + self.cy_px + yd * self.f_px
+
+    def tangents(self, u: Any, v: Any) -> tuple[Any, Any]:
+        """Pixels (u, v) to ideal image coordinates (X/Z, Y/Z): the exact inverse of `pixel`."""
+        yd = (v - self.height / 2 - self.cy_px) / self.f_px
+        xd = (u - self.width / 2 - self.cx_px - yd * self.b2) / (self.f_px + self.b1)
+        return self.undistort(xd, yd)
+
+    def on_device(self) -> Camera:
+        """The same camera with its interior orientation as Dr.Jit scalars."""
+        return replace(self, **{name: dr.opaque(mi.Float64, float(getattr(self, name))) for name in INTERIOR})
+
+    def in_wall_frame(self, frame: WallFrame) -> Camera:
+        """The same camera, its pose moved from the world into the wall frame."""
+        return replace(self, position=frame.to_wall(self.position), rotation=frame.rotation @ self.rotation)
+
+    def reduced(self, step: float, width: int, height: int, corner: tuple[float, float] = (0.0, 0.0)) -> Camera:
+        """The camera of an image of width x height pixels, each `step` px of this frame wide, that starts at `corner`, px."""
+        cx = (self.width / 2 + self.cx_px - corner[0]) / step - width / 2
+        cy = (self.height / 2 + self.cy_px - corner[1]) / step - height / 2
+        scaled = {name: getattr(self, name) / step for name in ("f_px", "b1", "b2")}
+        return replace(self, width=width, height=height, cx_px=cx, cy_px=cy, **scaled)
+
+    def turned(self) -> Camera:
+        """The same camera with its image read upside down: its pixel (u, v) is this one's (width - u, height - v)."""
+        mirrored = {name: -getattr(self, name) for name in ("cx_px", "cy_px", "p1", "p2")}
+        return replace(self, rotation=self.rotation * [-1.0, -1.0, 1.0], **mirrored)
+
+    def check_invertible(self) -> None:
+        """Raise InputError where `tangents` does not invert `pixel` over the whole frame (a distortion that folds the image)."""
+        u, v = np.meshgrid(np.linspace(0, self.width, 33), np.linspace(0, self.height, 33))
+        with np.errstate(all="ignore"):
+            x, y = self.tangents(u, v)
+            folded = self._jacobian(x, y)
+            back_u, back_v = self.pixel(x, y)
+            error = np.hypot(back_u - u, back_v - v)
+        if not (np.isfinite(error).all() and error.max() < 1e-6 and (folded[0] * folded[2] > folded[1] ** 2).all()):
+            raise InputError(
+                "the lens distortion folds the image and has no inverse over the frame",
+                where="camera calibration",
+                remedy="check k1..k4 and p1, p2 (Metashape's units: tangents, not pixels)",
+            )
+
+
+@dataclass(frozen=True)
+class CameraPair:
+    """The left and the right camera of a fixed stereo pair, both in one frame."""
+
+    left: Camera
+    right: Camera
+
+    def in_wall_frame(self, frame: WallFrame) -> CameraPair:
+        return CameraPair(self.left.in_wall_frame(frame), self.right.in_wall_frame(frame))
+
+    def exchanged(self) -> CameraPair:
+        """The same pair with the right camera's part played by the left: both turned upside down, so that sides change."""
+        return CameraPair(self.right.turned(), self.left.turned())
+
+    @property
+    def base_m(self) -> float:
+        """The distance between the perspective centres, m."""
+        return float(np.linalg.norm(self.right.position - self.left.position))
+
+    def changed(self, side: Side, **added: float) -> CameraPair:
+        """The pair with `added` summed to the named interior parameters of the left, the right or both cameras."""
+        return self._each(
+            side, lambda camera: replace(camera, **{key: getattr(camera, key) + value for key, value in added.items()})
+        )
+
+    def rotated(self, side: Side, axis: int, angle_rad: float) -> CameraPair:
+        """The pair with cameras turned about their own x (0), y (1) or z (2) axis by the right-hand rule."""
+        turn = axis_rotation(axis, angle_rad)
+        return self._each(side, lambda camera: replace(camera, rotation=camera.rotation @ turn))
+
+    def shifted(self, side: Side, shift_m: FloatArray) -> CameraPair:
+        """The pair with perspective centres moved by (3,) m along the axes of the frame the pair is given in."""
+        return self._each(side, lambda camera: replace(camera, position=camera.position + shift_m))
+
+    def _each(self, side: Side, change: Any) -> CameraPair:
+        sides = [field.name for field in fields(self)] if side == "both" else [side]
+        return replace(self, **{name: change(getattr(self, name)) for name in sides})
+
+
+def axis_rotation(axis: int, angle_rad: float) -> FloatArray:
+    """(3, 3) right-handed rotation about coordinate axis 0, 1 or 2."""
+    sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
+    matrix = np.eye(3)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    matrix[first, first] = matrix[second, second] = cosine
+    matrix[second, first], matrix[first, second] = sine, -sine
+    return matrix

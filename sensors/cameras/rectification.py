@@ -1,0 +1,67 @@
+"""Epipolar rectification of a calibrated pair, by OpenCV (Fusiello-style row alignment, Bouguet's split of the rotation)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera, CameraPair
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """Two virtual cameras whose rows are epipolar lines.
+
+    left, right: (3, 3) rotations, camera frame to rectified frame; f: principal distance, px; u_left, u_right, v: principal
+    points, px; base_m: the base, m. A point at (x, y, z) of the rectified left frame has u = f x/z + u_left, v = f y/z + v,
+    and disparity d = u_l - u_r, from which z = f base / (d - (u_left - u_right)).
+    """
+
+    left: FloatArray
+    right: FloatArray
+    f: float
+    u_left: float
+    u_right: float
+    v: float
+    base_m: float
+
+    @property
+    def offset(self) -> float:
+        """The disparity of a point at infinity, px."""
+        return self.u_left - self.u_right
+
+
+def rectify(pair: CameraPair) -> Rectification:
+    """Rectify a pair of cameras (given in one frame). The lens distortion is not OpenCV's business: see Camera.tangents.
+
+    Raises InputError where the cameras are swapped, stand at one place or above one another.
+    """
+    left, right = pair.left, pair.right
+    rotation = right.rotation.T @ left.rotation
+    base = right.rotation.T @ (left.position - right.position)
+    if pair.base_m < 1e-6:
+        raise InputError("both cameras stand at the same place", where="cameras", remedy="give them a base")
+    size = (left.width, left.height)
+    rotations_and_projections = cv2.stereoRectify(
+        _matrix(left), np.zeros(5), _matrix(right), np.zeros(5), size, rotation, base.reshape(3, 1), flags=0, alpha=-1
+    )
+    r_left, r_right, p_left, p_right = rotations_and_projections[:4]
+    if abs(p_right[1, 3]) > abs(p_right[0, 3]):
+        raise InputError("the base runs along the images' columns", where="cameras", remedy="turn both cameras by 90 degrees")
+    base_m = -p_right[0, 3] / p_left[0, 0]
+    if base_m < 0:
+        raise InputError("the left camera stands to the right of the right one", where="cameras", remedy="swap left and right")
+    return Rectification(r_left, r_right, p_left[0, 0], p_left[0, 2], p_right[0, 2], p_left[1, 2], base_m)
+
+
+def _matrix(camera: Camera) -> FloatArray:
+    """(3, 3) OpenCV camera matrix, pixel centres at integers."""
+    matrix: Any = np.diag([camera.f_px, camera.f_px, 1.0])
+    matrix[0, 2] = camera.width / 2 + camera.cx_px - 0.5
+    matrix[1, 2] = camera.height / 2 + camera.cy_px - 0.5
+    return matrix

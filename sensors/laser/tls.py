@@ -1,0 +1,377 @@
+"""The terrestrial laser scanner: pulses in a pattern of azimuth and zenith, ray-traced, recorded in their nominal directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar, Literal
+
+import numpy as np
+import psutil
+from pydantic import Field, model_validator
+
+from scene.common.backend import dr, mi
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import WALL, FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import axis_rotation
+from sensors.effects.base import Stage, apply_stage
+from sensors.laser.atmosphere import extinction_per_m
+from sensors.laser.faces import mean_of_faces
+from sensors.models.placement import EXACT_POSE, PoseSigma
+from sensors.models.sensor_model import TlsModel
+from sensors.numerics.device import opaque, rotated, vector
+from sensors.signal_chain.beam import Beam, Echo, SubRays
+from sensors.signal_chain.observation import FurtherReturns, Observation, offset_of, packed
+from sensors.signal_chain.polar import polar
+from sensors.signal_chain.pulses import REFERENCE_RANGE_M, Pulses, direction, tangents
+from sensors.signal_chain.returns import MOST_RETURNS, Recorded, further_returns
+
+Window = tuple[float, float]
+
+_RAYS_AT_ONCE = 1 << 20
+"""Sub-rays whose echoes are held at a time: 25 MB."""
+_BYTES_PER_PULSE = 400
+"""What a pulse takes at the peak: rays, points, surface and the difference's ray tracing of it."""
+
+
+class ScannerConfig(Config):
+    """A laser scanner as an instrument, and the window it scans."""
+
+    short_forms: ClassVar[tuple[str, ...]] = ("preset",)
+    name: str | None = Field(None, min_length=1, description="manufacturer and model; a preset gives its own")
+    zenith_limits_rad: Window = Field((0.5, 2.3), description="field of view in zenith: smallest, largest [rad]")
+    azimuth_step_rad: float = Field(0.0005, gt=0, le=0.02, description="angular step between scan lines [rad]")
+    zenith_step_rad: float = Field(0.0005, gt=0, le=0.02, description="angular step between the pulses of a line [rad]")
+    azimuth_rad: Window | None = Field(None, description="window in azimuth: start, stop; none: the wall's extent [rad]")
+    zenith_rad: Window | None = Field(None, description="window in zenith: start, stop; none: the wall's extent [rad]")
+    pulse_rate_hz: float = Field(100_000.0, gt=0, description="pulses per second [Hz]")
+    minimum_range_m: float = Field(1.0, ge=0, description="nearest range that is recorded [m]")
+    maximum_range_m: float = Field(1000.0, gt=0, description="farthest range that is recorded [m]")
+    visibility_m: float | None = Field(None, gt=0, description="haze or fog weakens the echoes; none: clear air [m]")
+    faces: Literal[1, 2] = Field(1, description="2: scan in both faces and take the mean, in which axis errors cancel")
+    face_tolerance_m: float = Field(
+        0.1, ge=0, description="ranges of both faces that differ by more are not averaged, the first face's is kept [m]"
+    )
+    wavelength_nm: float = Field(1550.0, ge=300, le=3000, description="of the laser, for the extinction in haze [nm]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ScannerConfig:
+        for name in ("zenith_limits_rad", "azimuth_rad", "zenith_rad"):
+            window = getattr(self, name)
+            if window is not None and not window[0] < window[1]:
+                raise ValueError(f"{name}: start must be smaller than stop, got {list(window)}")
+        for name, low, high in (("zenith_limits_rad", 0, 1), ("zenith_rad", 0, 1), ("azimuth_rad", -2, 2)):
+            window = getattr(self, name)
+            if window is not None and not low * np.pi <= window[0] < window[1] <= high * np.pi:
+                allowed = "0..pi" if low == 0 else "-2 pi..2 pi"
+                raise ValueError(f"{name} must lie in {allowed}, got {list(window)} (are these degrees?)")
+        if self.minimum_range_m >= self.maximum_range_m:
+            raise ValueError("minimum_range_m must be smaller than maximum_range_m")
+        return self
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of the air, 1/m; 0 where no visibility is given."""
+        return 0.0 if self.visibility_m is None else extinction_per_m(self.visibility_m, self.wavelength_nm)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Nominal directions: scan lines in azimuth, pulses of a line in zenith; start and step in rad."""
+
+    azimuth_start: float
+    azimuth_step: float
+    lines: int
+    zenith_start: float
+    zenith_step: float
+    pulses: int
+
+    @classmethod
+    def over(cls, azimuth: Window, zenith: Window, config: ScannerConfig) -> Pattern:
+        """The pattern that starts at the windows' starts and ends at or before their stops."""
+        lines, pulses = (
+            int(np.floor((stop - start) / step + 1e-9)) + 1
+            for (start, stop), step in ((azimuth, config.azimuth_step_rad), (zenith, config.zenith_step_rad))
+        )
+        most = min(psutil.virtual_memory().available // _BYTES_PER_PULSE, 2**31)
+        if lines * pulses > most:
+            raise InputError(
+                f"{lines:,} lines of {pulses:,} pulses would take {lines * pulses * _BYTES_PER_PULSE / 1e9:,.0f} GB of memory",
+                where="scanner.azimuth_step_rad, scanner.zenith_step_rad",
+                allowed=f"up to {most:,} pulses in the free memory",
+                remedy="choose coarser steps or a smaller window",
+            )
+        return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)
+
+    def second_face(self) -> Pattern:
+        """The same directions in the other face: the azimuth turned by pi, the zenith angle 2 pi less what it was."""
+        return replace(
+            self,
+            azimuth_start=self.azimuth_start + np.pi,
+            zenith_start=2 * np.pi - self.zenith_start,
+            zenith_step=-self.zenith_step,
+        )
+
+
+@dataclass(frozen=True)
+class LaserScanner:
+    """A scanner on its station.
+
+    position: (3,) m and rotation: (3, 3), scanner to wall frame, as surveyed; pattern: what it scans; truth: whether channels of
+    it are kept; pose_sigma: how well the pose is known.
+    """
+
+    position: FloatArray
+    rotation: FloatArray
+    pattern: Pattern
+    config: ScannerConfig
+    model: TlsModel
+    truth: bool = False
+    pose_sigma: PoseSigma = EXACT_POSE
+
+    @classmethod
+    def aimed(
+        cls,
+        station: tuple[FloatArray, FloatArray],
+        frame: WallFrame,
+        vertices: FloatArray,
+        config: ScannerConfig,
+        model: TlsModel,
+        truth: bool = False,
+        pose_sigma: PoseSigma = EXACT_POSE,
+    ) -> LaserScanner:
+        """A scanner whose window, where the config leaves it open, is the extent of `vertices` ((n, 3), wall frame).
+
+        station: position (3,) and rotation (3, 3) scanner to world.
+        """
+        position, rotation = frame.to_wall(station[0]), frame.rotation @ station[1]
+        azimuth, zenith = _extent(vertices, position, rotation)
+        azimuth = config.azimuth_rad or _padded(azimuth, config.azimuth_step_rad)
+        low, high = config.zenith_rad or _padded(zenith, config.zenith_step_rad)
+        low, high = max(low, config.zenith_limits_rad[0]), min(high, config.zenith_limits_rad[1])
+        if not low < high:
+            raise InputError(
+                "the wall lies outside the scanner's field of view",
+                where="scanner.zenith_limits_rad",
+                remedy="move the station or tilt it",
+            )
+        return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model, truth, pose_sigma)
+
+    def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
+        """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith). Recorded from the surveyed pose."""
+        position, rotation = self.pose_sigma.displaced(self.position, self.rotation, random.child("pose"))
+        real = replace(self, position=position, rotation=rotation)
+        seen = self._scan(real, scene, random)
+        if self.config.faces == 1:
+            return seen
+        turned = replace(self, pattern=self.pattern.second_face())
+        return mean_of_faces(seen, turned._scan(real, scene, random.child("face", 2)), self.config.face_tolerance_m)
+
+    def _scan(self, real: LaserScanner, scene: RayCaster, random: KeyedRandom) -> Observation:
+        """A scan in one face; real: the scanner where it really stands."""
+        pulses, beam = self.emitted(self.emit(), random)
+        if beam.records_several and self.config.faces == 2:
+            raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
+        echo = real.echo(scene, pulses, beam, beam.received)
+        seen = self._record(self.measured(pulses, echo, random), real)
+        if echo.returns is None or not np.any(echo.returns.numpy() > 1):
+            return seen
+        return replace(seen, further=self._further(real, scene, random, seen, echo.returns))
+
+    def emitted(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
+        """The pulses as they really leave, and the beam."""
+        effects = self.model.chain()
+        return apply_stage(effects, Stage.AIM, pulses, random), apply_stage(effects, Stage.FOOTPRINT, Beam(), random)
+
+    def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
+        """What the instrument makes of the return of each pulse."""
+        pulses = replace(
+            pulses,
+            true_range=echo.range_m,
+            range_m=echo.range_m,
+            cos_incidence=echo.cos_incidence,
+            albedo=echo.albedo,
+            power=echo.power,
+            block=echo.block,
+            returned=echo.returned,
+            minimum_range=dr.opaque(mi.Float64, self.config.minimum_range_m),
+        )
+        for stage in (Stage.RANGE, Stage.POWER, Stage.RETURN):
+            pulses = apply_stage(self.model.chain(), stage, pulses, random)
+        return pulses
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(lines, pulses of a line) of an observation."""
+        return self.pattern.lines, self.pattern.pulses
+
+    def emit(self) -> Pulses:
+        """The pattern's pulses, in order of lines, before any effect."""
+        return self.pulses_at(dr.arange(mi.UInt32, self.pattern.lines * self.pattern.pulses))
+
+    def pulses_at(self, index: mi.UInt32) -> Pulses:
+        """The pulses of these numbers, which count along the lines of the pattern, before any effect."""
+        pattern = self.pattern
+        line = index // dr.opaque(mi.UInt32, pattern.pulses)
+        pulse = index - line * dr.opaque(mi.UInt32, pattern.pulses)
+        start_azimuth, step_azimuth, start_zenith, step_zenith = opaque(
+            pattern.azimuth_start, pattern.azimuth_step, pattern.zenith_start, pattern.zenith_step
+        )
+        azimuth, zenith = start_azimuth + step_azimuth * mi.Float64(line), start_zenith + step_zenith * mi.Float64(pulse)
+        return Pulses(
+            line=line,
+            share=mi.Float64(index) / dr.opaque(mi.Float64, max(pattern.lines * pattern.pulses - 1, 1)),
+            line_key=line + _grid_number(pattern.azimuth_start, pattern.azimuth_step),
+            pulse_key=pulse + _grid_number(pattern.zenith_start, pattern.zenith_step),
+            azimuth=azimuth,
+            zenith=zenith,
+            aim_azimuth=azimuth,
+            aim_zenith=zenith,
+        )
+
+    def echo(self, scene: RayCaster, pulses: Pulses, beam: Beam, merge: Callable[[SubRays], Echo]) -> Echo:
+        """Ray-trace the emitted beams; `merge` makes one echo of those of a pulse's sub-rays.
+
+        Rays start from memory and echoes end there, so that one compiled kernel serves whatever effects come before and after.
+        """
+        dr.eval(pulses.aim_azimuth, pulses.aim_zenith)
+        count, parts = dr.width(pulses.aim_azimuth, pulses.aim_zenith), []
+        step = count if beam.sub_rays == 1 else _RAYS_AT_ONCE // beam.sub_rays
+        for start in range(0, count, step):
+            echo = merge(self._sub_ray_echoes(scene, pulses, beam, start, min(step, count - start)))
+            dr.eval(echo)
+            parts.append(echo)
+        return Echo.joined(parts)
+
+    def _sub_ray_echoes(self, scene: RayCaster, pulses: Pulses, beam: Beam, start: int, count: int) -> SubRays:
+        """The echoes of all sub-rays of `count` pulses from the number `start` on.
+
+        The rays of one pulse are traced together: they are neighbours, and several times as fast as one ray of each pulse.
+        """
+        ray, many = dr.arange(mi.UInt32, count * beam.sub_rays), dr.opaque(mi.UInt32, beam.sub_rays)
+        own = ray // many
+        axis, *across = self._axes(pulses, start, count)
+        if beam.sub_rays > 1:
+            dr.eval(axis, across)
+            axis, *across = (dr.gather(mi.Array3f64, vectors, own) for vectors in (axis, *across))
+        echoes = self._traced(scene, beam.sub_ray(axis, across, ray - own * many))
+        dr.eval(echoes)
+        return SubRays(echoes, beam.sub_rays)
+
+    def _axes(self, pulses: Pulses, start: int, count: int) -> tuple[mi.Array3f64, ...]:
+        """Unit vectors along the beams of `count` pulses from the number `start` on, and two across each, wall frame."""
+        pulse = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        azimuth, zenith = (dr.gather(mi.Float64, angle, pulse) for angle in (pulses.aim_azimuth, pulses.aim_zenith))
+        vectors = direction(azimuth, zenith), *tangents(azimuth, zenith)
+        return tuple(rotated(self.rotation, each) for each in vectors)
+
+    def _traced(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
+        """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
+        hits = scene.intersect(vector(self.position), ray, exact=True)
+        cos_incidence = -dr.dot(hits.normal, mi.Vector3f(ray))
+        power = hits.albedo * cos_incidence * dr.square(REFERENCE_RANGE_M / mi.Float32(hits.distance))
+        power *= dr.exp(dr.opaque(mi.Float32, -2 * self.config.extinction_per_m) * mi.Float32(hits.distance))
+        nearest, farthest = opaque(self.config.minimum_range_m, self.config.maximum_range_m)
+        in_reach = (hits.distance >= nearest) & (hits.distance <= farthest)
+        returned = hits.valid & (cos_incidence > 0) & in_reach
+        return Echo(hits.distance, cos_incidence, hits.albedo, power, hits.block, returned)
+
+    def _record(self, pulses: Pulses, real: LaserScanner) -> Observation:
+        """The scan's grid; real: the scanner where it really stands."""
+        shape = self.shape
+        found = self._recorded(pulses, real)
+        if np.isnan(found.depth).all():
+            raise InputError(
+                "no pulse returned", where="station, scanner", remedy="check position, rotation, window, range limits and effects"
+            )
+        return Observation(
+            sensor="tls",
+            points=found.points.reshape(*shape, 3),
+            depth=found.depth.reshape(shape),
+            block=found.block.reshape(shape),
+            viewpoint=self.position,
+            intensity=found.intensity.reshape(shape),
+            pulse_interval_s=1.0 / self.config.pulse_rate_hz,
+            truth={name: channel.reshape(shape) for name, channel in found.truth.items()},
+            zenith_rad=self.pattern.zenith_start + self.pattern.zenith_step * np.arange(self.pattern.pulses, dtype=np.float64),
+            offset=found.offset.reshape(*shape, 2),
+        )
+
+    def _recorded(self, pulses: Pulses, real: LaserScanner) -> Recorded:
+        """Points from the nominal direction and the recorded range; NaN and WALL where nothing returned.
+
+        real: the scanner where it really stands.
+        """
+        returned = pulses.returned
+        range_m = dr.select(returned, pulses.range_m, np.nan)
+        nominal = rotated(self.rotation, direction(pulses.azimuth, pulses.zenith))
+        point = vector(self.position) + range_m * nominal
+        aimed = rotated(real.rotation, direction(pulses.aim_azimuth, pulses.aim_zenith))
+        offset = offset_of(point, vector(real.position) + pulses.true_range * aimed)
+        points = packed(point)
+        power = dr.select(returned, pulses.power, np.nan)
+        block = dr.select(returned, pulses.block, WALL)
+        channels = {"true_range_m": pulses.true_range, "cos_incidence": pulses.cos_incidence} if self.truth else {}
+        truth = {name: dr.select(returned, channel, np.nan) for name, channel in channels.items()}
+        dr.eval(points, offset, range_m, power, block, truth)
+        return Recorded(
+            points=points.numpy().reshape(-1, 3),
+            offset=offset.numpy().reshape(-1, 2),
+            depth=range_m.numpy(),
+            intensity=power.numpy(),
+            block=block.numpy(),
+            truth={name: channel.numpy() for name, channel in truth.items()},
+        )
+
+    def _further(
+        self, real: LaserScanner, scene: RayCaster, random: KeyedRandom, seen: Observation, count: mi.UInt32
+    ) -> FurtherReturns:
+        """The returns of pulses with `count` of them beside those in the grid; each number is traced again, for few pulses.
+
+        Every return has noise of its own. An effect that compares with the whole scan compares with the returns of one number.
+        """
+        found, emitted = [], self.emit().evaluated()
+        for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
+            index = dr.compress(count >= max(number, 2))
+            pulses, beam = self.emitted(emitted.at(index), random)
+            echo = real.echo(scene, pulses, beam, partial(beam.numbered, number=dr.opaque(mi.UInt32, number)))
+            recorded = self._recorded(self.measured(pulses, echo, random.child("return", number)), real)
+            found.append((index.numpy().astype(np.int64), np.array(echo.strongest, dtype=bool), recorded))
+        return further_returns(found, seen)
+
+
+def _grid_number(start: float, step: float) -> mi.UInt32:
+    """Number of a pattern's first line or pulse on the grid of multiples of `step`; one more for every step further.
+
+    A start between two multiples belongs to the lower one up to a share that no simple fraction meets, so that rounding errors
+    do not decide.
+    """
+    return dr.opaque(mi.UInt32, int(np.floor(start / step + 0.381966)) % 2**32)
+
+
+def _extent(vertices: FloatArray, position: FloatArray, rotation: FloatArray) -> tuple[Window, Window]:
+    """Windows in azimuth and zenith, rad, that hold all vertices; azimuth is measured from the vertices' mean direction."""
+    middle_x, middle_y, _ = (vertices.mean(axis=0) - position) @ rotation
+    middle = float(np.arctan2(middle_y, middle_x))
+    turn = rotation @ axis_rotation(2, middle)  # so that no azimuth window straddles the cut at pi
+    limits = np.array([_angles((vertices[rows : rows + _CHUNK] - position) @ turn) for rows in range(0, len(vertices), _CHUNK)])
+    low, high = limits[:, :, 0].min(axis=0), limits[:, :, 1].max(axis=0)
+    return (middle + float(low[0]), middle + float(high[0])), (float(low[1]), float(high[1]))
+
+
+_CHUNK = 1 << 20
+
+
+def _angles(local: FloatArray) -> list[list[float]]:
+    """Smallest and largest azimuth, then zenith, of (n, 3) points in the scanner's frame, rad."""
+    _, *angles = polar(local)
+    return [[angle.min(), angle.max()] for angle in angles]
+
+
+def _padded(window: Window, step: float) -> Window:
+    return window[0] - step, window[1] + step

@@ -1,0 +1,225 @@
+"""The sensor model: base noise and a list of effects, as a config's `sensor:` section and a measurement's model.yaml hold it."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from scene.common.config import Config
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Side
+from sensors.effects import StereoEffect, TlsEffect
+from sensors.effects.affinity_skew import AffinitySkew
+from sensors.effects.angle_noise import AngleNoise
+from sensors.effects.base import Effect, Stage
+from sensors.effects.camera_kappa import CameraKappa
+from sensors.effects.camera_omega import CameraOmega
+from sensors.effects.camera_phi import CameraPhi
+from sensors.effects.camera_shift import CameraShift
+from sensors.effects.focal_length import FocalLength
+from sensors.effects.matching_noise import MatchingNoise
+from sensors.effects.parallax_noise import ParallaxNoise
+from sensors.effects.point_noise import PointNoise
+from sensors.effects.principal_point_x import PrincipalPointX
+from sensors.effects.principal_point_y import PrincipalPointY
+from sensors.effects.radial_distortion import RadialDistortion
+from sensors.effects.range_noise import RangeNoise
+from sensors.effects.range_noise_proportional import RangeNoiseProportional
+from sensors.effects.regularization_noise import RegularizationNoise
+from sensors.effects.tangential_distortion import TangentialDistortion
+from sensors.signal_chain.pulses import PulseGeometry
+
+MOST_EFFECTS = 100
+"""Each adds to the kernel that observes, which is compiled anew."""
+
+
+class TlsNoise(Config):
+    """A laser scanner's white noise, as a datasheet states it."""
+
+    range_sigma_m: float = Field(0.003, ge=0, le=10, description="standard deviation of the range [m]")
+    range_ppm: float = Field(0.0, ge=0, le=1e5, description="further standard deviation of the range, in proportion to it [ppm]")
+    angle_sigma_rad: float = Field(0.00005, ge=0, le=0.1, description="standard deviation of azimuth and of zenith [rad]")
+
+
+class TlsModel(Config):
+    """What the simulation believes about a laser scanner."""
+
+    sensor: Literal["tls"] = "tls"
+    noise: TlsNoise = TlsNoise()
+    effects: tuple[TlsEffect, ...] = Field(
+        (), max_length=MOST_EFFECTS, description="effects of the catalogue beyond the base noise"
+    )
+
+    @model_validator(mode="after")
+    def _one_beam(self) -> TlsModel:
+        if sum(effect.stage == Stage.FOOTPRINT for effect in self.effects) > 1:
+            raise ValueError("a scanner has one beam: name beam_divergence once")
+        return self
+
+    def without_noise(self) -> TlsModel:
+        """The same effects alone."""
+        return self.model_copy(update={"noise": TlsNoise(range_sigma_m=0.0, angle_sigma_rad=0.0)})
+
+    def variance(self, at: PulseGeometry) -> FloatArray:
+        """(n,) variance of a recorded range that the model predicts, m2."""
+        return np.asarray(sum((effect.variance(at) for effect in self.chain()), np.zeros(len(at))))
+
+    def chain(self) -> tuple[Effect, ...]:
+        """The base noise and the effects, as one list of effects."""
+        noise = self.noise
+        return (
+            AngleNoise(azimuth_sigma_rad=noise.angle_sigma_rad, zenith_sigma_rad=noise.angle_sigma_rad),
+            RangeNoise(sigma_m=noise.range_sigma_m),
+            RangeNoiseProportional(ppm=noise.range_ppm),
+            *self.effects,
+        )
+
+
+class Spread(Config):
+    """Mean and standard deviation of an orientation parameter drawn anew at each observation; a number alone is the latter."""
+
+    mean: float = Field(0.0, description="mean, in the parameter's unit")
+    sigma: float = Field(0.0, ge=0, description="standard deviation, in the parameter's unit")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _number(cls, value: Any) -> Any:
+        return {"sigma": value} if isinstance(value, int | float) else value
+
+
+class OrientationNoise(Config):
+    """Noise on the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values."""
+
+    omega_rad: Spread = Field(Spread(), description="rotation about the camera's x axis [rad]")
+    phi_rad: Spread = Field(Spread(), description="rotation about the camera's y axis [rad]")
+    kappa_rad: Spread = Field(Spread(), description="rotation about the camera's z axis [rad]")
+    x_m: Spread = Field(Spread(), description="perspective centre, world x [m]")
+    y_m: Spread = Field(Spread(), description="perspective centre, world y [m]")
+    z_m: Spread = Field(Spread(), description="perspective centre, world z [m]")
+    f_px: Spread = Field(Spread(), description="principal distance [px]")
+    cx_px: Spread = Field(Spread(), description="principal point x [px]")
+    cy_px: Spread = Field(Spread(), description="principal point y [px]")
+    b1: Spread = Field(Spread(), description="affinity [px]")
+    b2: Spread = Field(Spread(), description="skew [px]")
+    k1: Spread = Field(Spread(), description="radial distortion, r^2")
+    k2: Spread = Field(Spread(), description="radial distortion, r^4")
+    k3: Spread = Field(Spread(), description="radial distortion, r^6")
+    k4: Spread = Field(Spread(), description="radial distortion, r^8")
+    p1: Spread = Field(Spread(), description="tangential distortion, Metashape's order")
+    p2: Spread = Field(Spread(), description="tangential distortion, Metashape's order")
+
+    def draw(self, side: Side, random: KeyedRandom) -> tuple[Effect, ...]:
+        """One draw of all parameters for one camera, as effects; each parameter has its own random number."""
+        value = {name: self._draw(name, random.child(name)) for name in type(self).model_fields}
+        try:
+            return self._effects(side, value)
+        except ValidationError as error:
+            problem = "; ".join(f"{item['loc'][-1]} {item['input']:.4g}: {item['msg'].lower()}" for item in error.errors())
+            remedy = "lower its sigma; angles are in radians"
+            raise InputError(f"a drawn value is out of bounds: {problem}", where="noise.orientation", remedy=remedy) from None
+
+    def _effects(self, side: Side, value: dict[str, float]) -> tuple[Effect, ...]:
+        return (
+            FocalLength(camera=side, delta_px=value["f_px"]),
+            PrincipalPointX(camera=side, delta_px=value["cx_px"]),
+            PrincipalPointY(camera=side, delta_px=value["cy_px"]),
+            RadialDistortion(camera=side, **{key: value[key] for key in ("k1", "k2", "k3", "k4")}),
+            TangentialDistortion(camera=side, p1=value["p1"], p2=value["p2"]),
+            AffinitySkew(camera=side, b1_px=value["b1"], b2_px=value["b2"]),
+            CameraOmega(camera=side, angle_rad=value["omega_rad"]),
+            CameraPhi(camera=side, angle_rad=value["phi_rad"]),
+            CameraKappa(camera=side, angle_rad=value["kappa_rad"]),
+            CameraShift(camera=side, x_m=value["x_m"], y_m=value["y_m"], z_m=value["z_m"]),
+        )
+
+    def _draw(self, name: str, random: KeyedRandom) -> float:
+        spread: Spread = getattr(self, name)
+        return spread.mean + spread.sigma * float(random.generator().standard_normal())
+
+
+class StereoNoise(Config):
+    """A stereo pair's noise: matching, and orientation drawn anew at each observation."""
+
+    parallax_sigma_px: float = Field(
+        0.3, ge=0, le=1000, description="white noise of the disparity [px of the full-resolution frame]"
+    )
+    regularization_sigma_px: float = Field(
+        0.1, ge=0, le=1000, description="smooth noise of the disparity, at the nodes of a grid [px]"
+    )
+    regularization_step_px: float = Field(
+        32.0, gt=0, le=100_000, description="distance of the grid's nodes [px of the full-resolution frame]"
+    )
+    point_sigma_m: float = Field(
+        0.0, ge=0, le=10, description="white noise of the points along the surface's normal, for a cloud without cameras [m]"
+    )
+    point_shared_sigma_m: float = Field(
+        0.0, ge=0, le=10, description="such noise that neighbours share, at the nodes of a grid over the wall's plane [m]"
+    )
+    point_shared_step_m: float = Field(0.1, gt=0, le=1000, description="distance of that grid's nodes [m]")
+    orientation: OrientationNoise = OrientationNoise()
+    orientation_drawn: Literal["each_camera", "both_alike"] = Field(
+        "each_camera", description="orientation noise of its own for each camera, or one draw for both, most of which cancels"
+    )
+
+    def draw(self, random: KeyedRandom) -> tuple[Effect, ...]:
+        """The orientation noise of one observation, as effects."""
+        sides: tuple[Side, ...] = ("both",) if self.orientation_drawn == "both_alike" else ("left", "right")
+        return tuple(effect for side in sides for effect in self.orientation.draw(side, random.child(side)))
+
+    @property
+    def of_points(self) -> PointNoise:
+        """The noise of the points in metres."""
+        sigma, shared, step = self.point_sigma_m, self.point_shared_sigma_m, self.point_shared_step_m
+        return PointNoise(sigma_m=sigma, shared_sigma_m=shared, shared_step_m=step)
+
+
+class StereoModel(Config):
+    """What the simulation believes about a stereo pair."""
+
+    sensor: Literal["stereo"] = "stereo"
+    noise: StereoNoise = StereoNoise()
+    effects: tuple[StereoEffect, ...] = Field(
+        (), max_length=MOST_EFFECTS, description="effects of the catalogue beyond the base noise"
+    )
+
+    def without_noise(self) -> StereoModel:
+        """The same effects alone."""
+        return self.model_copy(update={"noise": StereoNoise(parallax_sigma_px=0.0, regularization_sigma_px=0.0)})
+
+    @property
+    def matching_noise(self) -> tuple[MatchingNoise, ...]:
+        """What makes disparities scatter, by a known semivariogram: the base noise, and effects of that kind."""
+        noise = self.noise
+        base = (
+            ParallaxNoise(sigma_px=noise.parallax_sigma_px),
+            RegularizationNoise(sigma_px=noise.regularization_sigma_px, step_px=noise.regularization_step_px),
+        )
+        return (*base, *(effect for effect in self.effects if isinstance(effect, MatchingNoise)))
+
+    @property
+    def variance(self) -> float:
+        """Variance of a disparity that the model predicts, px2, on average over the image."""
+        return sum(effect.total_variance for effect in self.matching_noise)
+
+    def semivariogram(self, lag: FloatArray) -> FloatArray:
+        """(k,) semivariogram of a disparity that the model predicts, px2, at `lag` ((k, 2), px)."""
+        return np.asarray(sum((effect.semivariogram(lag) for effect in self.matching_noise), np.zeros(len(lag))))
+
+    def chain(self, random: KeyedRandom) -> tuple[Effect, ...]:
+        """The base noise and the effects, as one list of effects; the orientation is drawn from `random`."""
+        noise = self.noise
+        return (
+            *noise.draw(random.child("orientation")),
+            ParallaxNoise(sigma_px=noise.parallax_sigma_px),
+            RegularizationNoise(sigma_px=noise.regularization_sigma_px, step_px=noise.regularization_step_px),
+            noise.of_points,
+            *self.effects,
+        )
+
+    def of_points(self) -> tuple[Effect, ...]:
+        """What it says of points in metres: the base noise, and effects of that stage."""
+        return (self.noise.of_points, *(effect for effect in self.effects if effect.stage == Stage.POINT))

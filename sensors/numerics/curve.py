@@ -1,0 +1,88 @@
+"""Curves and surfaces by values at even distances, linear between them: what an empirical term is."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from scene.common.backend import dr, mi
+from scene.common.config import Config
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.upload import on_device
+from sensors.numerics.device import bounded, opaque
+
+Rows = tuple[tuple[float, ...], ...]
+_MOST_VALUES = 4096
+
+
+def _rectangular(rows: Rows) -> Rows:
+    if not rows or len({len(row) for row in rows}) != 1 or len(rows[0]) < 2 or len(rows) * len(rows[0]) > _MOST_VALUES:
+        raise ValueError(f"needs rows of one length, 2 values each at least, {_MOST_VALUES} in all at most")
+    return rows
+
+
+Table = Annotated[Rows, AfterValidator(_rectangular)]
+"""Values of a surface: rows of one length."""
+
+
+class Axis(Config):
+    """What an empirical term depends on, from `low` to `high` and held beyond."""
+
+    low: float = Field(0.0, description="x of the first value, in its unit; held below")
+    high: float = Field(1.0, description="x of the last value, in its unit; held above")
+    period: float = Field(0.0, ge=0, description="of x, which then counts modulo it; 0: none")
+
+    @model_validator(mode="after")
+    def _forward(self) -> Axis:
+        if not self.high > self.low:
+            raise ValueError("needs low < high")
+        return self
+
+    def place(self, x: Any, count: int) -> tuple[Any, Any]:
+        """The value before x and the share of the way to the next, of `count` values; x on the device."""
+        if count < 2:
+            return mi.UInt32(0), mi.Float64(0.0)
+        if self.period:
+            (cycle,) = opaque(self.period)
+            x = x - cycle * dr.floor(x / cycle)
+        start, step = opaque(self.low, (self.high - self.low) / (count - 1))
+        place = bounded((x - start) / step, 0.0, count - 1.0)
+        index = mi.UInt32(bounded(dr.floor(place), 0.0, count - 2.0))
+        return index, place - mi.Float64(index)
+
+    def place_on_host(self, x: FloatArray, count: int) -> tuple[Any, FloatArray]:
+        """The same for a NumPy array (n,)."""
+        if count < 2:
+            return np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
+        turned = np.mod(x, self.period) if self.period else x
+        place = np.clip((turned - self.low) / (self.high - self.low) * (count - 1), 0, count - 1)
+        index = np.minimum(np.nan_to_num(place).astype(np.int64), count - 2)
+        return index, place - index
+
+
+def surface(x: Any, y: Any, along: Axis, across: Axis, rows_of_values: Rows) -> mi.Float64:
+    """The surface at x, y: values in rows along y, columns along x, bilinear; of one row a curve of x."""
+    values = np.asarray(rows_of_values, dtype=np.float64)
+    rows, columns = values.shape
+    (i, a), (j, b) = across.place(y, rows), along.place(x, columns)
+    table = on_device(mi.Float64, values.ravel())
+    first = i * columns + j
+    low = _between(table, first, b)
+    return low if rows == 1 else low + a * (_between(table, first + columns, b) - low)
+
+
+def _between(table: mi.Float64, index: mi.UInt32, share: mi.Float64) -> mi.Float64:
+    left, right = (dr.gather(mi.Float64, table, index + offset) for offset in (0, 1))
+    return left + share * (right - left)
+
+
+def surface_on_host(x: FloatArray, y: FloatArray, along: Axis, across: Axis, rows_of_values: Rows) -> FloatArray:
+    """The same for NumPy arrays (n,); NaN where x or y is."""
+    values = np.asarray(rows_of_values, dtype=np.float64)
+    rows, columns = values.shape
+    (i, a), (j, b) = across.place_on_host(y, rows), along.place_on_host(x, columns)
+    below = np.minimum(i + 1, rows - 1)
+    low, high = (values[row, j] * (1 - b) + values[row, j + 1] * b for row in (i, below))
+    return np.asarray(low * (1 - a) + high * a)

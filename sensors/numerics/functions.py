@@ -1,0 +1,37 @@
+"""The functions that a sensor's equations need, on the host and on the device, so that each equation is written once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scene.common.backend import dr, mi
+
+
+@dataclass(frozen=True)
+class Functions:
+    """Elementary functions of arrays of one kind; select(condition, a, b): a where the condition holds, else b."""
+
+    sin: Callable[[Any], Any]
+    cos: Callable[[Any], Any]
+    log: Callable[[Any], Any]
+    exp: Callable[[Any], Any]
+    floor: Callable[[Any], Any]
+    select: Callable[[Any, Any, Any], Any]
+
+
+HOST = Functions(np.sin, np.cos, np.log, np.exp, np.floor, np.where)
+DEVICE = Functions(dr.sin, dr.cos, dr.log, dr.exp, dr.floor, dr.select)
+
+
+class OnDevice:
+    """The numbers of a model as device scalars: arguments of the compiled kernel, not constants in it."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+
+    def __getattr__(self, name: str) -> mi.Float64:
+        return dr.opaque(mi.Float64, float(getattr(self._model, name)))

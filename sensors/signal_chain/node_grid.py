@@ -1,0 +1,70 @@
+"""Smooth random fields over the image: Gaussian values on the nodes of a grid, interpolated bilinearly."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scene.common.backend import dr, mi
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.upload import on_device
+from sensors.signal_chain.matches import Matches
+
+
+def smooth_field(state: Matches, step_px: float, random: KeyedRandom, *, even: bool = False) -> mi.Float32:
+    """(n,) the field at the cells of `state`: sum_ij w_ij(u, v) g_ij, g_ij ~ N(0, 1), nodes at multiples of `step_px`.
+
+    Its variance is 1 at the nodes, 1/4 midway between them and 4/9 on average; even: divided by the root of sum w_ij^2, so that
+    it is 1 everywhere.
+    """
+    columns, rows = (int(np.ceil(size / step_px)) + 1 for size in (state.width, state.height))
+    nodes = on_device(mi.Float32, random.generator().standard_normal((rows, columns)))
+    step = dr.opaque(mi.Float64, step_px)
+    x, y = state.u / step, state.v / step
+    left, top = mi.UInt32(x), mi.UInt32(y)
+    across, down = mi.Float32(x - left), mi.Float32(y - top)
+    stride = dr.opaque(mi.UInt32, columns)
+    corner = top * stride + left
+    a, b, c, d = (dr.gather(mi.Float32, nodes, corner + offset, state.matched) for offset in (0, 1, stride, stride + 1))
+    field = dr.lerp(dr.lerp(a, b, across), dr.lerp(c, d, across), down)
+    if not even:
+        return field
+    squares = (dr.square(share) + dr.square(1 - share) for share in (across, down))
+    return field * dr.rsqrt(next(squares) * next(squares))
+
+
+MEAN_VARIANCE = 4 / 9
+"""Mean variance of a field whose nodes have variance 1."""
+_PHASES = (np.arange(24) + 0.5) / 24
+"""Places within a cell of nodes over which a mean is taken."""
+
+
+def node_semivariogram(lag: FloatArray) -> FloatArray:
+    """(k,) semivariogram of a field of variance 1 at the nodes, at `lag` ((k, 2), in steps of the nodes), the mean over places.
+
+    4/9 - B(x) B(y), B the cubic B-spline (2/3 at 0, 0 from 2 on): two hat functions convolved.
+    """
+    across, down = (_spline(np.abs(lag[:, axis])) for axis in (0, 1))
+    return np.asarray(MEAN_VARIANCE - across * down)
+
+
+def _spline(x: FloatArray) -> FloatArray:
+    near, far = 2 / 3 - x**2 + x**3 / 2, np.maximum(2 - x, 0.0) ** 3 / 6
+    return np.where(x < 1, near, far)
+
+
+def even_correlation(lag: FloatArray) -> FloatArray:
+    """(k, m) correlation of an even field with itself at `lag` ((k, 2), in steps of the nodes), at m places within a cell."""
+    across, down = (_along_axis(np.abs(lag[:, axis])) for axis in (0, 1))
+    return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(lag), -1))
+
+
+def _along_axis(lag: FloatArray) -> FloatArray:
+    """(k, phases) of hat functions along one axis: which nodes two places share, and by how much."""
+    here = _PHASES[None, :]
+    ahead = here + np.minimum(lag, 4.0)[:, None]  # none is shared from 2 on
+    cells = np.floor(ahead)
+    there = ahead - cells
+    shared = np.select([cells == 0, cells == 1], [(1 - here) * (1 - there) + here * there, here * (1 - there)], 0.0)
+    sizes = (np.sqrt((1 - share) ** 2 + share**2) for share in (here, there))
+    return np.asarray(shared / (next(sizes) * next(sizes)))

@@ -1,0 +1,67 @@
+"""Several returns of one pulse: how those beside the scan's grid are put in order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.geometry.mesh import FloatArray, IntArray
+from sensors.signal_chain.observation import FurtherReturns, Observation
+
+MOST_RETURNS = 15
+"""Of one pulse; what LAS 1.4 can number. Farther ones are dropped."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Recorded returns of n pulses: points (n, 3), depth, intensity, block and channels of the truth (n,); NaN, WALL for none.
+
+    offset: (n, 2) x and y of the recorded minus the true points, m.
+    """
+
+    points: FloatArray
+    offset: NDArray[np.float32]
+    depth: FloatArray
+    intensity: NDArray[np.float32]
+    block: IntArray
+    truth: dict[str, NDArray[np.floating]]
+
+
+def further_returns(found: Sequence[tuple[NDArray[np.int64], NDArray[np.bool_], Recorded]], seen: Observation) -> FurtherReturns:
+    """Order returns by cell and range, and number those that were recorded.
+
+    found: by rising range, the cells of pulses with several returns, whether each return is the one in the grid of `seen`, and
+    what was recorded of it. Effects may have lost returns: numbers and counts are of what is left.
+    """
+    shape = seen.depth.shape
+    cell, in_grid, depth = (np.concatenate(part) for part in zip(*[(c, g, r.depth) for c, g, r in found], strict=True))
+    order = np.argsort(cell, kind="stable")
+    alive = np.where(in_grid, seen.valid.ravel()[cell], ~np.isnan(depth))[order]
+    sums = np.cumsum(alive)
+    start = np.searchsorted(cell[order], cell[order], side="left")
+    number = sums - np.where(start > 0, sums[start - 1], 0)
+    count = np.ones(seen.depth.size, dtype=np.uint8)
+    count[cell] = np.bincount(cell[order], alive, minlength=seen.depth.size)[cell]
+    grid_number = np.ones(seen.depth.size, dtype=np.uint8)
+    grid_number[cell[order][in_grid[order]]] = number[in_grid[order]]
+    kept = alive & ~in_grid[order]
+
+    def column(*parts: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate(parts)[order][kept]
+
+    recorded = [each for _, _, each in found]
+    return FurtherReturns(
+        cell=cell[order][kept],
+        number=number[kept].astype(np.uint8),
+        points=column(*(each.points for each in recorded)),
+        depth=depth[order][kept],
+        block=column(*(each.block for each in recorded)),
+        intensity=column(*(each.intensity for each in recorded)),
+        truth={name: column(*(each.truth[name] for each in recorded)) for name in seen.truth},
+        grid_number=np.maximum(grid_number, 1).reshape(shape),
+        grid_count=np.maximum(count, 1).reshape(shape),
+    )

@@ -1,0 +1,107 @@
+"""The right camera's depth map: the stereo sensor observes with its cameras turned upside down, which exchanges left and right.
+
+The errors of the cameras and of their exposures are those of the left depth map (`random` draws the same ones); the matching's
+errors are drawn anew. Two depth maps of one real pair of photographs have much of their matching errors in common: where both are
+fused, their mean is more precise here than it would be there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import Camera
+from sensors.effects.base import Effect, Stage
+from sensors.models.sensor_model import StereoModel
+from sensors.signal_chain.observation import Observation
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair
+
+StereoSensor = StereoPair | MatchedStereoPair
+
+
+def pair_of(sensor: StereoSensor) -> StereoPair:
+    """The cameras, model and quality of a stereo sensor."""
+    return sensor.pair if isinstance(sensor, MatchedStereoPair) else sensor
+
+
+def observe_right(sensor: StereoSensor, scene: RayCaster, random: KeyedRandom) -> Observation:
+    """The right depth map of the look that `sensor.observe(scene, random)` takes; rows and columns are the right image's."""
+    pair = pair_of(sensor)
+    exchanged = replace(pair, cameras=pair.cameras.exchanged(), model=_ExchangedModel.of(pair))
+    turned: StereoSensor = replace(sensor, pair=exchanged) if isinstance(sensor, MatchedStereoPair) else exchanged
+    seen = turned.observe(scene, random)
+    return replace(
+        seen,
+        points=_turned(seen.points),
+        depth=_turned(seen.depth),
+        block=_turned(seen.block),
+        truth={name: _turned(channel) for name, channel in seen.truth.items()},
+        offset=None if seen.offset is None else _turned(seen.offset),
+    )
+
+
+def depth_cameras(pair: StereoPair) -> tuple[Camera, Camera]:
+    """The nominal cameras, wall frame, of the left and the right depth map's own pixels; their centres are the cells' centres."""
+    cameras, step = pair.cameras.in_wall_frame(pair.frame), REDUCTION[pair.quality]
+    rows, columns = pair.shape
+    rest = float(cameras.right.width - columns * step), float(cameras.right.height - rows * step)
+    return cameras.left.reduced(step, columns, rows), cameras.right.reduced(step, columns, rows, rest)
+
+
+class _ExchangedModel(StereoModel):
+    """A stereo model for the exchanged pair: every effect acts on the cameras as they stand."""
+
+    frame_height_px: int
+
+    @classmethod
+    def of(cls, pair: StereoPair) -> _ExchangedModel:
+        return cls(noise=pair.model.noise, effects=pair.model.effects, frame_height_px=pair.cameras.left.height)
+
+    def chain(self, random: KeyedRandom) -> tuple[Effect, ...]:
+        effects = super().chain(random)
+        return cast(tuple[Effect, ...], tuple(_ExchangedEffect(effect, self.frame_height_px) for effect in effects))
+
+
+@dataclass(frozen=True)
+class _ExchangedEffect:
+    """An effect as `apply_stage` calls it, in an exchanged pair."""
+
+    effect: Effect
+    height: int
+
+    @property
+    def name(self) -> str:
+        return self.effect.name
+
+    @property
+    def stage(self) -> Stage:
+        return self.effect.stage
+
+    @property
+    def order(self) -> int:
+        return self.effect.order
+
+    @property
+    def is_null(self) -> bool:
+        return self.effect.is_null
+
+    def apply(self, state: Any, random: KeyedRandom) -> Any:
+        if self.stage == Stage.CAMERA:
+            return self.effect.apply(state.exchanged(), random).exchanged()
+        if self.stage == Stage.EXPOSE:
+            side = "left" if state.camera == "right" else "right"
+            upright = self.effect.apply(replace(state, camera=side, v=self.height - state.v, du=-state.du), random)
+            return replace(state, du=-upright.du)
+        return self.effect.apply(state, random.child("exchanged"))
+
+
+def _turned(image: Any) -> Any:
+    """(h, w, ...) upside down."""
+    turned: FloatArray = np.ascontiguousarray(image[::-1, ::-1])
+    return turned

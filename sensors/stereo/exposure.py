@@ -1,0 +1,115 @@
+"""Photographs of the scene: rendered by ray casting in Mitsuba, exposed with noise, coded in 8 bits.
+
+A picture has one pixel per cell of the depth map (a matcher works on the reduced images), so that its noise is that of
+`step` x `step` pixels of the frame binned together.
+Limits: Lambertian rock, one bounce of light, sharp optics: samples on a fixed grid inside each pixel are averaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from scene.appearance.illumination import Illumination
+from scene.appearance.texture import RockTexture
+from scene.common.backend import dr, mi
+from scene.common.config import Config
+from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import on_device
+from sensors.cameras.camera import Camera
+from sensors.numerics.device import bounded, opaque, rotated, vector
+
+Radiance = NDArray[np.float32]
+
+Displacement = Callable[[mi.Float64], mi.Float64]
+"""Recorded minus ideal column of the pixels in rows v, px of the frame."""
+
+WHITE_PERCENTILE = 99.0
+WHITE_LEVEL = 0.85
+"""Automatic exposure puts this percentile of the pair's radiance at this share of full scale."""
+
+
+class ExposureConfig(Config):
+    """How light becomes grey values."""
+
+    samples_per_side: int = Field(2, ge=1, le=8, description="rays per pixel along a row or a column, averaged")
+    compensation_ev: float = Field(0.0, ge=-10, le=10, description="exposure against the automatic one, powers of two [EV]")
+    gamma: float = Field(2.2, gt=0, le=4, description="grey value = 255 signal^(1/gamma)")
+    full_well_e: float = Field(78_000.0, gt=0, description="electrons of a full pixel of the frame (Nikon D810 at ISO 64) [e]")
+    read_noise_e: float = Field(5.0, ge=0, description="standard deviation of the read noise of a pixel of the frame [e]")
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """image: (rows, columns) uint8; clipped_share: of the pixels, at full scale."""
+
+    image: NDArray[np.uint8]
+    clipped_share: float
+
+
+def _still(v: mi.Float64) -> mi.Float64:
+    return mi.Float64(0.0)
+
+
+@dataclass(frozen=True)
+class Studio:
+    """What a picture of the rock depends on beside the camera. footprint_m: size of a picture's pixel on the rock."""
+
+    scene: RayCaster
+    light: Illumination
+    texture: RockTexture
+    footprint_m: float
+
+    def radiance(self, camera: Camera, step: int, samples_per_side: int, displaced: Displacement = _still) -> Radiance:
+        """(rows, columns) radiance times pi, relative to an open white face turned to the sun; the sky where nothing is hit.
+
+        camera: wall frame; step: pixels of the frame per pixel of the picture; displaced: see Displacement. The samples'
+        positions are the same in every pixel: random ones would add noise that differs between the views.
+        """
+        rows, columns = camera.height // step, camera.width // step
+        index = dr.arange(mi.UInt32, rows * columns)
+        row, column = index // columns, index % columns
+        total = dr.zeros(mi.Float32, rows * columns)
+        for sample in range(samples_per_side**2):
+            dr.make_opaque(total)  # one kernel per sample bounds the memory
+            du, dv = opaque(*((np.array(divmod(sample, samples_per_side)) + 0.5) / samples_per_side))
+            u, v = (mi.Float64(column) + du) * step, (mi.Float64(row) + dv) * step
+            total += self._seen(camera, u - displaced(v), v)
+        return np.array(total / samples_per_side**2).reshape(rows, columns)
+
+    def _seen(self, camera: Camera, u: mi.Float64, v: mi.Float64) -> mi.Float32:
+        """(n,) radiance along the rays through the pixels (u, v)."""
+        x, y = camera.on_device().tangents(u, v)
+        origin, direction = vector(camera.position), rotated(camera.rotation, mi.Array3f64(x, y, 1.0))
+        hits = self.scene.intersect(origin, direction)
+        point = dr.select(hits.valid, origin + hits.distance * direction, 0.0)
+        albedo = hits.albedo * self.texture.factor(point, self.footprint_m)
+        rock = bounded(albedo, 0, 1) * self.light.irradiance(self.scene, point, hits.normal)
+        return dr.select(hits.valid, rock, dr.opaque(mi.Float32, self.light.sky_share))
+
+
+def full_scale(*pictures: Radiance) -> float:
+    """The radiance at which automatic exposure saturates: one for all `pictures`, as both cameras of a pair are set alike."""
+    bright = np.percentile(np.concatenate([picture.ravel() for picture in pictures]), WHITE_PERCENTILE)
+    return max(float(bright) / WHITE_LEVEL, 1e-6)
+
+
+def expose(radiance: Radiance, white: float, step: int, config: ExposureConfig, random: KeyedRandom) -> Photograph:
+    """Expose a picture whose radiance `white` saturates at 0 EV.
+
+    Electrons N = N_full L / white 2^EV with N_full = step^2 full wells (binning); their noise is Gaussian with variance
+    N + step^2 read^2 (shot noise, near enough above a hundred electrons); beyond N_full a pixel is clipped.
+    """
+    level = on_device(mi.Float32, radiance) * dr.opaque(mi.Float32, 2.0**config.compensation_ev / white)
+    full, read = (dr.opaque(mi.Float32, value) for value in (config.full_well_e * step**2, config.read_noise_e * step))
+    noise = random.normals(dr.arange(mi.UInt32, radiance.size)).x * dr.sqrt(level / full + dr.square(read / full))
+    level = bounded(level + noise, 0, 1)
+    grey = mi.Float32(255) * dr.power(level, dr.opaque(mi.Float32, 1 / config.gamma))
+    dr.eval(grey, level)
+    image = np.rint(grey.numpy()).astype(np.uint8).reshape(radiance.shape)
+    return Photograph(image, float(np.mean(level.numpy() >= 1)))

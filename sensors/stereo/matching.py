@@ -1,0 +1,164 @@
+"""Matching of a rectified pair of pictures by OpenCV's semi-global block matching, in tiles.
+
+Disparities here are in cells of the pictures, column in the left one minus column in the right one.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from scene.common.config import Config
+from scene.common.errors import InputError
+from sensors.stereo.rectified import Disparity, Picture
+from sensors.stereo.refinement import RefinementConfig
+
+MODES = {"sgbm": cv2.STEREO_SGBM_MODE_SGBM, "hh": cv2.STEREO_SGBM_MODE_HH, "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY}
+SUBPIXELS = 16
+"""OpenCV's disparities are integers, in sixteenths of a pixel."""
+MOST_DISPARITIES = 2048
+SPECKLE_STEP_PX = 1.0
+"""Neighbours whose disparities differ by more belong to different regions."""
+
+
+class MatchingConfig(Config):
+    """The real matcher; its pixels are those of the pictures it matches, which are the depth map's cells."""
+
+    block_size_px: int = Field(5, ge=1, le=21, description="side of the window whose costs are summed, odd [px]")
+    p1: float = Field(8.0, ge=0, description="penalty of a disparity step of one, per pixel of the window")
+    p2: float = Field(32.0, gt=0, description="penalty of a larger step, per pixel of the window; more than p1")
+    uniqueness_percent: int = Field(5, ge=0, le=100, description="by how much the best match must beat the second best [%]")
+    mode: Literal["sgbm", "hh", "3way"] = Field("sgbm", description="paths of the aggregation: 5 (sgbm), 8 (hh), 3 (3way)")
+    left_right_tolerance_px: int = Field(1, ge=1, description="largest disagreement of the two directions of matching [px]")
+    speckle_px: int = Field(60, ge=0, description="smooth regions with at most so many pixels are dropped")
+    depth_margin_m: float = Field(1.0, ge=0, description="how far the search goes before and behind the visible surface [m]")
+    tile_px: int = Field(1024, ge=64, description="side of the tiles that are matched one by one [px]")
+    overlap_px: int = Field(64, ge=0, le=1024, description="how far a tile looks beyond its own pixels [px]")
+    refinement: RefinementConfig | None = Field(RefinementConfig(), description="least-squares matching; none: left out")
+
+    @field_validator("block_size_px")
+    @classmethod
+    def _odd(cls, size: int) -> int:
+        if size % 2 == 0:
+            raise ValueError("must be odd")
+        return size
+
+    @field_validator("p2")
+    @classmethod
+    def _larger(cls, p2: float, info: Any) -> float:
+        if not p2 > info.data.get("p1", 0.0):
+            raise ValueError("must be larger than p1")
+        return p2
+
+
+@dataclass(frozen=True)
+class SearchRange:
+    """The disparities that are tried: `count` (a multiple of 16) from `least` on, cells."""
+
+    least: int
+    count: int
+
+    @classmethod
+    def between(cls, smallest: float, largest: float) -> SearchRange:
+        """The range that holds both disparities. Raises InputError where it is too wide to be matched."""
+        least = int(np.floor(smallest)) - 1
+        count = 16 * int(np.ceil((largest + 2 - least) / 16))
+        if count > MOST_DISPARITIES:
+            raise InputError(
+                f"the surface spans {count} disparities",
+                where="matching",
+                allowed=f"at most {MOST_DISPARITIES}",
+                remedy="take a coarser depth_map or a smaller depth_margin_m",
+            )
+        return cls(least, count)
+
+
+def match(left: Picture, right: Picture, search: SearchRange, config: MatchingConfig) -> Disparity:
+    """(h, w) disparities of the left picture's cells in steps of 1/16, NaN where there is no match.
+
+    left: (h, w), right: (h, any) grey values, NaN outside the images. The left-right check is OpenCV's: from the same costs, the
+    best left cell of every right cell must agree. Tiles run in OpenCV's number of threads; the result does not depend on it.
+    """
+    canvas_left, canvas_right = _aligned(left, right, search)
+    raw = np.full(left.shape, -SUBPIXELS, dtype=np.int16)
+
+    def fill(tile: tuple[slice, slice]) -> None:
+        raw[tile] = _matched_tile(canvas_left, canvas_right, tile, search, config)
+
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads())) as pool:
+        for _ in pool.map(fill, _tiles(left.shape, config.tile_px)):
+            pass
+    return np.where((raw < 0) | np.isnan(left), np.float32(np.nan), raw.astype(np.float32) / SUBPIXELS + search.least)
+
+
+def without_speckles(disparity: Disparity, speckle_px: int) -> Disparity:
+    """The disparities without connected smooth regions of at most `speckle_px` cells: stray matches, as the sky gives them."""
+    known = ~np.isnan(disparity)
+    least = np.float32(np.floor(disparity[known].min())) if known.any() else np.float32(0)
+    steps = np.where(known, np.rint((disparity - least) * SUBPIXELS), -SUBPIXELS).astype(np.int16)
+    cv2.filterSpeckles(steps, -SUBPIXELS, speckle_px, SPECKLE_STEP_PX * SUBPIXELS)
+    return np.where(steps < 0, np.float32(np.nan), disparity)
+
+
+def _aligned(left: Picture, right: Picture, search: SearchRange) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Both pictures in 8 bits on canvases of one size, where disparity `search.least` is 0 and no left cell lacks room.
+
+    Left cell j is at column j + count of its canvas; the right cell that matches it with the least disparity is at the same.
+    """
+    rows, columns = left.shape
+    canvases = np.zeros((2, rows, columns + search.count), dtype=np.uint8)
+    canvases[0, :, search.count :] = _grey(left)
+    shift = search.count + search.least  # of right cells
+    start, stop = max(0, -shift), min(right.shape[1], canvases.shape[2] - shift)
+    if stop > start:
+        canvases[1, :, start + shift : stop + shift] = _grey(right[:, start:stop])
+    return canvases[0], canvases[1]
+
+
+def _grey(picture: Picture) -> NDArray[np.uint8]:
+    return np.clip(np.rint(np.nan_to_num(picture)), 0, 255).astype(np.uint8)
+
+
+def _tiles(shape: tuple[int, int], side: int) -> list[tuple[slice, slice]]:
+    starts = [range(0, length, side) for length in shape]
+    return [
+        (slice(row, min(row + side, shape[0])), slice(column, min(column + side, shape[1])))
+        for row in starts[0]
+        for column in starts[1]
+    ]
+
+
+def _matched_tile(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], tile: tuple[slice, slice], search: SearchRange, config: MatchingConfig
+) -> NDArray[np.int16]:
+    """The raw disparities of one tile (columns as in the left picture), matched together with its surroundings."""
+    rows, columns = tile
+    top, first = max(0, rows.start - config.overlap_px), max(0, columns.start - config.overlap_px)
+    around = (
+        slice(top, min(left.shape[0], rows.stop + config.overlap_px)),
+        slice(first, min(left.shape[1], columns.stop + search.count + config.overlap_px)),
+    )
+    raw = _matcher(search.count, config).compute(np.ascontiguousarray(left[around]), np.ascontiguousarray(right[around]))
+    inner = columns.start - first + search.count
+    return raw[rows.start - top : rows.stop - top, inner : inner + columns.stop - columns.start]
+
+
+def _matcher(count: int, config: MatchingConfig) -> Any:
+    area = config.block_size_px**2
+    return cv2.StereoSGBM_create(
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=config.block_size_px,
+        P1=round(config.p1 * area),
+        P2=round(config.p2 * area),
+        disp12MaxDiff=config.left_right_tolerance_px,
+        preFilterCap=63,
+        uniquenessRatio=config.uniqueness_percent,
+        mode=MODES[config.mode],
+    )

@@ -1,0 +1,110 @@
+"""The rectified pair of pictures: resampled with the nominal calibration onto grids whose rows are epipolar lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.common.backend import dr, mi
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.cameras.rectification import Rectification
+from sensors.numerics.device import opaque, rotated
+
+Picture = NDArray[np.float32]
+Disparity = NDArray[np.float32]
+
+LARGEST_STRETCH = 3
+"""A rectified picture may be this many times wider or higher than the camera's."""
+
+
+@dataclass(frozen=True)
+class RectifiedGrid:
+    """Grids of cells that cover the rectified images; cell (i, j) of a grid is at u = step (j + first), v = step (i + top), px.
+
+    step: px of the frame per cell; left_first, right_first, top: in cells; left_width, right_width, height: in cells.
+    """
+
+    pair: CameraPair
+    geometry: Rectification
+    step: int
+    left_first: int
+    right_first: int
+    top: int
+    left_width: int
+    right_width: int
+    height: int
+
+    @classmethod
+    def cover(cls, pair: CameraPair, geometry: Rectification, step: int) -> RectifiedGrid:
+        """The grids that hold the whole of both frames in the rows that both have; pair: nominal.
+
+        Raises InputError for cameras that converge so much that rectification tears the images apart.
+        """
+        left_u, left_v = _outline(pair.left, geometry.left, geometry, geometry.u_left)
+        right_u, right_v = _outline(pair.right, geometry.right, geometry, geometry.u_right)
+        top, bottom = max(left_v.min(), right_v.min()) / step, min(left_v.max(), right_v.max()) / step
+        rows = int(np.floor(bottom)) - int(np.ceil(top)) + 1
+        left, right = ([int(np.floor(u.min() / step)), int(np.ceil(u.max() / step))] for u in (left_u, right_u))
+        left_width, right_width = left[1] - left[0] + 1, right[1] - right[0] + 1
+        if rows < 1 or max(left_width, right_width) > LARGEST_STRETCH * pair.left.width / step:
+            raise InputError(
+                "the cameras look into such different directions that their images cannot be rectified",
+                where="cameras",
+                remedy="check the rotations, or take matcher: simulated",
+            )
+        return cls(pair, geometry, step, left[0], right[0], int(np.ceil(top)), left_width, right_width, rows)
+
+    @property
+    def disparity_offset(self) -> int:
+        """Cells to add to a difference of columns, left minus right, to get a disparity in cells."""
+        return self.left_first - self.right_first
+
+    def left(self, image: NDArray[np.uint8]) -> Picture:
+        """(height, left_width) grey values of the left picture, NaN outside it; image: one pixel per `step` px of the frame."""
+        geometry = self.geometry
+        return self._resampled(image, self.pair.left, geometry.left, geometry.u_left, self.left_first, self.left_width)
+
+    def right(self, image: NDArray[np.uint8]) -> Picture:
+        """(height, right_width) grey values of the right picture, NaN outside it."""
+        geometry = self.geometry
+        return self._resampled(image, self.pair.right, geometry.right, geometry.u_right, self.right_first, self.right_width)
+
+    def cells(self, u: mi.Float64, v: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
+        """Column and row in the left grid of rectified left pixels (u, v), px."""
+        step, first, top = opaque(self.step, self.left_first, self.top)
+        return u / step - first, v / step - top
+
+    def _resampled(
+        self, image: NDArray[np.uint8], camera: Camera, rotation: FloatArray, u_0: float, first: int, width: int
+    ) -> Picture:
+        """Lanczos interpolation at where each cell's ray meets the camera's image."""
+        index, columns = dr.arange(mi.UInt32, self.height * width), dr.opaque(mi.UInt32, width)
+        left, top, step, f, centre_u, centre_v = opaque(first, self.top, self.step, self.geometry.f, u_0, self.geometry.v)
+        x = ((mi.Float64(index % columns) + left) * step - centre_u) / f
+        y = ((mi.Float64(index // columns) + top) * step - centre_v) / f
+        ray = rotated(rotation.T, mi.Array3f64(x, y, 1.0))
+        u, v = camera.on_device().pixel(ray.x / ray.z, ray.y / ray.z)
+        column, row = mi.Float32(u / step - 0.5), mi.Float32(v / step - 0.5)
+        inside = (column >= 0) & (column <= image.shape[1] - 1) & (row >= 0) & (row <= image.shape[0] - 1)
+        dr.eval(column, row, inside)
+        maps = (array.numpy().reshape(self.height, width) for array in (column, row))
+        picture = cv2.remap(image.astype(np.float32), *maps, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        picture[~inside.numpy().reshape(picture.shape)] = np.nan
+        return picture
+
+
+def _outline(camera: Camera, rotation: FloatArray, geometry: Rectification, u_0: float) -> tuple[FloatArray, FloatArray]:
+    """Rectified pixels (u, v) of the frame's border. Raises InputError where a border ray runs along the rectified plane."""
+    along = np.linspace(0, 1, 65)
+    zero, one = np.zeros_like(along), np.ones_like(along)
+    u = np.concatenate([along, along, zero, one]) * camera.width
+    v = np.concatenate([zero, one, along, along]) * camera.height
+    ray = rotation @ np.stack([*camera.tangents(u, v), np.ones_like(u)])
+    if not (ray[2] > 0.05).all():
+        raise InputError("a camera looks along the base", where="cameras", remedy="check the rotations (camera to world)")
+    return geometry.f * ray[0] / ray[2] + u_0, geometry.f * ray[1] / ray[2] + geometry.v

@@ -1,0 +1,180 @@
+"""The stereo sensor vertex by vertex: the reference's own reconstruction (thesis 3.4, method 2).
+
+1  Every vertex of the wall is projected into the real pair (nominal calibration plus camera effects); image rows are displaced.
+2  Both pixels are undistorted and rectified with the nominal calibration: their disparity, plus the matching's effects.
+3  The disparity is reprojected with the nominal calibration. The triangles stay: rims and floors of niches are where they are.
+Effects that look at neighbouring pixels act on the ray-traced depth map; a vertex takes what they change at its place.
+Limits: what one camera does not see of the other's is not left out, as in the reference. Each vertex has white noise of its own,
+however dense the vertices: a surface of fine triangles is averaged over more of them than one of coarse triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from scene.common.backend import dr, mi
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import WALL, FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
+from scene.ray_casting.upload import on_device, vectors_on_device
+from sensors.cameras.camera import Camera
+from sensors.cameras.rectification import rectify
+from sensors.effects.base import Effect, Stage, apply_stage
+from sensors.numerics.device import rotated, vector
+from sensors.signal_chain.matches import Matches, bridged
+from sensors.signal_chain.observation import packed
+from sensors.stereo.raised_points import in_metres, shifts
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair, exposed, rectified_disparity, reproject, row_tangent
+
+
+def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) -> TriangleMesh:
+    """The wall as the pair reconstructs it: its vertices where they are recorded (wall frame), its triangles and their labels.
+
+    What is not in both images, or behind a camera, is left out. The same `random` draws the orientation and the displacement
+    of rows that `pair.observe` draws; matching noise is keyed by the vertex. Raises InputError where nothing is left.
+    """
+    mesh = scene.mesh
+    effects = pair.model.chain(random)
+    nominal = pair.cameras.in_wall_frame(pair.frame)
+    real = pair.real_pair(effects, random).in_wall_frame(pair.frame)
+    point = vectors_on_device(mesh.vertices)
+    u, v, depth, in_left = _projected(real.left, point)
+    right_u, right_v, _, in_right = _projected(real.right, point)
+    u += exposed(effects, "left", v, random)
+    right_u += exposed(effects, "right", right_v, random)
+    geometry = rectify(nominal)
+    left_u, left_v, disparity = rectified_disparity(nominal, geometry, (u, v), (right_u, right_v))
+    albedo = None if mesh.vertex_albedo is None else on_device(mi.Float32, mesh.vertex_albedo)
+    block = mi.Int32(WALL) if mesh.vertex_block is None else on_device(mi.Int32, mesh.vertex_block)
+    index, size = dr.arange(mi.UInt32, len(mesh.vertices)), (nominal.left.width, nominal.left.height, REDUCTION[pair.quality])
+    rows = row_tangent(geometry, left_v), float(geometry.offset)
+    matches: Matches = VertexMatches(
+        index,
+        u,
+        v,
+        disparity,
+        in_left & in_right,
+        block,
+        depth,
+        albedo,
+        *size,
+        *rows,
+        _TracedCells(pair, scene, effects, random),
+    )
+    for stage in (Stage.MATCH, Stage.FILL):
+        matches = apply_stage(effects, stage, matches, random)
+    local = reproject(geometry, left_u, left_v, matches.disparity)
+    recorded = packed(rotated(nominal.left.rotation, local) + vector(nominal.left.position))
+    kept = matches.matched & (local.z > 0)
+    dr.eval(recorded, kept)
+    vertices = recorded.numpy().reshape(-1, 3)
+    if moving := in_metres(effects):
+        vertices = vertices + shifts(mesh, moving, mesh.vertices, random)
+    return _kept(mesh.with_vertices(vertices), kept.numpy().astype(bool))
+
+
+def _projected(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64, mi.Float64, mi.Bool]:
+    """Pixel (u, v), depth along the axis, m, of 3 x (n,) points, wall frame, and whether they are in the image."""
+    local = rotated(camera.rotation.T, point - vector(camera.position))
+    u, v = camera.on_device().pixel(local.x / local.z, local.y / local.z)
+    return u, v, local.z, (local.z > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+
+
+def _kept(mesh: TriangleMesh, kept: np.ndarray) -> TriangleMesh:
+    """The mesh of the triangles all of whose vertices are kept."""
+    chosen = kept[mesh.faces].all(axis=1)
+    if not chosen.any():
+        raise InputError(
+            "no part of the wall is seen by both cameras",
+            where="cameras",
+            remedy="check positions, rotations (camera to world; x right, y down, z forward) and which side faces the wall",
+        )
+    if chosen.all() and kept.all():
+        return mesh
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces[chosen]] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    channels = {name: getattr(mesh, name) for name in ("vertex_albedo", "vertex_block")}
+    return TriangleMesh(
+        mesh.vertices[used],
+        number[mesh.faces[chosen]],
+        **{name: None if channel is None else channel[used] for name, channel in channels.items()},
+        face_block=None if mesh.face_block is None else mesh.face_block[chosen],
+    )
+
+
+class _TracedCells:
+    """The ray-traced matches of the same look, made where an effect asks for them."""
+
+    def __init__(self, pair: StereoPair, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom) -> None:
+        self._look = pair, scene, effects, random
+
+    @cached_property
+    def matches(self) -> Matches:
+        pair, scene, effects, random = self._look
+        return pair.traced(scene, effects, random)[0]
+
+
+@dataclass(frozen=True)
+class VertexMatches(Matches):
+    """Matches of n vertices instead of cells: index is the vertex, (u, v) its place in the left image.
+
+    cells: the depth map that effects look at which need neighbours; before: its disparities as they are by now.
+    """
+
+    cells: _TracedCells
+    before: FloatArray | None = None
+
+    def raster(self) -> FloatArray:
+        return self.cells.matches.raster() if self.before is None else self.before
+
+    def albedo_raster(self) -> FloatArray | None:
+        return self.cells.matches.albedo_raster()
+
+    def sampled(self, raster: FloatArray) -> mi.Float64:
+        columns, rows = (self._nearest(place / self.reduction, count) for place, count in self._axes())
+        return dr.gather(mi.Float64, on_device(mi.Float64, raster), rows * dr.opaque(mi.UInt32, self.shape[1]) + columns)
+
+    def with_raster(self, disparity: FloatArray) -> Matches:
+        """The vertices with the change of the cells around them: their mean (bilinear) where all are of the vertex's surface,
+        else that of the cell whose disparity was most like the vertex's. Half-occluded cells count as background."""
+        was = bridged(self.raster(), np.inf)
+        change = on_device(mi.Float64, np.nan_to_num(disparity - was))
+        old = on_device(mi.Float64, np.where(np.isnan(was), np.inf, was))
+        stride, step = dr.opaque(mi.UInt32, self.shape[1]), dr.opaque(mi.Float64, self.reduction)
+        least, nearest, mean = mi.Float64(np.inf), mi.Float64(0.0), mi.Float64(0.0)
+        one_surface = dr.full(mi.Bool, True, dr.width(self.u))
+        for across in (0, 1):
+            for down in (0, 1):
+                (column, weight), (row, other) = (
+                    self._beside(place / step, count, side)
+                    for (place, count), side in zip(self._axes(), (across, down), strict=True)
+                )
+                cell = row * stride + column
+                distance, value = dr.abs(dr.gather(mi.Float64, old, cell) - self.disparity), dr.gather(mi.Float64, change, cell)
+                nearer = distance < least
+                nearest, least = dr.select(nearer, value, nearest), dr.select(nearer, distance, least)
+                one_surface &= distance < step
+                mean += weight * other * value
+        return replace(self, disparity=self.disparity + dr.select(one_surface, mean, nearest), before=disparity)
+
+    def _beside(self, place: mi.Float64, count: int, side: int) -> tuple[mi.UInt32, mi.Float64]:
+        """The cell whose centre is before (side 0) or behind (1) `place`, in cells, and its weight in a linear interpolation."""
+        first = dr.floor(place - 0.5)
+        share = place - 0.5 - first
+        return self._nearest(first + side, count), share if side else 1 - share
+
+    def _axes(self) -> tuple[tuple[mi.Float64, int], tuple[mi.Float64, int]]:
+        u, v = (dr.select(self.matched, place, 0.0) for place in (self.u, self.v))
+        return (u, self.shape[1]), (v, self.shape[0])
+
+    @staticmethod
+    def _nearest(place: mi.Float64, count: int) -> mi.UInt32:
+        """Number of the cell in which `place`, in cells, lies; at the border the outermost."""
+        last = dr.opaque(mi.Float64, count - 1)
+        floor = dr.select(place > 0, dr.floor(place), 0.0)
+        return mi.UInt32(dr.select(floor < last, floor, last))  # dr.clip aborts in LLVM 15
