@@ -56,7 +56,7 @@ def test_layers_import_downwards_only(folder: str) -> None:
 @pytest.mark.parametrize(
     ("folder", "line"),
     [
-        ("scene", "from sensors.tls import Scanner"),
+        ("scene", "from sensors.laser.tls import Scanner"),
         ("scene", "import pipeline.run.simulation"),
         ("scene", "def late():\n    from pipeline import run"),
         ("sensors", "from pipeline.run.simulation import simulate"),
@@ -198,7 +198,7 @@ def test_what_is_private_stays_in_its_module(folder: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["from sensors.tls import _extent", "scanner._aimed()", "class A(B):\n    def f(self):\n        super()._g()"]
+    "line", ["from sensors.laser.tls import _extent", "scanner._aimed()", "class A(B):\n    def f(self):\n        super()._g()"]
 )
 def test_the_rule_sees_what_is_private(line: str) -> None:
     assert private_of_others(line)

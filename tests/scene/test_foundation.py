@@ -328,7 +328,7 @@ def test_a_message_is_one_plain_line_of_bounded_length() -> None:
 
 
 def test_a_wrong_variant_is_an_input_error() -> None:
-    code = "import scene.backend"
+    code = "import scene.common.backend"
     environment = {"SCARPSIM_VARIANT": "vulkan", "PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin"}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert "allowed: cuda_ad_mono, llvm_ad_mono" in result.stderr
