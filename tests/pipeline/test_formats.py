@@ -20,7 +20,7 @@ from format_cases import GRID, a_cloud, a_mesh, a_raster
 from pipeline.formats.files.atomic import write_bytes, write_json, write_text, writing
 from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points.laz import write_laz
 from pipeline.formats.rasters.geotiff import write_geotiff, write_tiff
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -72,7 +72,7 @@ def _fail_half_way(path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_killed_in_the_middle_leaves_no_file(tmp_path: Path, number: signal.Signals) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from pipeline.formats.atomic import writing\n"
+        "import sys, time; from pathlib import Path; from pipeline.formats.files.atomic import writing\n"
         "with writing(Path(sys.argv[1])) as t:\n t.write_bytes(b'half'); print('ready', flush=True); time.sleep(60)"
     )
     path = tmp_path / "a.bin"

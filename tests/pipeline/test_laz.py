@@ -13,7 +13,7 @@ import pytest
 from format_cases import UTM, a_cloud
 
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.laz import EXACT_INTENSITY, read_laz, write_laz
+from pipeline.formats.points.points.laz import EXACT_INTENSITY, read_laz, write_laz
 from scene.common.errors import InputError
 
 
@@ -70,7 +70,7 @@ def test_laz_keeps_large_coordinates(tmp_path: Path, extent_m: float, step_m: fl
 
 def test_laz_bytes_do_not_depend_on_threads(tmp_path: Path) -> None:
     code = (
-        "import sys, numpy as np; from pathlib import Path; from pipeline.formats.laz import write_laz\n"
+        "import sys, numpy as np; from pathlib import Path; from pipeline.formats.points.laz import write_laz\n"
         "from pipeline.formats.point_cloud import PointCloud\n"
         "p = np.random.default_rng(0).uniform(0, 70, (160_000, 3))\n"
         "write_laz(Path(sys.argv[1]), PointCloud(p, p[:, 0], extra={'block': p[:, 1].astype('i4')}))"

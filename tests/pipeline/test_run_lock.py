@@ -74,7 +74,7 @@ def test_what_stands_where_the_lock_should_is_refused_and_stays(make: Callable[[
 def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
     """kill -9 leaves the lock's file, and nobody holds it."""
     program = (
-        "import sys, pathlib, os; from pipeline.formats.lock import locked\n"
+        "import sys, pathlib, os; from pipeline.formats.files.lock import locked\n"
         "with locked(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     process = subprocess.Popen(

@@ -3,7 +3,7 @@
 cameras.txt: CAMERA_ID MODEL WIDTH HEIGHT PARAMS; images.txt, two lines per image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME,
 then its keypoints (which may be empty); points3D.txt: POINT3D_ID X Y Z R G B ERROR and the track as (IMAGE_ID, KEYPOINT) pairs
 (COLMAP documentation, "Output Format"). Poses lead from the world to the camera, the quaternion's scalar comes first, and the
-centre of the top-left pixel is (0.5, 0.5). The camera models are OpenCV's: see pipeline.formats.opencv.
+centre of the top-left pixel is (0.5, 0.5). The camera models are OpenCV's: see pipeline.formats.cameras.opencv.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.cameras.opencv import OpencvInterior, shared_distortion
+from pipeline.formats.cameras.cameras.opencv import OpencvInterior, shared_distortion
 from pipeline.formats.files.atomic import write_bytes, write_text
 from scene.common.errors import InputError
 from scene.common.regular_file import read_text
