@@ -28,7 +28,7 @@ from pipeline.detection.inference.operating_point import set_operating_point
 from pipeline.detection.network.config import BEST, load_train_config
 from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.products.run import LOWEST_SCORE, detect
-from pipeline.detection.training.training.training import train
+from pipeline.detection.training.training import train
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
 MARKS = "<!-- ablation -->", "<!-- end of ablation -->"

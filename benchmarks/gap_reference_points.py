@@ -23,7 +23,7 @@ from benchmarks.gap_injections.bases import put_scanned
 from benchmarks.workshop import scan
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.in_words import values as in_words
 from pipeline.measurement.build import build

@@ -13,8 +13,8 @@ import numpy as np
 from measure import medians, peak_memory_gb
 
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz, write_laz
-from pipeline.formats.points.points.xyz import read_xyz, write_xyz
+from pipeline.formats.points.laz import read_laz, write_laz
+from pipeline.formats.points.xyz import read_xyz, write_xyz
 
 LINES, PULSES = 2000, 1500
 ROUNDS = 3

@@ -75,7 +75,7 @@ def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     marks = [("start", psutil.Process().create_time()), ("import", 0.0)]
     from pipeline.config.simulation import SimulationConfig
     from pipeline.formats.point_cloud import PointCloud
-    from pipeline.formats.points.points.laz import PulseChannels, write_laz
+    from pipeline.formats.points.laz import PulseChannels, write_laz
     from pipeline.run.recorded_points import recorded_points
     from pipeline.run.site import prepare_site
     from scene.common.backend import dr

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline.formats.cameras.cameras.metashape import write_metashape
+from pipeline.formats.cameras.metashape import write_metashape
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
 from scene.ray_casting.raycast import RayCaster

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from make_gap_pages import FOLDER, small_png
 
-from pipeline.formats.cameras.cameras.cameras import write_cameras_yaml
+from pipeline.formats.cameras.cameras import write_cameras_yaml
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud

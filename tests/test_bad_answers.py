@@ -21,8 +21,8 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.detection.inference.weights import check_detector
 from pipeline.detection.products.run import detector_folder
 from pipeline.detection.products.score_files import assess
-from pipeline.formats.cameras.cameras.camera_files import read_lens
-from pipeline.formats.cameras.cameras.colmap import read_colmap
+from pipeline.formats.cameras.camera_files import read_lens
+from pipeline.formats.cameras.colmap import read_colmap
 from pipeline.formats.files.atomic import write_text
 from pipeline.formats.measurements.checks import check_pixels
 from pipeline.formats.point_cloud import PointCloud

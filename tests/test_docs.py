@@ -19,7 +19,7 @@ import pytest
 import yaml
 from nbclient import NotebookClient
 
-from pipeline.formats.points.points.laz import read_laz
+from pipeline.formats.points.laz import read_laz
 from scene.common.config import load_yaml, parse
 from sensors.models.sensor_model import TlsModel
 

@@ -26,7 +26,7 @@ from pipeline.cli.main import COMMANDS, main, simulate
 from pipeline.config.bundled import configs_folder
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import load_config
-from pipeline.formats.cameras.cameras.metashape import write_metashape
+from pipeline.formats.cameras.metashape import write_metashape
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.view.server import open_results
 from scene.common.keyed_random import KeyedRandom

@@ -20,16 +20,16 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from pipeline.config.overrides import apply_overrides
-from pipeline.formats.cameras.cameras.camera_files import read_lens, read_oriented
-from pipeline.formats.cameras.cameras.cameras import read_cameras_yaml, write_cameras_yaml
-from pipeline.formats.cameras.cameras.colmap import read_map, write_map
-from pipeline.formats.cameras.cameras.metashape import write_calibration, write_metashape
-from pipeline.formats.cameras.cameras.opencv import write_opencv
+from pipeline.formats.cameras.camera_files import read_lens, read_oriented
+from pipeline.formats.cameras.cameras import read_cameras_yaml, write_cameras_yaml
+from pipeline.formats.cameras.colmap import read_map, write_map
+from pipeline.formats.cameras.metashape import write_calibration, write_metashape
+from pipeline.formats.cameras.opencv import write_opencv
 from pipeline.formats.meshes.ply import read_ply, read_ply_points, write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.e57 import E57Scan, read_e57, write_e57
-from pipeline.formats.points.points.laz import read_laz, write_laz
-from pipeline.formats.points.points.xyz import read_xyz, write_xyz
+from pipeline.formats.points.e57 import E57Scan, read_e57, write_e57
+from pipeline.formats.points.laz import read_laz, write_laz
+from pipeline.formats.points.xyz import read_xyz, write_xyz
 from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from scene.common.config import load_yaml
 from scene.common.errors import InputError

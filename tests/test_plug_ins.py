@@ -51,7 +51,7 @@ from pathlib import Path
 from pipeline import configure, make_wall
 from pipeline.cli.json_schema import json_schema
 from pipeline.comparison.sensors_compared import contestants
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.points import read_points
 from scene import InputError
 
 config = configure(scanner="toy_one", wall={"style": "quarry"})

@@ -11,10 +11,10 @@ import yaml
 from benchmarks.bad_inputs.case import Case
 from benchmarks.bad_inputs.exchange_cases import sparse
 from benchmarks.bad_inputs.spoil import Change, both, instead, link, pipe, put, text
-from pipeline.formats.cameras.cameras.cameras import read_cameras_yaml
-from pipeline.formats.cameras.cameras.colmap import write_colmap
-from pipeline.formats.cameras.cameras.metashape import write_metashape
-from pipeline.formats.cameras.cameras.opencv import write_opencv
+from pipeline.formats.cameras.cameras import read_cameras_yaml
+from pipeline.formats.cameras.colmap import write_colmap
+from pipeline.formats.cameras.metashape import write_metashape
+from pipeline.formats.cameras.opencv import write_opencv
 from sensors.cameras.camera import Camera
 
 

@@ -25,7 +25,7 @@ from benchmarks.bad_inputs.case import PORT_IN_USE, Case
 from benchmarks.bad_inputs.spoil import Change, both, instead, link, pipe, text, write_mesh
 from pipeline.dataset.records import _digest, _text
 from pipeline.formats.meshes.ply import read_ply
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.points import read_points
 from scene.common.errors import InputError
 
 Draw = Callable[[st.SearchStrategy[Any]], Any]

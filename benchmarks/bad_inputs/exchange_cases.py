@@ -15,8 +15,8 @@ from benchmarks.bad_inputs.case import Case
 from benchmarks.bad_inputs.raw_cases import _e57, in_e57
 from benchmarks.bad_inputs.spoil import Array, Change, both, instead, pipe, put, text
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
 
 YAML, SITE = "measurement/measurement.yaml", "site.yaml"
 _TAIL = ("--reference", "raw/wall.ply", "--scanner", "riegl_vz400i", "--out", "out", "--quiet")

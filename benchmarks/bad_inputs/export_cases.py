@@ -33,7 +33,7 @@ from benchmarks.bad_inputs.spoil import (
 )
 from pipeline.formats.meshes.ply import read_ply, write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz, write_laz
+from pipeline.formats.points.laz import read_laz, write_laz
 from scene.geometry.mesh import TriangleMesh
 
 RUN, MAP, TILES = "run/run.json", "run/difference_001.tif", "set/train/annotations.json"

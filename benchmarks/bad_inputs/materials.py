@@ -18,8 +18,8 @@ from pipeline.detection.products.events import Event, write_events
 from pipeline.formats.files.atomic import write_json
 from pipeline.formats.meshes.ply import read_ply, write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
 from scene.geometry.mesh import FloatArray, TriangleMesh
 
 SITE: dict[str, Any] = {

@@ -27,8 +27,8 @@ from benchmarks.bad_inputs.spoil import (
 )
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
 
 YAML, MODEL, WALL, SCAN = "measurement/measurement.yaml", "measurement/model.yaml", "measurement/wall.ply", "measurement/scan.ply"
 PAIR, SURFACE = "pair/measurement.yaml", "pair/surface.xyz"

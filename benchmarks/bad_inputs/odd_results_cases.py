@@ -30,7 +30,7 @@ from benchmarks.bad_inputs.spoil import (
     whole,
 )
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz, write_laz
+from pipeline.formats.points.laz import read_laz, write_laz
 
 SITE, RUN, GAP, TRUTH, FOUND = "site.yaml", "run/run.json", "diagnosis/gap.json", "truth.json", "found.json"
 _SURROGATE = "\ud800"
@@ -275,7 +275,7 @@ def _backwards(folder: Path) -> None:
 
 def _epoch_files(*moves: Callable[[Array], Array]) -> Change:
     def change(folder: Path) -> None:
-        from pipeline.formats.points.points.points import read_points
+        from pipeline.formats.points.points import read_points
 
         found = read_points(folder / "measurement/scan.ply").points
         for number, move in enumerate(moves):

@@ -15,7 +15,7 @@ from benchmarks.bad_inputs.case import PORT_IN_USE, Case
 from benchmarks.bad_inputs.spoil import GONE, NAN, Change, both, instead, link, pipe, put, text, whole
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 
 SITE, YAML, RUN, MAP = "site.yaml", "measurement/measurement.yaml", "run/run.json", "run/difference_001.tif"
 _OUT = ("--out", "out", "--quiet")
@@ -259,7 +259,7 @@ def _clouds(*moves: Any) -> Change:
 
 
 def _scan(folder: Path) -> Any:
-    from pipeline.formats.points.points.points import read_points
+    from pipeline.formats.points.points import read_points
 
     return read_points(folder / "measurement/scan.ply").points
 

@@ -29,9 +29,9 @@ from benchmarks.bad_inputs.spoil import (
     whole,
 )
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.e57 import E57Scan, write_e57
-from pipeline.formats.points.points.laz import write_laz
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
 
 SCAN, WALL = "raw/scan.ply", "raw/wall.ply"
 FACTOR, OFFSET = 131, 155

@@ -17,8 +17,8 @@ import yaml
 
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
 
 Change = Callable[[Path], object]
 Array = np.ndarray[Any, np.dtype[np.float64]]

@@ -13,10 +13,10 @@ import numpy as np
 import yaml
 
 from benchmarks.gap_injections.formulas import IN_RASTER, Array, Matched, Optics, Scan, Values, in_raster, matched, scanned
-from pipeline.formats.cameras.cameras.cameras import write_cameras_yaml
+from pipeline.formats.cameras.cameras import write_cameras_yaml
 from pipeline.formats.meshes.ply import read_ply, write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz, write_laz
+from pipeline.formats.points.laz import read_laz, write_laz
 from pipeline.measurement.build import Request, build
 from scene.geometry.mesh import TriangleMesh
 from sensors.cameras.camera import Camera, CameraPair

@@ -29,7 +29,7 @@ from pipeline.formats.measurements.measurement import (
 )
 from pipeline.formats.measurements.measurement import Measurement as Measured
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.points import read_points
 from pipeline.gap.naming import workflow
 from pipeline.gap.report import figures, report
 from pipeline.report.notebook_progress import python_progress

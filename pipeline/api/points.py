@@ -12,9 +12,9 @@ from pipeline.api.extras import library
 from pipeline.api.pictures import Picture, html_table
 from pipeline.formats.meshes.ply import write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import EXACT_INTENSITY
-from pipeline.formats.points.points.pcd import write_pcd
-from pipeline.formats.points.points.xyz import write_xyz
+from pipeline.formats.points.laz import EXACT_INTENSITY
+from pipeline.formats.points.pcd import write_pcd
+from pipeline.formats.points.xyz import write_xyz
 from pipeline.run.products import write_cloud
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray

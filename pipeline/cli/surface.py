@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     import numpy as np
 
     from pipeline.formats.meshes.ply import write_ply
-    from pipeline.formats.points.points.points import read_points
+    from pipeline.formats.points.points import read_points
     from pipeline.surface.from_cloud import surface_of_cloud
     from pipeline.surface.mesh import SurfaceConfig
 

@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     if config.training.start is not None:
         check_detector(detector_folder(config.training.start))
     load_keras(quiet=arguments.quiet)
-    from pipeline.detection.training.training.training import train
+    from pipeline.detection.training.training import train
 
     arguments.kept = f"what was learned is in {arguments.out}; go on with --resume"
     with shown_progress(quiet=arguments.quiet) as progress:

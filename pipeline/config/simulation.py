@@ -17,8 +17,8 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
 from pipeline.config.overrides import Override, apply_overrides
 from pipeline.config.presets import is_path, model_file, spelled_out, with_preset, without_what_a_preset_sets
-from pipeline.formats.cameras.cameras.camera_files import oriented_files, read_oriented, stereo_pair
-from pipeline.formats.cameras.cameras.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
+from pipeline.formats.cameras.camera_files import oriented_files, read_oriented, stereo_pair
+from pipeline.formats.cameras.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
 from pipeline.precision.detectability import PlanningConfig
 from pipeline.registration.register import IcpConfig
 from pipeline.surface.mesh import SurfaceConfig

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.formats.cameras.cameras.cameras import write_cameras_yaml
+from pipeline.formats.cameras.cameras import write_cameras_yaml
 from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
 from pipeline.formats.measurements.measurement import FILE, read_measurement
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import EXACT_INTENSITY, write_laz
+from pipeline.formats.points.laz import EXACT_INTENSITY, write_laz
 from pipeline.measurement.picture import picture
 from scene.common.errors import InputError
 from scene.common.yaml_text import yaml_line

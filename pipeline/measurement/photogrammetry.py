@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.formats.cameras.cameras.camera_files import read_oriented, stereo_pair
-from pipeline.formats.cameras.cameras.cameras import read_cameras_yaml
+from pipeline.formats.cameras.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras.cameras import read_cameras_yaml
 from pipeline.formats.measurements.checks import check_seen
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray

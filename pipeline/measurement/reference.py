@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.scan_geometry import ScanGeometry
-from pipeline.formats.points.points.points import SUFFIXES
+from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.measurement.scans import METRES, RawScan, read_scans
 from pipeline.measurement.station import Station

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.checks import finite
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.points import TEXT, check_reach, placed, read_points
-from pipeline.formats.points.points.ptx import read_ptx
-from pipeline.formats.points.points.xyz import read_table, read_xyz
+from pipeline.formats.points.points import TEXT, check_reach, placed, read_points
+from pipeline.formats.points.ptx import read_ptx
+from pipeline.formats.points.xyz import read_table, read_xyz
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
@@ -75,7 +75,7 @@ def _from_text(path: Path, columns: Sequence[str]) -> RawScan:
 
 
 def _from_e57(path: Path) -> Iterator[RawScan]:
-    from pipeline.formats.points.points.e57 import read_e57  # the library takes a tenth of a second to load
+    from pipeline.formats.points.e57 import read_e57  # the library takes a tenth of a second to load
 
     for number, scan in enumerate(read_e57(path), start=1):
         name = f"{path.name} ({number}: {scan.name})"

@@ -21,18 +21,18 @@ from pipeline.change.difference import statistics
 from pipeline.change.m3c2 import M3c2Map
 from pipeline.change.tiles import tiles
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.cameras.cameras.crs import wkt_of
+from pipeline.formats.cameras.crs import wkt_of
 from pipeline.formats.files.atomic import explained, give_name, note, noting, to_disk, write_bytes, write_json
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.files.inside import inside
 from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.copc import SUFFIX as COPC
-from pipeline.formats.points.points.copc import write_copc
-from pipeline.formats.points.points.e57 import E57Scan, write_e57
-from pipeline.formats.points.points.laz import LazHeader, PulseChannels, write_laz
-from pipeline.formats.points.points.pcd import write_pcd
-from pipeline.formats.points.points.xyz import write_xyz
+from pipeline.formats.points.copc import SUFFIX as COPC
+from pipeline.formats.points.copc import write_copc
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.laz import LazHeader, PulseChannels, write_laz
+from pipeline.formats.points.pcd import write_pcd
+from pipeline.formats.points.xyz import write_xyz
 from pipeline.formats.rasters.geotiff import write_geotiff, write_tiff
 from pipeline.formats.records.run_files import epoch_folder
 from pipeline.report.figures import (

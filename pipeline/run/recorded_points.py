@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.e57 import E57Scan
+from pipeline.formats.points.e57 import E57Scan
 from scene.geometry.frame import WallFrame
 from sensors.signal_chain.observation import Observation
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from pipeline.change.annotate import merge
 from pipeline.config.simulation import CamerasFile, SensorName, SimulationConfig
-from pipeline.formats.cameras.cameras.crs import wkt_of
+from pipeline.formats.cameras.crs import wkt_of
 from pipeline.formats.files.atomic import noting, remove_written, write_json
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.files.lock import is_free, locked

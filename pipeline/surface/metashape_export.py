@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.cameras.cameras.metashape import write_metashape
+from pipeline.formats.cameras.metashape import write_metashape
 from pipeline.formats.files.atomic import write_bytes, write_text
 from pipeline.formats.rasters.geotiff import write_tiff
 from pipeline.surface.depth_maps import DepthMap

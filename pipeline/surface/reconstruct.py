@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.formats.cameras.cameras.colmap import write_colmap, write_map
+from pipeline.formats.cameras.colmap import write_colmap, write_map
 from pipeline.formats.meshes.ply import read_ply, read_ply_points
 from pipeline.surface.depth_maps import DepthMap, normals, pinhole
 from pipeline.surface.mesh import SurfaceConfig, labelled_surface, octree_depth

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz
-from pipeline.formats.points.points.points import check_reach
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.points.points import check_reach
 from pipeline.formats.records.result_records import GAP_FILE, read_gap
 from pipeline.view.results import INSTRUMENTS, Item, Layer, Patch, PointLayer, ViewWindow, inside
 from scene.common.errors import InputError

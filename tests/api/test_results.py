@@ -20,7 +20,7 @@ import xarray
 from pipeline import Mesh, Points, Run, SimulationConfig, configure, detect, open_run, plan, simulate
 from pipeline.api import detecting, planning
 from pipeline.api.maps import raster_of
-from pipeline.formats.points.points.laz import read_laz
+from pipeline.formats.points.laz import read_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.report.progress import Progress
 from scene import InputError

@@ -85,7 +85,7 @@ def test_a_tile_that_is_cut_short_stops_a_training_before_it_begins(split, tmp_p
 @pytest.mark.slow
 def test_a_training_that_fails_in_its_first_epoch_leaves_nothing(tmp_path, eager):
     """Called as a function, which does not read every tile beforehand."""
-    from pipeline.detection.training.training.training import train
+    from pipeline.detection.training.training import train
 
     for name in ("train", "val"):
         make_set(tmp_path / "set" / name, 1, 5)

@@ -25,7 +25,7 @@ from pipeline.detection.network.keras_backend import keras_ready, stderr_dropped
 from pipeline.detection.network.normalisation import denormalised, nmad, normalised
 from pipeline.detection.products import events
 from pipeline.detection.products.run import detect, find_inputs
-from pipeline.detection.training.training.schedule import has_settled, learning_rate
+from pipeline.detection.training.schedule import has_settled, learning_rate
 from pipeline.formats.rasters.geotiff import write_geotiff
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -225,7 +225,7 @@ def test_training_stops_where_the_mean_slope_is_flat():
 
 def test_the_detector_does_without_the_ray_tracer_and_that_refuses_to_come_second():
     """Dr.Jit would take LLVM's symbols from TensorFlow and crash; the other way round both work."""
-    modules = "pipeline.detection.products.run, pipeline.detection.training.training.training, pipeline.detection.products.score_files"
+    modules = "pipeline.detection.products.run, pipeline.detection.training.training, pipeline.detection.products.score_files"
     script = f"""
 import sys, {modules}
 assert "drjit" not in sys.modules and "tensorflow" in sys.modules

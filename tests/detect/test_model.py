@@ -27,7 +27,7 @@ from pipeline.detection.network.config import (
 from pipeline.detection.network.data import CocoFolder, network_input, window
 from pipeline.detection.network.model import LOSSES, MaskRCNN
 from pipeline.detection.products.run import detect as run_detect
-from pipeline.detection.training.training.training import train
+from pipeline.detection.training.training import train
 from pipeline.formats.rasters.geotiff import write_geotiff
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid

@@ -13,7 +13,7 @@ from test_model import SMALL, make_set
 from pipeline.detection.inference import weights
 from pipeline.detection.network.config import TrainConfig, TrainingConfig
 from pipeline.detection.network.keras_backend import computing_in
-from pipeline.detection.training.training.training import train
+from pipeline.detection.training.training import train
 from scene.common.errors import InputError
 
 _FLAGS = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""

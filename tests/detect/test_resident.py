@@ -15,8 +15,8 @@ from test_model import make_set
 
 from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainConfig, TrainingConfig
 from pipeline.detection.network.data import CocoFolder, mirrored, network_input, window
-from pipeline.detection.training.training.resident import cut, resident, turned
-from pipeline.detection.training.training.training import train
+from pipeline.detection.training.resident import cut, resident, turned
+from pipeline.detection.training.training import train
 from scene.common.errors import InputError
 
 FIXED = DetectorConfig(image_px=128, most_blocks=8, normalisation=NormalisationConfig(method="fixed"))
@@ -87,7 +87,7 @@ from keras import ops
 from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainingConfig
 from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.network.model import LOSSES
-from pipeline.detection.training.training.resident import ResidentLearner, resident
+from pipeline.detection.training.resident import ResidentLearner, resident
 
 
 class Darkest(keras.Model):

@@ -19,7 +19,7 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from pipeline.measurement.build import Request, build
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError

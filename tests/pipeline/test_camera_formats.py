@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.config.simulation import CamerasFile
-from pipeline.formats.cameras.cameras.camera_files import read_lens, read_oriented
-from pipeline.formats.cameras.cameras.cameras import read_cameras_yaml, write_cameras_yaml
-from pipeline.formats.cameras.cameras.colmap import read_colmap, read_map, write_colmap, write_map
-from pipeline.formats.cameras.cameras.metashape import read_calibration, read_metashape, write_calibration, write_metashape
-from pipeline.formats.cameras.cameras.opencv import read_opencv, read_opencv_text, write_opencv
+from pipeline.formats.cameras.camera_files import read_lens, read_oriented
+from pipeline.formats.cameras.cameras import read_cameras_yaml, write_cameras_yaml
+from pipeline.formats.cameras.colmap import read_colmap, read_map, write_colmap, write_map
+from pipeline.formats.cameras.metashape import read_calibration, read_metashape, write_calibration, write_metashape
+from pipeline.formats.cameras.opencv import read_opencv, read_opencv_text, write_opencv
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera, CameraPair

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pipeline import configure, make_wall, open_run, simulate
-from pipeline.formats.points.points.e57 import read_e57
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.e57 import read_e57
+from pipeline.formats.points.points import read_points
 from scene import InputError
 
 SMALL: dict[str, Any] = {

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from format_cases import UTM, a_cloud
 
-from pipeline.formats.cameras.cameras.crs import wkt_of
+from pipeline.formats.cameras.crs import wkt_of
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points import copc
-from pipeline.formats.points.points.copc import octree, write_copc
-from pipeline.formats.points.points.laz import LazHeader, PulseChannels, read_laz
+from pipeline.formats.points import copc
+from pipeline.formats.points.copc import octree, write_copc
+from pipeline.formats.points.laz import LazHeader, PulseChannels, read_laz
 from scene.common.errors import InputError
 
 STEP = 0.51e-6

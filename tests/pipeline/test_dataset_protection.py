@@ -25,8 +25,8 @@ from pipeline.dataset.run import Workers, make_dataset, verify_dataset
 from pipeline.dataset.worker import Order
 from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.products.run import find_inputs
-from pipeline.formats.cameras.cameras.colmap import write_colmap
-from pipeline.formats.cameras.cameras.opencv import write_opencv
+from pipeline.formats.cameras.colmap import write_colmap
+from pipeline.formats.cameras.opencv import write_opencv
 from pipeline.formats.files.inside import inside
 from scene.common.errors import InputError
 from sensors.cameras.camera import Camera

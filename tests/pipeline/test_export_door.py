@@ -16,7 +16,7 @@ from pipeline.export.yolo import save_yolo
 from pipeline.formats.files.atomic import write_json
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.formats.records.result_records import read_run
 from pipeline.report.progress import Progress

@@ -20,7 +20,7 @@ from format_cases import GRID, a_cloud, a_mesh, a_raster
 from pipeline.formats.files.atomic import write_bytes, write_json, write_text, writing
 from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from pipeline.formats.rasters.geotiff import write_geotiff, write_tiff
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid

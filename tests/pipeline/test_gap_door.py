@@ -17,9 +17,9 @@ from pipeline.cli.main import main
 from pipeline.formats.measurements.checks import PointFit, check_different
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
-from pipeline.formats.points.points.points import read_points
-from pipeline.formats.points.points.xyz import read_xyz
+from pipeline.formats.points.laz import write_laz
+from pipeline.formats.points.points import read_points
+from pipeline.formats.points.xyz import read_xyz
 from scene.common.errors import InputError
 from scene.ray_casting.raycast import RayCaster
 from sensors.effects.base import Sensor

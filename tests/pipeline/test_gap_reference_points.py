@@ -13,7 +13,7 @@ from benchmarks import workshop
 from pipeline.formats.measurements.config import MeasurementConfig
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
 from pipeline.measurement.build import Request, build

@@ -15,7 +15,7 @@ from matplotlib.text import Text
 
 from pipeline.cli.main import main
 from pipeline.formats.measurements.measurement import Measurement, read_measurement
-from pipeline.formats.points.points.laz import read_laz
+from pipeline.formats.points.laz import read_laz
 from pipeline.gap.decisions import read_decisions
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.splitting import split_of_noises

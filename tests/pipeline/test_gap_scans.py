@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.e57 import E57Scan, write_e57
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.points import read_points
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
 from pipeline.gap.residuals.registration import registered, residuals_of

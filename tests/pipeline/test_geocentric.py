@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from pipeline.formats.cameras.cameras.metashape import read_metashape, write_metashape
+from pipeline.formats.cameras.metashape import read_metashape, write_metashape
 from scene.common.errors import InputError
 from sensors.cameras.camera import Camera
 

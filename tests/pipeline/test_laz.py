@@ -13,7 +13,7 @@ import pytest
 from format_cases import UTM, a_cloud
 
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import EXACT_INTENSITY, read_laz, write_laz
+from pipeline.formats.points.laz import EXACT_INTENSITY, read_laz, write_laz
 from scene.common.errors import InputError
 
 

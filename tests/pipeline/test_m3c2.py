@@ -12,7 +12,7 @@ from pycocotools import mask
 from pipeline.change.difference import SurfaceRaster
 from pipeline.change.m3c2 import M3c2Config, core_grid, m3c2
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.points.points.laz import read_laz
+from pipeline.formats.points.laz import read_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.run.simulation import simulate
 from scene.common.config import parse

@@ -17,16 +17,16 @@ import yaml
 from gap_cases import write_scan
 
 from pipeline.cli.main import main
-from pipeline.formats.cameras.cameras.cameras import write_cameras_yaml
-from pipeline.formats.cameras.cameras.colmap import write_colmap
-from pipeline.formats.cameras.cameras.metashape import write_metashape
+from pipeline.formats.cameras.cameras import write_cameras_yaml
+from pipeline.formats.cameras.colmap import write_colmap
+from pipeline.formats.cameras.metashape import write_metashape
 from pipeline.formats.measurements.measurement import StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.e57 import E57Scan, write_e57
-from pipeline.formats.points.points.laz import PulseChannels, write_laz
-from pipeline.formats.points.points.points import read_points
-from pipeline.formats.points.points.ptx import read_ptx
+from pipeline.formats.points.e57 import E57Scan, write_e57
+from pipeline.formats.points.laz import PulseChannels, write_laz
+from pipeline.formats.points.points import read_points
+from pipeline.formats.points.ptx import read_ptx
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.measurement.build import build

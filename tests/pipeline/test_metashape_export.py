@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.formats.cameras.cameras.metashape import read_metashape
+from pipeline.formats.cameras.metashape import read_metashape
 from pipeline.formats.rasters.geotiff import read_tiff
 from pipeline.surface.depth_maps import DepthMap
 from pipeline.surface.metashape_export import SCRIPT, write_metashape_export

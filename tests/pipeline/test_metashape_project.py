@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.formats.cameras.cameras.camera_files import oriented_files, read_oriented, stereo_pair
-from pipeline.formats.cameras.cameras.metashape import read_metashape, write_metashape
+from pipeline.formats.cameras.camera_files import oriented_files, read_oriented, stereo_pair
+from pipeline.formats.cameras.metashape import read_metashape, write_metashape
 from scene.common.errors import InputError
 from sensors.cameras.camera import Camera
 
@@ -118,7 +118,7 @@ def test_what_is_missing_or_damaged_is_named(project: Path, spoil: Callable[[Pat
 
 
 def test_a_document_beyond_the_limit_is_not_unpacked(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.formats.cameras.cameras.metashape_project.MOST_TEXT_BYTES", 100)
+    monkeypatch.setattr("pipeline.formats.cameras.metashape_project.MOST_TEXT_BYTES", 100)
     with pytest.raises(InputError, match=r"project\.zip: its doc\.xml has 0 MB") as found:
         read_metashape(project)
     assert "no archive" not in str(found.value)

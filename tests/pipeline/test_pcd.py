@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.pcd import write_pcd
+from pipeline.formats.points.pcd import write_pcd
 from scene.common.errors import InputError
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bad_inputs.raw_cases import in_e57
 from pipeline.formats.meshes.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.e57 import E57Scan, read_e57, write_e57
-from pipeline.formats.points.points.laz import PulseChannels, read_laz, write_laz
-from pipeline.formats.points.points.points import SUFFIXES, read_points
-from pipeline.formats.points.points.xyz import read_xyz, write_xyz
+from pipeline.formats.points.e57 import E57Scan, read_e57, write_e57
+from pipeline.formats.points.laz import PulseChannels, read_laz, write_laz
+from pipeline.formats.points.points import SUFFIXES, read_points
+from pipeline.formats.points.xyz import read_xyz, write_xyz
 from pipeline.measurement.scans import read_scans
 from scene.common.errors import InputError
 
@@ -134,7 +134,7 @@ def test_an_e57_takes_memory_for_the_points_that_are_there(tmp_path: Path, cloud
     (at_once,) = read_e57(path)
     monkeypatch = pytest.MonkeyPatch()
     with monkeypatch.context() as patched:
-        patched.setattr("pipeline.formats.points.points.e57._PIECE", 1000)
+        patched.setattr("pipeline.formats.points.e57._PIECE", 1000)
         assert_same(read_e57(path)[0].cloud, at_once.cloud)
     in_e57(path, claim, 'recordCount="999999999">')
     with pytest.raises(InputError, match="5,000 points, where it says 999,999,999"):

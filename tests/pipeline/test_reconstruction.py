@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.simulation import SimulationConfig
-from pipeline.formats.cameras.cameras.colmap import read_map
+from pipeline.formats.cameras.colmap import read_map
 from pipeline.run.simulation import simulate
 from pipeline.surface.depth_maps import DepthMap, normals, pinhole
 from pipeline.surface.mesh import SurfaceConfig

@@ -14,7 +14,7 @@ from pipeline.formats.measurements.measurement import Measurement, read_measurem
 from pipeline.formats.measurements.rounded_points import check_rounded_points
 from pipeline.formats.meshes.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from pipeline.gap.residuals.registration import residuals_of
 from scene.common.errors import InputError
 

@@ -19,9 +19,9 @@ from pycocotools.coco import COCO
 from pipeline.cli.main import main
 from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.meshes.ply import read_ply, write_ply
-from pipeline.formats.points.points.e57 import read_e57
-from pipeline.formats.points.points.laz import read_laz
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.e57 import read_e57
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.points.points import read_points
 from pipeline.run import simulation as pipeline_run
 from pipeline.run.simulation import simulate
 from scene.common.config import parse

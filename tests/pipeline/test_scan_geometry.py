@@ -16,8 +16,8 @@ from surfaces import heightfield
 
 from pipeline.formats.measurements.scan_geometry import ScanGeometry, polar, recover_pattern
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz, write_laz
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.laz import read_laz, write_laz
+from pipeline.formats.points.points import read_points
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray

@@ -13,7 +13,7 @@ from surfaces import heightfield
 from test_run import config
 
 from pipeline.change.difference import DifferenceConfig, raster_grid, surface_raster
-from pipeline.formats.points.points.laz import read_laz
+from pipeline.formats.points.laz import read_laz
 from pipeline.registration.register import IcpConfig
 from pipeline.registration.rigid import RigidTransform
 from pipeline.run.simulation import simulate

@@ -13,7 +13,7 @@ from surfaces import heightfield
 from pipeline.cli import main as cli
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from scene.walls.imported import ImportedWall
 
 STATION = np.array([345203.0, 6389435.0, 122.0])

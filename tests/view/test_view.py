@@ -25,7 +25,7 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.files.atomic import write_json, write_text
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz, write_laz
+from pipeline.formats.points.laz import read_laz, write_laz
 from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.run.simulation import simulate
 from pipeline.view.beside import Pair, beside, border

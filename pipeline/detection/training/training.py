@@ -20,7 +20,7 @@ from pipeline.detection.network.keras_backend import computing_in
 from pipeline.detection.network.model import LOSSES, MaskRCNN, total_loss
 from pipeline.detection.products.figures import write_loss_figure
 from pipeline.detection.products.run import detector_folder
-from pipeline.detection.training.training.schedule import has_settled, learning_rate
+from pipeline.detection.training.schedule import has_settled, learning_rate
 from pipeline.formats.files.atomic import write_json, writing
 from pipeline.formats.files.inside import inside
 from pipeline.report.progress import Progress
@@ -142,7 +142,7 @@ def _learner(model: MaskRCNN, folders: tuple[CocoFolder, CocoFolder], config: Tr
     if backend != "jax":
         where, remedy = "training.data", "set KERAS_BACKEND=jax, or training.data=streamed"
         raise InputError(f"is resident with KERAS_BACKEND={backend}", where=where, allowed="resident on jax", remedy=remedy)
-    from pipeline.detection.training.training.resident import ResidentLearner, resident
+    from pipeline.detection.training.resident import ResidentLearner, resident
 
     sets = [resident(folder, config.detector, model.size) for folder in folders]
     return ResidentLearner(model, sets[0], sets[1], config.training)

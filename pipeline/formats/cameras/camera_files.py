@@ -5,10 +5,10 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
-from pipeline.formats.cameras.cameras.colmap import read_colmap
-from pipeline.formats.cameras.cameras.metashape import MetashapeCameras, read_calibration, read_metashape
-from pipeline.formats.cameras.cameras.metashape_project import is_project, project_files
-from pipeline.formats.cameras.cameras.opencv import read_opencv, read_opencv_text
+from pipeline.formats.cameras.colmap import read_colmap
+from pipeline.formats.cameras.metashape import MetashapeCameras, read_calibration, read_metashape
+from pipeline.formats.cameras.metashape_project import is_project, project_files
+from pipeline.formats.cameras.opencv import read_opencv, read_opencv_text
 from pipeline.formats.files.xml_file import read_root
 from scene.common.errors import InputError
 from scene.common.regular_file import check_file

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pipeline.formats.cameras.cameras.camera_files import read_lens
+from pipeline.formats.cameras.camera_files import read_lens
 from pipeline.formats.files.atomic import write_text
 from scene.common.config import Config, load_yaml, parse
 from sensors.cameras.camera import INTERIOR, CameraConfig, CameraPair

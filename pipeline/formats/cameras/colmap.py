@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.cameras.cameras.opencv import OpencvInterior, shared_distortion
+from pipeline.formats.cameras.opencv import OpencvInterior, shared_distortion
 from pipeline.formats.files.atomic import write_bytes, write_text
 from scene.common.errors import InputError
 from scene.common.regular_file import read_text

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.formats.cameras.cameras.geocentric import Projection, is_geocentric
-from pipeline.formats.cameras.cameras.metashape_project import active_chunk, is_project
+from pipeline.formats.cameras.geocentric import Projection, is_geocentric
+from pipeline.formats.cameras.metashape_project import active_chunk, is_project
 from pipeline.formats.files.atomic import write_bytes
 from pipeline.formats.files.xml_file import read_root
 from scene.common.errors import InputError

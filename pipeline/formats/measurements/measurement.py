@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pydantic import Discriminator, Tag
 
 from pipeline.change.areas import Area, in_areas
-from pipeline.formats.cameras.cameras.camera_files import read_oriented, stereo_pair
-from pipeline.formats.cameras.cameras.cameras import read_cameras_yaml
+from pipeline.formats.cameras.camera_files import read_oriented, stereo_pair
+from pipeline.formats.cameras.cameras import read_cameras_yaml
 from pipeline.formats.measurements.checks import (
     PointFit,
     check_different,
@@ -36,7 +36,7 @@ from pipeline.formats.measurements.surface_datum import told_datum
 from pipeline.formats.measurements.surface_fit import SurfaceFit, air_side, check_in_metres
 from pipeline.formats.measurements.surroundings import Surroundings
 from pipeline.formats.point_cloud import SCAN, PointCloud, joined
-from pipeline.formats.points.points.points import read_points
+from pipeline.formats.points.points import read_points
 from pipeline.registration.rigid import rotation_matrix
 from scene.common.config import Config, load_yaml, parse
 from scene.common.errors import InputError

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.formats.files.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import LazHeader, PulseChannels, StoredCloud
+from pipeline.formats.points.laz import LazHeader, PulseChannels, StoredCloud
 from scene.common.errors import InputError
 
 SUFFIX = ".copc.laz"

@@ -8,9 +8,9 @@ import numpy as np
 
 from pipeline.formats.meshes.ply import read_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz
-from pipeline.formats.points.points.ptx import PtxScan, read_ptx
-from pipeline.formats.points.points.xyz import read_xyz
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.points.ptx import PtxScan, read_ptx
+from pipeline.formats.points.xyz import read_xyz
 from scene.common.errors import InputError
 from scene.common.plug_ins import plugged
 from scene.common.regular_file import check_file
@@ -76,7 +76,7 @@ def _read(path: Path) -> PointCloud:
 
 
 def _read_e57(path: Path) -> PointCloud:
-    from pipeline.formats.points.points.e57 import read_e57  # the library takes a tenth of a second to load
+    from pipeline.formats.points.e57 import read_e57  # the library takes a tenth of a second to load
 
     return joined([scan.placed for scan in read_e57(path)])
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import read_laz
-from pipeline.formats.points.points.points import check_reach
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.points.points import check_reach
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
 

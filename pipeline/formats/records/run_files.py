@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.cameras.cameras.crs import wkt_of
+from pipeline.formats.cameras.crs import wkt_of
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.formats.records.result_files import read_own_points, read_surface

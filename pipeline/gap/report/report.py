@@ -11,7 +11,7 @@ import yaml
 from pipeline.formats.files.atomic import write_json, write_text, writing
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points.laz import write_laz
+from pipeline.formats.points.laz import write_laz
 from pipeline.gap.decisions import deciding
 from pipeline.gap.naming.verdict import closing
 from pipeline.gap.naming.workflow import GapDiagnosis
