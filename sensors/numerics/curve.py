@@ -11,7 +11,7 @@ from scene.common.backend import dr, mi
 from scene.common.config import Config
 from scene.geometry.mesh import FloatArray
 from scene.ray_casting.upload import on_device
-from sensors.numerics.device import bounded, opaque
+from sensors.numerics.device import bounded, cell_index, opaque
 
 Rows = tuple[tuple[float, ...], ...]
 _MOST_VALUES = 4096
@@ -49,7 +49,7 @@ class Axis(Config):
             x = x - cycle * dr.floor(x / cycle)
         start, step = opaque(self.low, (self.high - self.low) / (count - 1))
         place = bounded((x - start) / step, 0.0, count - 1.0)
-        index = mi.UInt32(bounded(dr.floor(place), 0.0, count - 2.0))
+        index = cell_index(place, count - 1)
         return index, place - mi.Float64(index)
 
     def place_on_host(self, x: FloatArray, count: int) -> tuple[Any, FloatArray]:

@@ -23,6 +23,29 @@ def rotated(matrix: FloatArray, vectors: mi.Array3f64) -> mi.Array3f64:
     return mi.Array3f64(*(dr.dot(vector(row), vectors) for row in matrix))
 
 
+def cell_index(place: Any, count: int) -> mi.UInt32:
+    """Return the number of the cell in which each place lies, safe for `dr.gather` whatever the place is.
+
+    A gather outside its array ends the process, so every index that is computed from a sensor's values comes from here.
+
+    Parameters
+    ----------
+    place : mi.Float32 or mi.Float64, (n,)
+        Place along the array in cells, cell k covering k <= place < k + 1. Any value, NaN and infinities too.
+    count : int
+        Number of cells, at least 1.
+
+    Returns
+    -------
+    mi.UInt32, (n,)
+        Numbers from 0 to count - 1. Places before the first cell and NaN give 0, places behind the last cell give count - 1.
+        Values that are computed with the share `place - index` stay NaN where the place is NaN.
+    """
+    last = dr.opaque(type(place), count - 1)
+    floor = dr.select(place > 0, dr.floor(place), 0)
+    return mi.UInt32(dr.select(floor < last, floor, last))  # dr.clip's minimum aborts in LLVM 15
+
+
 def bounded(value: Any, low: Any, high: Any) -> Any:
     """`value` between `low` and `high`, a device array of any type (dr.clip's minimum aborts in LLVM 15)."""
     return dr.select(value < low, low, dr.select(value > high, high, value))

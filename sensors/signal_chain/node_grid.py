@@ -8,6 +8,7 @@ from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from scene.ray_casting.upload import on_device
+from sensors.numerics.device import cell_index
 from sensors.signal_chain.matches import Matches
 
 
@@ -21,7 +22,7 @@ def smooth_field(state: Matches, step_px: float, random: KeyedRandom, *, even: b
     nodes = on_device(mi.Float32, random.generator().standard_normal((rows, columns)))
     step = dr.opaque(mi.Float64, step_px)
     x, y = state.u / step, state.v / step
-    left, top = mi.UInt32(x), mi.UInt32(y)
+    left, top = cell_index(x, columns - 1), cell_index(y, rows - 1)
     across, down = mi.Float32(x - left), mi.Float32(y - top)
     stride = dr.opaque(mi.UInt32, columns)
     corner = top * stride + left

@@ -121,7 +121,7 @@ class _Pictures:
             target = mi.Float32(x) - disparity - change
             base = dr.floor(target)
             first, y_safe, x_safe = mi.Int32(base) - 1, bounded(y, 0, self.height - 1), bounded(x, 0, self.left_width - 1)
-            within = (x == x_safe) & (y == y_safe) & (first >= 0) & (first + 3 < self.right_width)
+            within = (x == x_safe) & (y == y_safe) & (base >= 1) & (base + 2 < self.right_width)  # NaN is outside
             cell = y_safe * self.left_width + x_safe
             counts = dr.abs(dr.gather(mi.Float32, self.disparity, cell) - start - change) <= OWN_SURFACE_PX
             value, gradient = self._cubic(y_safe * self.right_width + first, target - base, within & counts)

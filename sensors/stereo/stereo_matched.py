@@ -78,7 +78,7 @@ class MatchedStereoPair:
         grid = RectifiedGrid.cover(nominal, geometry, step)
         disparity = self.matched(photographs, grid, search_m)
         left_u, left_v = rectified_pixel(nominal.left, geometry.left, u, v, geometry.f, geometry.u_left, geometry.v)
-        found = _sampled(disparity, *grid.cells(left_u, left_v))
+        found = sampled_disparity(disparity, *grid.cells(left_u, left_v))
         full_px = (mi.Float64(found) + grid.disparity_offset) * step
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
         rows = row_tangent(geometry, left_v), float(geometry.offset)
@@ -141,13 +141,13 @@ def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def _sampled(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
+def sampled_disparity(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
     """(n,) disparities at fractional columns and rows: bilinear on one surface, the nearest cell's at a depth step."""
     height, width = disparity.shape
     values = on_device(mi.Float32, disparity)
     columns, rows = dr.opaque(mi.Int32, width), dr.opaque(mi.Int32, height)
     left, top = mi.Int32(dr.floor(column)), mi.Int32(dr.floor(row))
-    inside = (left >= 0) & (top >= 0) & (left + 1 < columns) & (top + 1 < rows)
+    inside = (column >= 0) & (row >= 0) & (column < columns - 1) & (row < rows - 1)  # in floating point: NaN is outside
     across, down = mi.Float32(column - left), mi.Float32(row - top)
     corner = top * columns + left
     a, b, c, d = (dr.gather(mi.Float32, values, corner + offset, inside) for offset in (0, 1, columns, columns + 1))

@@ -24,7 +24,7 @@ from scene.ray_casting.upload import on_device, vectors_on_device
 from sensors.cameras.camera import Camera
 from sensors.cameras.rectification import rectify
 from sensors.effects.base import Effect, Stage, apply_stage
-from sensors.numerics.device import rotated, vector
+from sensors.numerics.device import cell_index, rotated, vector
 from sensors.signal_chain.matches import Matches, bridged
 from sensors.signal_chain.observation import packed
 from sensors.stereo.raised_points import in_metres, shifts
@@ -136,7 +136,7 @@ class VertexMatches(Matches):
         return self.cells.matches.albedo_raster()
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
-        columns, rows = (self._nearest(place / self.reduction, count) for place, count in self._axes())
+        columns, rows = (cell_index(place / self.reduction, count) for place, count in self._axes())
         return dr.gather(mi.Float64, on_device(mi.Float64, raster), rows * dr.opaque(mi.UInt32, self.shape[1]) + columns)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
@@ -166,15 +166,8 @@ class VertexMatches(Matches):
         """The cell whose centre is before (side 0) or behind (1) `place`, in cells, and its weight in a linear interpolation."""
         first = dr.floor(place - 0.5)
         share = place - 0.5 - first
-        return self._nearest(first + side, count), share if side else 1 - share
+        return cell_index(first + side, count), share if side else 1 - share
 
     def _axes(self) -> tuple[tuple[mi.Float64, int], tuple[mi.Float64, int]]:
         u, v = (dr.select(self.matched, place, 0.0) for place in (self.u, self.v))
         return (u, self.shape[1]), (v, self.shape[0])
-
-    @staticmethod
-    def _nearest(place: mi.Float64, count: int) -> mi.UInt32:
-        """Number of the cell in which `place`, in cells, lies; at the border the outermost."""
-        last = dr.opaque(mi.Float64, count - 1)
-        floor = dr.select(place > 0, dr.floor(place), 0.0)
-        return mi.UInt32(dr.select(floor < last, floor, last))  # dr.clip aborts in LLVM 15
