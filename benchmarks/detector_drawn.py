@@ -22,7 +22,7 @@ from documents import write_between
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
-from pipeline.detection.evaluation.evaluate import matches
+from pipeline.detection.evaluation.evaluate import match_detections
 from pipeline.detection.inference import weights
 from pipeline.detection.inference.inference import paste
 from pipeline.detection.network.boxes import widened
@@ -149,7 +149,7 @@ def blocks(model: Any, folder: CocoFolder) -> Iterator[Block]:
             continue
         boxes, mask_boxes, masks = (answer[name][sure] for name in ("boxes", "mask_boxes", "masks"))
         true_masks = np.stack([coco_mask.decode(each["segmentation"]) > 0 for each in wanted])
-        matched = matches(overlaps(pasted(masks, mask_boxes, model.size), true_masks), FOUND)
+        matched = match_detections(overlaps(pasted(masks, mask_boxes, model.size), true_masks), FOUND)
         hits, of = np.flatnonzero(matched >= 0), matched[matched >= 0]
         if not len(hits):
             continue

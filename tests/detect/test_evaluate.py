@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import io
 import json
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
 
 from pipeline.change.annotate import run_length_encoding
-from pipeline.detection.evaluation.evaluate import coco_metrics, evaluate, matches
+from pipeline.detection.evaluation.evaluate import coco_metrics, evaluate, match_detections
 from pipeline.detection.products.score_files import as_text, assess, write
 from scene.common.errors import InputError
 
@@ -58,11 +63,89 @@ def test_groups_keep_their_own_counts(truth, found):
     assert (by["low"].true_positives, by["high"].true_positives, by["high"].false_positives) == (1, 1, 0)
 
 
-def test_a_match_is_each_others_best_and_ties_go_to_the_first():
-    assert_array_equal(matches(np.array([[0.8, 0.8], [0.8, 0.8]]), 0.5), [0, -1])
-    assert_array_equal(matches(np.array([[0.6, 0.9], [0.2, 0.95]]), 0.5), [-1, 1])
-    assert_array_equal(matches(np.array([[0.6, 0.1], [0.2, 0.7]]), 0.65), [-1, 1])
-    assert_array_equal(matches(np.zeros((2, 0)), 0.5), [-1, -1])
+def test_the_surest_detection_chooses_first_and_ties_go_to_the_last_as_in_pycocotools():
+    assert_array_equal(match_detections(np.array([[0.8, 0.8], [0.8, 0.8]]), 0.5), [1, 0])
+    assert_array_equal(match_detections(np.array([[0.6, 0.9], [0.2, 0.95]]), 0.5), [1, -1])
+    assert_array_equal(match_detections(np.array([[0.6, 0.1], [0.2, 0.7]]), 0.65), [-1, 1])
+    assert_array_equal(match_detections(np.zeros((2, 0)), 0.5), [-1, -1])
+
+
+def test_a_crowd_region_takes_what_no_block_takes_any_number_of_times():
+    overlap = np.array([[0.6, 1.0], [0.55, 0.9], [0.1, 0.5], [0.1, 0.4]])
+    assert_array_equal(match_detections(overlap, 0.5, np.array([False, True])), [0, 1, 1, -1])
+
+
+@pytest.mark.parametrize("kind", ["segm", "bbox"])
+@pytest.mark.parametrize("seed", range(12))
+def test_the_table_counts_as_pycocotools_on_drawn_sets(seed, kind):
+    """Several images and categories, crowd regions, equal scores, doubles, nothing in some images."""
+    truth, found = _drawn(np.random.default_rng(seed))
+    for confidence in (0.0, 0.5, 0.9):
+        kept = [item for item in found if item["score"] >= confidence]
+        ours = evaluate(truth, found, None, (confidence,), (0.25, 0.5, 0.75), kind)
+        counts = [(score.true_positives, score.false_positives, score.false_negatives) for score in ours]
+        assert counts == _counts_of_pycocotools(truth, kept, (0.25, 0.5, 0.75), kind)
+
+
+def _drawn(random):
+    images = [{"id": n, "file_name": f"{n}.tif", "width": 64, "height": 64} for n in (3, 5, 9, 12)]
+    categories = [{"id": n, "name": name} for n, name in ((1, "block"), (2, "vegetation"))]
+
+    def place():
+        return [int(value) for value in (*random.integers(0, 44, 2), *random.integers(4, 20, 2))]
+
+    blocks, found = [], []
+    for image in images[:3]:
+        for _ in range(random.integers(0, 9)):
+            x, y, width, height = place()
+            block = {**_item(len(blocks) + 1, image["id"], x, y, width, height), "category_id": int(random.integers(1, 3))}
+            blocks.append({**block, "iscrowd": int(random.random() < 0.25)})
+            for _ in range(random.integers(0, 3)):
+                shifted = [int(np.clip(value + random.integers(-3, 4), 0, 44)) for value in (x, y)]
+                score = float(random.choice([0.3, 0.5, 0.5, 0.8, 0.95]))
+                item = _item(len(found) + 1, image["id"], *shifted, width, height, score)
+                found.append(
+                    {**item, "category_id": int(random.integers(1, 3)) if random.random() < 0.2 else block["category_id"]}
+                )
+    found.append(_item(len(found) + 1, 12, *place(), 0.7))
+    return {"images": images, "annotations": blocks, "categories": categories}, found
+
+
+def _counts_of_pycocotools(truth, found, thresholds, kind):
+    """True and false positives and false negatives, from pycocotools' own matches of each image and category."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        reference = COCO()
+        reference.dataset = copy.deepcopy(truth)
+        reference.createIndex()
+        results = COCO()
+        results.dataset = {**copy.deepcopy(truth), "annotations": copy.deepcopy(found)}
+        results.createIndex()
+        judge = COCOeval(reference, results, kind)
+        judge.params.iouThrs, judge.params.maxDets = np.array(thresholds), [1000]
+        judge.params.areaRng, judge.params.areaRngLbl = [[0, 1e10]], ["all"]
+        judge.evaluate()
+    counts = np.zeros((len(thresholds), 3), dtype=int)
+    for each in filter(None, judge.evalImgs):
+        real, counted = ~np.array(each["gtIgnore"], dtype=bool), ~np.array(each["dtIgnore"], dtype=bool)
+        right = (np.array(each["dtMatches"]) > 0) & counted
+        counts[:, 0] += right.sum(axis=1)
+        counts[:, 1] += (counted & ~right).sum(axis=1)
+        counts[:, 2] += real.sum() - right.sum(axis=1)
+    return [tuple(int(value) for value in row) for row in counts]
+
+
+def test_each_category_has_a_table_of_its_own_beside_the_total(truth, found, tmp_path):
+    """All detections are called vegetation where the truth has rockfall: none is right in any table, nor in COCO's line."""
+    truth["categories"].append({"id": 2, "name": "vegetation"})
+    truth["annotations"].append({**_item(9, 2, 40, 40, 8, 8), "category_id": 2})
+    (tmp_path / "annotations.json").write_text(json.dumps(truth))
+    (tmp_path / "found.json").write_text(json.dumps([{**item, "category_id": 2} for item in found]))
+    assessment = assess(tmp_path, tmp_path / "found.json", kinds=("segm",), confidences=(0.9,))
+    counts = {(s.group, s.iou): (s.true_positives, s.false_positives, s.false_negatives) for s in assessment.scores}
+    assert counts["all", 0.25] == (0, 4, 4)
+    assert counts["category block", 0.25] == (0, 0, 3)
+    assert counts["category vegetation", 0.25] == (0, 4, 1)
+    assert assessment.coco["AP"] == 0
 
 
 def test_coco_metrics_of_perfect_and_of_no_detections(truth):

@@ -15,7 +15,7 @@ _COUNT = 4000
 
 def _block(number: int, image: int, x: int, **more: float) -> dict:
     mask = run_length_encoding(np.ones((4, 4), bool), 0, x, (16, 16))
-    return {"id": number, "image_id": image, "bbox": [x, 0, 4, 4], "area": 16, "segmentation": mask, **more}
+    return {"id": number, "image_id": image, "category_id": 1, "bbox": [x, 0, 4, 4], "area": 16, "segmentation": mask, **more}
 
 
 def _set(scores: np.ndarray, there: np.ndarray) -> tuple[dict, list[dict]]:

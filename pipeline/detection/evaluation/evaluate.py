@@ -1,6 +1,6 @@
-"""How good detections are: one-to-one matching, precision, recall, F1, mask areas, in the thesis's form; COCO's metrics beside.
+"""Score detections against the truth: matching, precision, recall, F1 and mask areas, and COCO's metrics beside them.
 
-The thesis calls the precision AP and the recall AR.
+Both come from the same matching, that of pycocotools. The thesis calls the precision AP and the recall AR.
 """
 
 from __future__ import annotations
@@ -65,20 +65,39 @@ class Score:
         return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in values.items()}
 
 
-def matches(overlap: NDArray[np.float64], threshold: float) -> NDArray[np.int64]:
-    """(p,) index of the block that each prediction is matched to, -1 for none.
+def match_detections(overlap: NDArray[np.float64], threshold: float, crowd: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+    """Match the detections of one category in one image with the annotated blocks, as pycocotools does.
 
-    overlap: (p, t) intersection over union, predictions by falling score. A prediction and a block are matched where each is
-    the other's best and they overlap by `threshold` or more; of equal overlaps the earlier counts, so that each takes part in
-    at most one match.
+    Detections choose in the order of their scores. Each takes the free block that it overlaps most, if they overlap by the
+    threshold. A detection without a block may fall on a crowd region, which any number of detections may share.
+
+    Parameters
+    ----------
+    overlap : (p, t) array
+        Intersection over union of detections by falling score with blocks. With crowd regions:
+        intersection over the detection's area.
+    threshold : float
+        Smallest overlap of a match.
+    crowd : (t,) bool array, optional
+        Which annotations are crowd regions (COCO's `iscrowd`). None: no annotation is.
+
+    Returns
+    -------
+    (p,) int array
+        Index of the annotation that each detection is matched with, -1 for none. Of equal overlaps the last annotation counts.
     """
-    result = np.full(overlap.shape[0], -1)
-    if 0 in overlap.shape:
-        return result
-    best, back = overlap.argmax(axis=1), overlap.argmax(axis=0)
-    rows = np.arange(len(best))
-    mutual = (back[best] == rows) & (overlap[rows, best] >= threshold)
-    result[mutual] = best[mutual]
+    detections, annotations = overlap.shape
+    result = np.full(detections, -1)
+    crowd = np.zeros(annotations, dtype=bool) if crowd is None else crowd
+    least = min(threshold, 1 - 1e-10)  # as pycocotools, which lets a threshold of 1 be reached in spite of rounding
+    free = ~crowd
+    for number, row in enumerate(overlap):
+        for choice in (free, crowd):
+            allowed = np.flatnonzero(choice & (row >= least))
+            if allowed.size:
+                best = allowed[::-1][np.argmax(row[allowed[::-1]])]
+                result[number], free[best] = best, False
+                break
     return result
 
 
@@ -90,18 +109,37 @@ def evaluate(
     thresholds: Sequence[float] = THRESHOLDS,
     kind: Overlap = "segm",
 ) -> list[Score]:
-    """Scores of COCO predictions against COCO annotations, as `read_coco` gives them, for every group, confidence and overlap.
+    """Score COCO detections against COCO annotations, for every group, confidence and overlap.
 
-    groups: image ids by name; all images as one group by default. kind: overlap of masks or of boxes.
+    A detection matches annotations of its own category only. Crowd regions (`iscrowd`) are neither found nor missed, and a
+    detection that falls on one is neither right nor wrong. Both are as in pycocotools, so that the scores agree with
+    `coco_metrics`. 
+    Parameters
+    ----------
+    truth : mapping
+        COCO's images and annotations, as `read_coco` gives them.
+    predictions : sequence of mappings
+        COCO's detections, as `read_detections` gives them.
+    groups : mapping of names to image ids, optional
+        Images that are scored together. None: all images as one group.
+    confidences, thresholds : sequences of float
+        Lowest scores and lowest overlaps that count.
+    kind : {"segm", "bbox"}
+        Overlap of masks or of boxes.
+
+    Returns
+    -------
+    list of Score
+        By group, then confidence, then threshold.
     """
     groups = groups or {"all": [image["id"] for image in truth["images"]]}
-    blocks, found = _by_image(truth["annotations"]), _by_image(predictions)
+    blocks, found = _by_image_and_category(truth["annotations"]), _by_image_and_category(predictions)
     result = []
     for group, images in groups.items():
-        images = list(images)
-        bound = _stand_out([block for image in images for block in blocks.get(image, [])])
+        keys = _keys(images, blocks, found)
+        bound = _stand_out([block for key in keys for block in blocks.get(key, []) if not block.get("iscrowd")])
         for confidence in confidences:
-            pairs = [_image_pairs(blocks.get(image, []), found.get(image, []), confidence, kind) for image in images]
+            pairs = [_pairs(blocks.get(key, []), found.get(key, []), confidence, kind) for key in keys]
             scores = (_score(group, confidence, threshold, pairs) for threshold in thresholds)
             result += [replace(score, kind=kind, stand_out=bound) for score in scores]
     return result
@@ -114,14 +152,19 @@ def matched_scores(
     threshold: float,
     kind: Overlap = "segm",
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(p,) scores of all predictions of some images, and whether each is matched to a block, as `evaluate` matches them all."""
-    blocks, found = _by_image(truth["annotations"]), _by_image(predictions)
+    """Return the scores (p,) of the detections in some images, and whether each is matched with a block.
+
+    Detections that fall on crowd regions are left out.
+    """
+    blocks, found = _by_image_and_category(truth["annotations"]), _by_image_and_category(predictions)
     scores: list[float] = []
     right: list[bool] = []
-    for image in images:
-        pairs = _image_pairs(blocks.get(image, []), found.get(image, []), 0.0, kind)
-        scores += sorted((item["score"] for item in found.get(image, [])), reverse=True)
-        right += list(matches(pairs.overlap, threshold) >= 0)
+    for key in _keys(images, blocks, found):
+        pairs = _pairs(blocks.get(key, []), found.get(key, []), 0.0, kind)
+        matched = match_detections(pairs.overlap, threshold, pairs.crowd)
+        counted = ~pairs.on_crowd(matched)
+        scores += list(np.sort([item["score"] for item in found.get(key, [])])[::-1][counted])
+        right += list(matched[counted] >= 0)
     return np.array(scores, dtype=np.float64), np.array(right, dtype=bool)
 
 
@@ -161,27 +204,43 @@ def _numbered(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Predictions and blocks of one image. overlap: (p, t); areas: px."""
+    """Detections and annotations of one category in one image. overlap: (p, t); areas: px; crowd: (t,) COCO's `iscrowd`."""
 
     overlap: NDArray[np.float64]
     predicted_area: NDArray[np.float64]
     true_area: NDArray[np.float64]
+    crowd: NDArray[np.bool_]
+
+    def on_crowd(self, matched: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(p,) which detections are matched with a crowd region."""
+        return np.append(self.crowd, False)[matched]  # -1, no match, takes the last
 
 
-def _by_image(annotations: Iterable[Mapping[str, Any]]) -> dict[int, list[Mapping[str, Any]]]:
-    result: dict[int, list[Mapping[str, Any]]] = {}
-    for annotation in annotations:
-        result.setdefault(annotation["image_id"], []).append(annotation)
+Key = tuple[int, int]
+"""Image id and category id."""
+
+
+def _by_image_and_category(entries: Iterable[Mapping[str, Any]]) -> dict[Key, list[Mapping[str, Any]]]:
+    result: dict[Key, list[Mapping[str, Any]]] = {}
+    for entry in entries:
+        result.setdefault((entry["image_id"], entry["category_id"]), []).append(entry)
     return result
 
 
-def _image_pairs(blocks: list[Mapping[str, Any]], found: list[Mapping[str, Any]], confidence: float, kind: Overlap) -> _Pairs:
+def _keys(images: Iterable[int], *entries: Mapping[Key, Any]) -> list[Key]:
+    """The keys of these images at which there is something in any of the `entries`."""
+    chosen = set(images)
+    return sorted({key for each in entries for key in each if key[0] in chosen})
+
+
+def _pairs(blocks: list[Mapping[str, Any]], found: list[Mapping[str, Any]], confidence: float, kind: Overlap) -> _Pairs:
     chosen = sorted((item for item in found if item["score"] >= confidence), key=lambda item: -item["score"])
-    areas = [np.array([float(item["area"]) for item in items]) for items in (chosen, blocks)]
+    predicted, true = (np.array([float(item["area"]) for item in items]) for items in (chosen, blocks))
+    crowd = np.array([bool(block.get("iscrowd")) for block in blocks], dtype=bool)
     if not chosen or not blocks:
-        return _Pairs(np.zeros((len(chosen), len(blocks))), *areas)
+        return _Pairs(np.zeros((len(chosen), len(blocks))), predicted, true, crowd)
     shapes = [[_shape(item, kind) for item in items] for items in (chosen, blocks)]
-    return _Pairs(np.asarray(coco_mask.iou(*shapes, [0] * len(blocks))), *areas)
+    return _Pairs(np.asarray(coco_mask.iou(*shapes, crowd.astype(int).tolist())), predicted, true, crowd)
 
 
 def _shape(item: Mapping[str, Any], kind: Overlap) -> Any:
@@ -192,9 +251,10 @@ def _score(group: str, confidence: float, threshold: float, images: Iterable[_Pa
     hits = predicted = true = 0
     ratios: list[NDArray[np.float64]] = []
     for pairs in images:
-        matched = matches(pairs.overlap, threshold)
-        chosen = np.flatnonzero(matched >= 0)
-        hits, predicted, true = hits + len(chosen), predicted + pairs.overlap.shape[0], true + pairs.overlap.shape[1]
+        matched = match_detections(pairs.overlap, threshold, pairs.crowd)
+        on_crowd = pairs.on_crowd(matched)
+        chosen = np.flatnonzero((matched >= 0) & ~on_crowd)
+        hits, predicted, true = hits + len(chosen), predicted + int((~on_crowd).sum()), true + int((~pairs.crowd).sum())
         true_area = pairs.true_area[matched[chosen]]
         ratios.append((pairs.predicted_area[chosen] / np.maximum(true_area, 1.0))[true_area > 0])  # a box may hold no mask
     every = np.concatenate(ratios) if ratios else np.zeros(0)

@@ -18,7 +18,7 @@ from pipeline.detection.evaluation.evaluate import CONFIDENCES, Overlap, Score, 
 from pipeline.detection.evaluation.reliability import EDGES, OVERLAP, Reliability, reliability
 from pipeline.detection.products.figures import write_reliability
 from pipeline.formats.files.atomic import write_json, write_text
-from pipeline.formats.records.coco import read_coco, read_detections
+from pipeline.formats.records.coco import Coco, Entry, read_coco, read_detections
 from scene.common.errors import InputError, nearest
 
 _MOST_PAIRS = 25_000_000
@@ -62,8 +62,23 @@ def assess(
     _check_pairs(reference.annotations, found, str(predictions))
     groups = _groups(reference.images, keys, str(path))
     scores = [score for kind in kinds for score in evaluate(reference.to_dict(), found, groups, confidences, kind=kind)]
+    scores += _of_categories(reference, found, kinds, confidences)
     reliable = reliability(reference.to_dict(), found, groups, kinds[0])
     return Assessment(scores, coco_metrics(reference.to_dict(), found, kinds[0]), reliable)
+
+
+def _of_categories(truth: Coco, found: list[Entry], kinds: Sequence[Overlap], confidences: Sequence[float]) -> list[Score]:
+    """Scores of each category over all images; none where there is one category, as the total says the same."""
+    if len(truth.categories) < 2:
+        return []
+    result = []
+    for category in truth.categories:
+        number, group = category["id"], f"category {category.get('name', category['id'])}"
+        own = [[each for each in entries if each["category_id"] == number] for entries in (truth.annotations, found)]
+        reference = {**truth.to_dict(), "annotations": own[0]}
+        images = {group: [image["id"] for image in truth.images]}
+        result += [score for kind in kinds for score in evaluate(reference, own[1], images, confidences, kind=kind)]
+    return result
 
 
 def _check_pairs(truth: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]], where: str) -> None:
