@@ -1,13 +1,14 @@
-"""Mending a triangle mesh: welded, without degenerate or doubled faces, manifold, consistently wound.
+"""Mend a triangle mesh: weld vertices, remove degenerate and doubled triangles, wind it one way, keep touching parts apart.
 
-Every step returns the mended mesh and says in words what it did ("" for nothing). All are vectorised sorts and gathers.
+The result is manifold. Every step returns the mended mesh and says in words what it did ("" for nothing).
+All steps are vectorised sorts and gathers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -24,16 +25,35 @@ WELD_M = 1e-6
 """Vertices nearer to one another than this are one, m."""
 _FLAT_M = 1e-9
 """A triangle of a smaller height than this has no area, m."""
+_SMALLEST_AREA_M2 = 1e-6
+"""Area below which a report need not say where triangles were removed, m2."""
 _FACES_AT_ONCE = 1 << 14
 _DIRECTION = np.array([0.5377, 0.6349, 0.5548])
 
 
-def clean(mesh: TriangleMesh, where: str) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """The mended mesh and what was mended. Coordinates should be local (float64 with micrometres to spare).
+def clean(mesh: TriangleMesh, where: str, origin: FloatArray | None = None) -> tuple[TriangleMesh, tuple[str, ...]]:
+    """Mend a mesh and say what was mended.
 
-    Raises InputError where nothing with an area is left, or where the surface has only one side.
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        In local coordinates, m, so that float64 has micrometres to spare.
+    where : str
+        What an error names, such as the file.
+    origin : (3,) array, optional
+        Of the local coordinates in those that the user knows, m; only the report needs it.
+
+    Returns
+    -------
+    TriangleMesh, tuple of str
+        The mended mesh, and each repair in words with its count.
+
+    Raises
+    ------
+    InputError
+        Where no triangle with an area is left, or the surface has only one side.
     """
-    steps: tuple[Callable[[TriangleMesh], Mended], ...] = (weld, drop_flat, drop_doubled, part_edges)
+    steps: tuple[Callable[[TriangleMesh], Mended], ...] = (weld, drop_flat, partial(drop_doubled, origin=origin))
     repairs = []
     for step in steps:
         mesh, words = step(mesh)
@@ -44,7 +64,7 @@ def clean(mesh: TriangleMesh, where: str) -> tuple[TriangleMesh, tuple[str, ...]
             )
     mesh, words = rewind(mesh, where)
     repairs.append(words)
-    for step in (part_vertices, drop_unused):
+    for step in (part_fans, drop_unused):
         mesh, words = step(mesh)
         repairs.append(words)
     return mesh, tuple(text for text in (*repairs, pieces(mesh)) if text)
@@ -71,30 +91,12 @@ def drop_flat(mesh: TriangleMesh) -> Mended:
     return _keep(mesh, keep, "degenerate triangles removed")
 
 
-def drop_doubled(mesh: TriangleMesh) -> Mended:
+def drop_doubled(mesh: TriangleMesh, origin: FloatArray | None = None) -> Mended:
     """Remove all but the first of the triangles over the same three vertices, whatever their winding."""
     first, _ = unique_rows(np.sort(mesh.faces, axis=1))
     keep = np.zeros(len(mesh.faces), bool)
     keep[first] = True
-    return _keep(mesh, keep, "duplicate triangles removed")
-
-
-def part_edges(mesh: TriangleMesh) -> Mended:
-    """Where more than two triangles share an edge, keep the two largest."""
-    edges = mesh.edges
-    ordered = edges[mesh.edge_order]
-    crowded = np.zeros(len(edges), bool)
-    crowded[2:] = ordered[2:] == ordered[:-2]
-    if not crowded.any():
-        return mesh, ""
-    fin = np.flatnonzero(np.isin(edges, ordered[crowded]))
-    face = fin % len(mesh.faces)
-    ranked = np.lexsort((-areas(mesh)[face], edges[fin]))
-    place = np.zeros(len(ranked), bool)
-    place[2:] = edges[fin][ranked][2:] == edges[fin][ranked][:-2]
-    keep = np.ones(len(mesh.faces), bool)
-    keep[face[ranked[place]]] = False
-    return _keep(mesh, keep, f"triangles removed at {len(np.unique(ordered[crowded]))} edges shared by more than two")
+    return _keep(mesh, keep, "duplicate triangles removed", origin)
 
 
 def rewind(mesh: TriangleMesh, where: str) -> Mended:
@@ -124,17 +126,35 @@ def wound_otherwise(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
     return minor | tie
 
 
-def part_vertices(mesh: TriangleMesh) -> Mended:
-    """Where fans of triangles touch only in a vertex, keep the largest fan; repeated, as that may bare another such vertex.
+def part_fans(mesh: TriangleMesh) -> Mended:
+    """Give each part of the surface a vertex of its own where parts touch in a vertex or along an edge.
 
-    The mesh must be manifold along its edges and consistently wound.
+    No triangle is removed: parts that touch, such as a rock on the ground, stay where they are and are no longer connected.
+    Triangles are connected over an edge that exactly two of them share. The mesh must be consistently wound.
     """
-    removed = 0
-    while (pinched := _pinched(mesh)).any():
-        lesser = _lesser_fans(mesh, pinched)
-        removed += int(lesser.sum())
-        mesh = replace(mesh, faces=mesh.faces[~lesser])
-    return mesh, f"{removed} triangles removed where the surface touched itself in a vertex" if removed else ""
+    pinched = _pinched(mesh)
+    if not pinched.any():
+        return mesh, ""
+    near = np.flatnonzero(pinched[mesh.faces].any(axis=1))
+    patch = replace(mesh, faces=mesh.faces[near])
+    corners, count = patch.faces.T.ravel(), len(near)
+    one, other = _twins(patch)  # wound alike, so that one leaves where the other arrives
+    links = np.concatenate([np.stack([one, (other + count) % (3 * count)], 1), np.stack([(one + count) % (3 * count), other], 1)])
+    fan = groups(links, 3 * count)
+    first, size = np.unique(fan, return_index=True, return_counts=True)[1:]
+    centre = corners[first]
+    ranked = np.lexsort((-size, centre))
+    again = np.zeros(len(ranked), bool)
+    again[ranked[1:]] = centre[ranked[1:]] == centre[ranked[:-1]]
+    new = again & pinched[centre]  # the largest fan keeps the vertex
+    number = centre.astype(np.int64)
+    number[new] = len(mesh.vertices) + np.arange(int(new.sum()))
+    faces = mesh.faces.copy()
+    faces[near] = number[fan].reshape(3, count).T
+    chosen = np.concatenate([np.arange(len(mesh.vertices)), centre[new]])
+    albedo = None if mesh.vertex_albedo is None else mesh.vertex_albedo[chosen]
+    parted = replace(mesh, vertices=mesh.vertices[chosen], faces=faces, vertex_albedo=albedo)
+    return parted, f"parts of the surface that touch kept apart at {int(pinched.sum())} vertices"
 
 
 def drop_unused(mesh: TriangleMesh) -> Mended:
@@ -283,26 +303,16 @@ def _pinched(mesh: TriangleMesh) -> NDArray[np.bool_]:
     return unmet > 0
 
 
-def _lesser_fans(mesh: TriangleMesh, pinched: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(m,) the triangles in all but the largest fan about each vertex in `pinched`."""
-    near = np.flatnonzero(pinched[mesh.faces].any(axis=1))
-    patch = replace(mesh, faces=mesh.faces[near])
-    corners, count = patch.faces.T.ravel(), len(near)
-    one, other = _twins(patch)  # wound alike, so that one leaves where the other arrives
-    links = np.concatenate([np.stack([one, (other + count) % (3 * count)], 1), np.stack([(one + count) % (3 * count), other], 1)])
-    fan = groups(links, 3 * count)
-    first, size = np.unique(fan, return_index=True, return_counts=True)[1:]
-    centre = corners[first]
-    ranked = np.lexsort((-size, centre))
-    lesser = np.zeros(len(ranked), bool)
-    lesser[ranked[1:]] = centre[ranked[1:]] == centre[ranked[:-1]]
-    shed = lesser[fan] & pinched[corners]
-    result = np.zeros(len(mesh.faces), bool)
-    result[near[np.flatnonzero(shed) % count]] = True
-    return result
-
-
-def _keep(mesh: TriangleMesh, keep: NDArray[np.bool_], words: str) -> Mended:
+def _keep(mesh: TriangleMesh, keep: NDArray[np.bool_], words: str, origin: FloatArray | None = None) -> Mended:
     if keep.all():
         return mesh, ""
-    return replace(mesh, faces=mesh.faces[keep]), f"{int(np.sum(~keep))} {words}"
+    return replace(mesh, faces=mesh.faces[keep]), f"{int(np.sum(~keep))} {words}{_place(mesh, ~keep, origin)}"
+
+
+def _place(mesh: TriangleMesh, removed: NDArray[np.bool_], origin: FloatArray | None) -> str:
+    """How large the removed triangles are and where the first of them lies, for a report; "" where they have no area."""
+    lost = replace(mesh, faces=mesh.faces[removed])
+    if (area := float(areas(lost).sum())) < _SMALLEST_AREA_M2:
+        return ""
+    x, y, z = lost.corners()[0].mean(axis=0) + (0.0 if origin is None else origin)
+    return f" ({area:.3g} m2, the first at {x:.2f}, {y:.2f}, {z:.2f})"

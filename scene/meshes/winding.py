@@ -21,9 +21,9 @@ _GEOCENTRIC_M = 6.3e6, 6.5e6
 def facing(mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, cleaned: bool = False) -> Mended:
     """The mesh wound one way in each connected piece, and counter-clockwise seen from the sensors; and what was turned, in words.
 
-    viewpoints: (3,) each, the mesh's frame, near its origin. A piece that shows most of its back is turned, unless it is closed
-    and wound right: then the sensors stand in it. Vertices stay. cleaned: it is welded and its pieces are wound one way, as
-    `clean` leaves them. Raises InputError for a surface with one side.
+    viewpoints: (3,) each, the mesh's frame, near its origin. A piece that shows most of its back is turned. Vertices stay.
+    cleaned: it is welded and its pieces are wound one way, as `clean` leaves them. Raises InputError for a surface with one side,
+    and for a closed solid that is seen from within.
     """
     welded, words = mesh, []
     if not cleaned:
@@ -31,7 +31,7 @@ def facing(mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, clea
         odd = wound_otherwise(welded, where)
         mesh, welded = flipped(mesh, odd), flipped(welded, odd)
         words = [f"{int(odd.sum())} triangles wound the other way round"] if odd.any() else []
-    backs = _pieces_seen_from_behind(mesh, welded, viewpoints)
+    backs = _pieces_seen_from_behind(mesh, welded, viewpoints, where)
     if backs.any():
         mesh = flipped(mesh, backs)
         part = "all" if backs.all() else "a piece of"
@@ -59,7 +59,9 @@ def check_near(vertices: FloatArray, viewpoints: Mapping[str, FloatArray], where
         )
 
 
-def _pieces_seen_from_behind(mesh: TriangleMesh, welded: TriangleMesh, viewpoints: list[FloatArray]) -> NDArray[np.bool_]:
+def _pieces_seen_from_behind(
+    mesh: TriangleMesh, welded: TriangleMesh, viewpoints: list[FloatArray], where: str
+) -> NDArray[np.bool_]:
     """(m,) the triangles of the pieces that are to be turned."""
     scene = RayCaster(mesh)
     seen = [scene.sides_seen(position) for position in viewpoints]
@@ -71,7 +73,14 @@ def _pieces_seen_from_behind(mesh: TriangleMesh, welded: TriangleMesh, viewpoint
     backs = np.bincount(piece[face], np.where(behind, 1, -1), count) > 0
     if not backs.any():
         return np.zeros(len(mesh.faces), bool)
-    return (backs & ~_is_whole(welded, piece, count))[piece]
+    if (backs & _is_whole(welded, piece, count)).any():
+        raise InputError(
+            "the sensor stands inside a closed solid of the surface",
+            where=where,
+            allowed="a place from which the outside of each closed solid is seen",
+            remedy="check the sensor's position, or cut the surface open",
+        )
+    return backs[piece]
 
 
 def _is_whole(mesh: TriangleMesh, piece: NDArray[np.int64], count: int) -> NDArray[np.bool_]:

@@ -42,7 +42,8 @@ class Hits:
     """What n rays hit, as lazy device arrays; entries of rays that hit nothing are meaningless where `valid` is False.
 
     valid: (n,) bool; distance: (n,) float64, in lengths of the direction vector (m for unit directions); face: (n,) uint32;
-    normal: 3 x (n,) float32 unit vectors, outside; albedo: (n,) float32; block: (n,) int32 label of the face, WALL for a miss.
+    normal: 3 x (n,) float32 unit vectors on the side that the ray meets, as rock is opaque from both sides;
+    albedo: (n,) float32; block: (n,) int32 label of the face, WALL for a miss.
     """
 
     valid: mi.Bool
@@ -128,8 +129,10 @@ class RayCaster:
         code = mi.UInt32(second.w)
         block, rest = code // 6, code % 6
         normal = _plane_normal(rest >> 1, (rest & 1) == 1, _joined(first.x, first.y), _joined(first.z, first.w))
-        distance = (_joined(second.x, second.y) - dr.dot(normal, origin)) / dr.dot(normal, direction)
-        return Hits(valid, distance, face, dr.normalize(mi.Vector3f(normal)), second.z, mi.Int32(block))
+        slope = dr.dot(normal, direction)
+        distance = (_joined(second.x, second.y) - dr.dot(normal, origin)) / slope
+        towards = dr.select(slope > 0, -mi.Vector3f(normal), mi.Vector3f(normal))
+        return Hits(valid, distance, face, dr.normalize(towards), second.z, mi.Int32(block))
 
     def _settle(self, face: mi.UInt32, origin: mi.Array3f64, direction: mi.Array3f64, at_edge: mi.Bool) -> mi.UInt32:
         """The face that the ray meets first in float64, of the one found and those that three rays beside it meet.

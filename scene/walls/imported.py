@@ -55,7 +55,7 @@ class ImportedWall(Config):
         mesh, notes = read_mesh(self.mesh, self.unit)
         self._check_extent(mesh)
         origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres: taken off and added again without loss
-        mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where)
+        mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where, origin)
         if self.flipped:
             mesh = flipped(mesh, np.ones(len(mesh.faces), bool))
         if self.albedo is not None:

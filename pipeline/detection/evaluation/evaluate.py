@@ -113,7 +113,8 @@ def evaluate(
 
     A detection matches annotations of its own category only. Crowd regions (`iscrowd`) are neither found nor missed, and a
     detection that falls on one is neither right nor wrong. Both are as in pycocotools, so that the scores agree with
-    `coco_metrics`. 
+    `coco_metrics`.
+
     Parameters
     ----------
     truth : mapping
