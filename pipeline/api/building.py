@@ -5,6 +5,7 @@ Everything after `stage` is in the wall frame: x along the wall, y up the wall, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -42,9 +43,13 @@ def make_wall(seed: int = 1, **keys: Any) -> Mesh:
     return Mesh.of(parse(ProceduralWall, keys, "make_wall").mesh(KeyedRandom(seed)))
 
 
-def open_wall(path: Path | str, **keys: Any) -> Mesh:
-    """A wall from a mesh file, mended as a simulation mends it, world frame, m. keys: unit, flipped, albedo."""
-    return Mesh.of(parse(ImportedWall, {"mesh": str(path), **keys}, "open_wall").load()[0])
+def open_wall(path: Path | str | Sequence[Path | str], **keys: Any) -> Mesh:
+    """Read a wall from a mesh file, or from several that make up the scene, mended as a simulation mends it.
+
+    keys: unit, flipped, albedo, as in a config's `wall`. The mesh is in the files' coordinates, m.
+    """
+    mesh = str(path) if isinstance(path, Path | str) else [str(each) for each in path]
+    return Mesh.of(parse(ImportedWall, {"mesh": mesh, **keys}, "open_wall").load()[0])
 
 
 def stage(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.cli.answer import Answer
@@ -19,7 +20,8 @@ EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_sit
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--site", metavar="NAME", help="start from a bundled site, such as glendale (default: the demo)")
-    parser.add_argument("--mesh", type=Path, metavar="FILE", help="with the wall of this mesh file, in survey coordinates")
+    words = "with the wall of this mesh file, or of several that make up the scene, in survey coordinates"
+    parser.add_argument("--mesh", type=Path, metavar="FILE", nargs="+", help=words)
     parser.add_argument(
         "--cameras", type=Path, metavar="FILE", help="with the pair of this file: Metashape, COLMAP or cameras.yaml"
     )
@@ -34,8 +36,10 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.dataset and (arguments.site or arguments.scanner or arguments.mesh or arguments.cameras):
         raise InputError("stands beside --site or --scanner", where="--dataset", remedy="a data set's walls name their sites")
     kind = "dataset" if arguments.dataset else "simulation"
-    files = {key: _beside(out, path) for key, path in (("mesh", arguments.mesh), ("cameras", arguments.cameras)) if path}
-    text = _dataset(arguments.dataset) if arguments.dataset else simulation_text(arguments.site, arguments.scanner, **files)
+    meshes = [_beside(out, path) for path in arguments.mesh or ()]
+    cameras = _beside(out, arguments.cameras) if arguments.cameras else ""
+    made = _dataset(arguments.dataset) if arguments.dataset else ""
+    text = made or simulation_text(arguments.site, arguments.scanner, meshes, cameras)
     from pipeline.cli.json_schema import schema_line, schema_name, schema_text
     from pipeline.formats.files.atomic import write_text
 
@@ -60,8 +64,8 @@ def _beside(out: Path, path: Path) -> str:
     return os.path.relpath(path.resolve(), out.parent.resolve())
 
 
-def simulation_text(site: str | None, scanner: str | None, mesh: str = "", cameras: str = "") -> str:
-    """A config that starts from a bundled site, with another scanner, wall (file) or cameras (file)."""
+def simulation_text(site: str | None, scanner: str | None, meshes: Sequence[str] = (), cameras: str = "") -> str:
+    """Return a config that starts from a bundled site, with another scanner, wall (one file or several) or cameras (file)."""
     from pipeline.config.bundled import bundled_config
     from pipeline.config.commented import commented_yaml
     from pipeline.config.simulation import SimulationConfig
@@ -69,6 +73,7 @@ def simulation_text(site: str | None, scanner: str | None, mesh: str = "", camer
 
     source = bundled_config("sites", site) if site else bundled_config("", "demo")
     values = load_yaml(source)
+    mesh = meshes[0] if len(meshes) == 1 else list(meshes)
     values |= ({"wall": {"mesh": mesh}} if mesh else {}) | ({"cameras": {"file": cameras}} if cameras else {})
     if scanner:
         models = [model for model in values["sensor"] if model["sensor"] != "tls"]

@@ -30,6 +30,7 @@ from scene.appearance.wetness import WetnessConfig
 from scene.blocks.block import RockfallConfig
 from scene.common.config import Config, load_yaml, parse
 from scene.common.errors import InputError
+from scene.geometry.frame import FrameConfig
 from scene.walls.procedural import ProceduralWall
 from scene.walls.wall import WallConfig
 from sensors.cameras.camera import CameraPair
@@ -115,6 +116,7 @@ class SimulationConfig(Config):
     wall: WallConfig = Field(
         ProceduralWall(), description="made by rule in the style of a site, or a mesh of your own: `mesh: FILE` and no `style`"
     )
+    frame: FrameConfig = Field(FrameConfig(), description="the wall's own frame, in which maps are drawn")
     rockfall: RockfallConfig = RockfallConfig()
     wetness: WetnessConfig | None = Field(None, description="wet patches of the rock, in every epoch; none: dry")
     sensor: tuple[SensorModel, ...] = Field((), description="sensor models (noise and effects), at most one of each sensor")
@@ -272,6 +274,8 @@ def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The values with the paths in them made absolute, relative to `folder`."""
 
     def absolute(path: Any) -> Any:
+        if isinstance(path, list):
+            return [absolute(each) for each in path]
         is_one = isinstance(path, str) and "\0" not in path  # whoever reads the others says what they are
         return os.path.realpath(folder / path) if is_one else path  # Path.resolve raises at a loop of links
 

@@ -36,7 +36,7 @@ def fingerprint(config: DatasetConfig) -> str:
     """What tells sets apart: a hash of the resolved config and of the files that its walls and cameras are read from."""
     digest = hashlib.sha256(config.model_dump_json().encode())
     for wall in config.walls.values():
-        meshes = [wall.wall.mesh] if isinstance(wall.wall, ImportedWall) else []
+        meshes = [*wall.wall.files] if isinstance(wall.wall, ImportedWall) else []
         cameras = wall.cameras.files() if isinstance(wall.cameras, CamerasFile) else []
         for file in [*meshes, *cameras]:
             digest.update(sha256(file).encode())

@@ -135,7 +135,7 @@ def _inputs(config: SimulationConfig) -> dict[str, str]:
 
     A file that is not there is left out: whoever reads it says so.
     """
-    named = [config.wall.mesh] if isinstance(config.wall, ImportedWall) else []
+    named = [*config.wall.files] if isinstance(config.wall, ImportedWall) else []
     named += [config.cameras.file] if isinstance(config.cameras, CamerasFile) else []
     files = [file for path in named for file in (sorted(path.glob("*.txt")) if path.is_dir() else [path]) if file.is_file()]
     return {str(path): sha256(path) for path in files}

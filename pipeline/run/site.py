@@ -52,7 +52,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
     target = Target(wall.mesh)
     if sensor == "stereo":
         cameras = config.camera_pair(target)
-        frame = WallFrame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
+        frame = config.frame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
         positions = {f"cameras, {side}": getattr(cameras, side).position for side in ("left", "right")}
         mesh, repairs = _faced(wall, frame, positions, origin)
         pair = _stereo(config, cameras, frame, random)
@@ -60,7 +60,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         return SensorSite(wall.name, repairs, mesh, frame, pair, eyes)
     stations = config.stations_of_the_scanner()
     poses = [station.place(target) for station in stations]
-    frame = WallFrame.fit(wall.mesh.vertices, poses[0][0])
+    frame = config.frame.fit(wall.mesh.vertices, poses[0][0])
     positions = {f"station, number {number}": position for number, (position, _) in enumerate(poses, start=1)}
     positions = positions if len(poses) > 1 else {"station": poses[0][0]}
     mesh, repairs = _faced(wall, frame, positions, origin)

@@ -24,8 +24,7 @@ from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from scene.common.config import Config
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.grid import Grid
-from scene.geometry.mesh import TriangleMesh
-from scene.ray_casting.raycast import DEFAULT_ALBEDO
+from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
 from sensors.laser.tls import LaserScanner
 from sensors.signal_chain.observation import Observation
 

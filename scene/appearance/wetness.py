@@ -11,8 +11,7 @@ from pydantic import Field
 from scene.appearance.texture import solid_noise
 from scene.common.config import Config
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import FloatArray, TriangleMesh
-from scene.ray_casting.raycast import DEFAULT_ALBEDO
+from scene.geometry.mesh import DEFAULT_ALBEDO, FloatArray, TriangleMesh
 from scene.ray_casting.upload import vectors_on_device
 
 _RAMP = 0.2

@@ -1,16 +1,48 @@
-"""The wall frame: the wall's mean plane is XY, z points towards the sensors, y up the wall, the origin at the lower corner."""
+"""Define the wall frame: XY is the wall's mean plane or another plane, z points towards the sensors, y up the wall.
+
+The origin lies at the lower corner.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _VERTICAL_LIMIT = 1e-3
 """Below this sine between the wall's normal and the vertical there is no direction up the wall (a floor or a roof)."""
+
+
+class FrameConfig(Config):
+    """Which way the wall frame's z axis points: difference maps show the change along it."""
+
+    normal: Literal["mean_plane", "sensor"] | tuple[float, float, float] = Field(
+        "mean_plane",
+        description="z axis of the wall frame: the normal of the mean plane of all vertices (mean_plane), the line from the "
+        "middle of the mesh to the sensor (sensor; for terrain that no plane fits), or a direction x, y, z in world coordinates",
+    )
+
+    def fit(self, vertices: FloatArray, towards: FloatArray) -> WallFrame:
+        """Fit the frame to the vertices (n, 3) of a wall; towards: (3,) where the sensors stand; both world, m.
+
+        Raises InputError where the vertices span no plane, and for a direction without length or away from the sensors.
+        """
+        if self.normal == "mean_plane":
+            return WallFrame.fit(vertices, towards)
+        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        normal = towards - middle if self.normal == "sensor" else np.array(self.normal, dtype=np.float64)
+        if not 0 < np.linalg.norm(normal) < np.inf:
+            raise InputError(f"got {self.normal}", where="frame.normal", allowed="a direction x, y, z that is not zero")
+        if np.dot(towards - middle, normal) < 0:
+            remedy = "change its sign: the wall frame's z axis points towards the sensors"
+            raise InputError(f"{self.normal} points away from the sensors", where="frame.normal", remedy=remedy)
+        return WallFrame.along(normal / np.linalg.norm(normal), vertices)
 
 
 @dataclass(frozen=True)
@@ -25,10 +57,10 @@ class WallFrame:
     origin: FloatArray
 
     @classmethod
-    def fit(cls, vertices: FloatArray, towards: FloatArray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> WallFrame:
+    def fit(cls, vertices: FloatArray, towards: FloatArray) -> WallFrame:
         """Fit the mean plane by SVD to all vertices.
 
-        vertices: (n, 3), world, m; towards: (3,) a point on the sensors' side of the wall, world, m; up: the vertical.
+        vertices: (n, 3), world, m; towards: (3,) a point on the sensors' side of the wall, world, m.
         The origin lies in the mean plane at the smallest x and y. Raises InputError where the vertices span no plane.
         """
         centre = vertices.mean(axis=0)
@@ -38,7 +70,17 @@ class WallFrame:
         if not variances[1] > 1e-12 * max(variances[0], 1e-300):
             raise InputError("the vertices lie on one line, so there is no mean plane", where="wall mesh")
         normal = axes[:, 2]
-        normal = normal if np.dot(np.asarray(towards) - centre, normal) >= 0 else -normal
+        return cls.along(normal if np.dot(np.asarray(towards) - centre, normal) >= 0 else -normal, vertices)
+
+    @classmethod
+    def along(cls, normal: FloatArray, vertices: FloatArray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> WallFrame:
+        """Make the frame whose z axis is `normal` and whose y axis points up the wall.
+
+        normal: (3,) unit vector, world; vertices: (n, 3), world, m; up: the vertical. The origin lies in the plane through the
+        mean of the vertices, at their smallest x and y.
+        """
+        centre = vertices.mean(axis=0)
+        local = vertices - centre
         upward = np.asarray(up, dtype=float) - np.dot(up, normal) * normal
         if np.linalg.norm(upward) < _VERTICAL_LIMIT:  # a horizontal surface: take the world's y
             upward = np.array([0.0, 1.0, 0.0]) - normal[1] * normal

@@ -14,6 +14,9 @@ IntArray = NDArray[np.int32]
 WALL = 0
 """The block label of a face or a point that belongs to no block; blocks count from 1."""
 
+DEFAULT_ALBEDO = 0.5
+"""Of rock whose albedo nobody gives."""
+
 _CHUNK = 1 << 18
 """Faces worked on at a time, which bounds the memory of intermediates."""
 

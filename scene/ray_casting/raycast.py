@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scene.common.backend import dr, mi
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
-from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.geometry.mesh import DEFAULT_ALBEDO, WALL, FloatArray, IntArray, TriangleMesh
 from scene.ray_casting.upload import on_device, vectors_on_device
 
-DEFAULT_ALBEDO = 0.5
 _LARGEST_COORDINATE = 1e4
 """Metres from the frame's origin beyond which float32 leaves less than a millimetre."""
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from scene.common.config import Config
 from scene.common.errors import InputError, nearest
 from scene.common.regular_file import check_file
-from scene.geometry.mesh import TriangleMesh
+from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
 from scene.meshes.cleaning import clean, drop_unused, flipped
 from scene.meshes.ply import read_elements
 from scene.meshes.rounding import check_rounding
@@ -36,9 +37,11 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class ImportedWall(Config):
-    """A wall from a mesh file in any format that trimesh reads."""
+    """A wall from one or several mesh files in any format that trimesh reads."""
 
-    mesh: Path = Field(description="mesh file (ply, obj, stl, off, glb, ...), in the survey's coordinates")
+    mesh: Path | tuple[Path, ...] = Field(
+        description="mesh file (ply, obj, stl, off, glb, ...), or a list of files that make up the scene; in survey coordinates"
+    )
     unit: Literal["m", "cm", "mm", "ft"] = Field("m", description="of the file's coordinates")
     flipped: bool = Field(
         False,
@@ -49,11 +52,29 @@ class ImportedWall(Config):
         None, ge=0.0, le=1.0, description="of the whole wall; if not given the file's own, or the luminance of its vertex colours"
     )
 
+    @field_validator("mesh")
+    @classmethod
+    def _different(cls, mesh: Path | tuple[Path, ...]) -> Path | tuple[Path, ...]:
+        if isinstance(mesh, tuple) and not mesh:
+            raise ValueError("names no file")
+        if isinstance(mesh, tuple) and len(set(mesh)) < len(mesh):
+            raise ValueError("names a file twice")
+        return mesh
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The mesh files, one or several."""
+        return self.mesh if isinstance(self.mesh, tuple) else (self.mesh,)
+
     def load(self) -> tuple[TriangleMesh, tuple[str, ...]]:
-        """The cleaned mesh in the world frame, m, and what was mended. Raises InputError where the file cannot be used."""
-        where = str(self.mesh)
-        mesh, notes = read_mesh(self.mesh, self.unit)
-        self._check_extent(mesh)
+        """Read, join and clean the meshes.
+
+        Returns the mesh in the world frame, m, and what was mended, in words. Raises InputError where a file cannot be used.
+        """
+        where = ", ".join(map(str, self.files))
+        meshes, found = zip(*(read_mesh(file, self.unit) for file in self.files), strict=True)
+        mesh, notes = joined(meshes), tuple(dict.fromkeys(note for each in found for note in each))
+        self._check_extent(mesh, where)
         origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres: taken off and added again without loss
         mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where, origin)
         if self.flipped:
@@ -62,17 +83,31 @@ class ImportedWall(Config):
             mesh = replace(mesh, vertex_albedo=np.full(len(mesh.vertices), self.albedo, np.float32))
         return mesh.with_vertices(mesh.vertices + origin), (*repairs, *notes)
 
-    def _check_extent(self, mesh: TriangleMesh) -> None:
+    def _check_extent(self, mesh: TriangleMesh, where: str) -> None:
         extent = _extent(mesh)
         if not _SMALLEST_M <= extent <= _LARGEST_M:
             likely = [unit for unit, metres in _METRES.items() if 2 <= extent / _METRES[self.unit] * metres <= 1000]
             remedy = f"set `unit` to {' or '.join(likely)} if that is the file's unit" if likely else "check the file"
             raise InputError(
                 f"the wall is {extent:.4g} m in size with `unit: {self.unit}`",
-                where=str(self.mesh),
+                where=where,
                 allowed=f"{_SMALLEST_M} m to {_LARGEST_M:.0f} m",
                 remedy=remedy,
             )
+
+
+def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Join meshes into one, in order. Beside a mesh with an albedo, one without it gets the default."""
+    if len(meshes) == 1:
+        return meshes[0]
+    start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = np.concatenate([mesh.faces + np.int32(first) for mesh, first in zip(meshes, start, strict=True)])
+    albedo = None
+    if any(mesh.vertex_albedo is not None for mesh in meshes):
+        usual = [np.full(len(mesh.vertices), DEFAULT_ALBEDO, np.float32) for mesh in meshes]
+        own = [each if mesh.vertex_albedo is None else mesh.vertex_albedo for mesh, each in zip(meshes, usual, strict=True)]
+        albedo = np.concatenate(own)
+    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), faces, albedo)
 
 
 def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:

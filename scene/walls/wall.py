@@ -45,4 +45,4 @@ def build_wall(config: ProceduralWall | ImportedWall, random: KeyedRandom) -> Wa
     if isinstance(config, ProceduralWall):
         return Wall(config.mesh(random), (), config.style)
     mesh, repairs = config.load()
-    return Wall(mesh, repairs, config.mesh.stem, str(config.mesh))
+    return Wall(mesh, repairs, " + ".join(file.stem for file in config.files), ", ".join(map(str, config.files)))

@@ -12,8 +12,8 @@ from surfaces import heightfield, plane, step
 from test_tls import POSITION, ROTATION, scan, scanner
 
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import FloatArray, TriangleMesh
-from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
+from scene.geometry.mesh import DEFAULT_ALBEDO, FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
 from sensors.laser.tls import LaserScanner, Pattern
 from sensors.signal_chain.beam import unit_offsets
 from sensors.signal_chain.observation import Observation

@@ -13,8 +13,8 @@ from scene.appearance.wetness import WetnessConfig
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import FloatArray, TriangleMesh
-from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
+from scene.geometry.mesh import DEFAULT_ALBEDO, FloatArray, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
 from sensors.laser.atmosphere import extinction_per_m
 from sensors.laser.tls import ScannerConfig
 from sensors.signal_chain.observation import Observation

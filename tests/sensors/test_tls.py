@@ -15,8 +15,8 @@ from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
-from scene.geometry.mesh import TriangleMesh
-from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
+from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
+from scene.ray_casting.raycast import RayCaster
 from sensors.effects import TLS_EFFECTS
 from sensors.laser.tls import LaserScanner, Pattern, ScannerConfig
 from sensors.models.placement import check_in_front

@@ -17,7 +17,8 @@ from test_tls import POSITION, QUIET, ROTATION, SIGNIFICANCE, scan, scanner
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
-from scene.ray_casting.raycast import DEFAULT_ALBEDO, RayCaster
+from scene.geometry.mesh import DEFAULT_ALBEDO
+from scene.ray_casting.raycast import RayCaster
 from sensors.effects import TLS_EFFECTS
 from sensors.laser.tls import LaserScanner
 from sensors.models.sensor_model import TlsModel
