@@ -20,14 +20,15 @@ from pipeline.config.simulation import SensorName
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.registration import register as icp
 from pipeline.run.site import SensorSite, prepare_site
-from pipeline.surface.from_cloud import surface_of_cloud
+from pipeline.surface.from_cloud import CloudConfig, surface_of_cloud
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
 from scene.blocks import block as solids
 from scene.blocks import carve as carving
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import TriangleMesh
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.geometry.point_planes import normals_of
 from scene.ray_casting.raycast import RayCaster
 from scene.walls.imported import ImportedWall
 from scene.walls.procedural import ProceduralWall
@@ -36,6 +37,9 @@ from sensors.signal_chain.observation import Observation, Sensor
 
 if TYPE_CHECKING:
     import xarray
+
+
+_FEWEST_FOR_NORMALS = 3
 
 
 def make_wall(seed: int = 1, **keys: Any) -> Mesh:
@@ -113,25 +117,44 @@ def reconstruct(observation: Observation, **keys: Any) -> Mesh:
 
 
 def mesh_points(points: ArrayLike, viewpoint: ArrayLike, **keys: Any) -> Mesh:
-    """The surface through unorganised points (n, 3), m, by Poisson reconstruction, in their frame; it looks to `viewpoint` (3,).
+    """Make the surface through unorganised points (n, 3), m, in their frame, as it is seen from `viewpoint` (3,), m.
 
-    keys: poisson_depth, poisson_trim_spacings. Needs the extra `poisson`.
+    keys: method ("triangulation" between the points, or "poisson", which needs the extra `poisson`), poisson_depth,
+    poisson_trim_spacings.
     """
-    config = parse(SurfaceConfig, {"method": "poisson", **keys}, "mesh_points")
-    cloud = PointCloud(_table(points, "points"))
-    return Mesh.of(
-        surface_of_cloud(cloud, _table(np.reshape(np.asarray(viewpoint), (1, -1)), "viewpoint", 1)[0], config, "points")
-    )
+    config = parse(CloudConfig, keys, "mesh_points")
+    eye = _table(np.reshape(np.asarray(viewpoint), (1, -1)), "viewpoint", 1)[0]
+    return Mesh.of(surface_of_cloud(PointCloud(_table(points, "points")), eye, config, "points").mesh)
 
 
 def register(moving: Any, reference: Any, seed: int = 1, **keys: Any) -> icp.Registration:
-    """ICP of one surface to another: `.rotation` (3, 3), `.translation` (3,) m, `.apply(points)`, `.rms_m`.
+    """Register one surface on another with ICP.
 
-    moving: a mesh or (n, 3) points; reference: a mesh, or (n, 3) points with method="point_to_point". keys: those of `icp`.
+    Parameters
+    ----------
+    moving, reference : mesh or (n, 3) array
+        In one frame, m. Vertices of a mesh that no triangle with an area uses are left out. Where the reference is an array and
+        the distance is measured along normals, they are estimated from the 24 nearest points of each.
+    seed : int
+        Of the random subsets that ICP begins with.
+    **keys
+        Those of a config's `icp`, such as method="point_to_point".
+
+    Returns
+    -------
+    Registration
+        `.rotation` (3, 3), `.translation` (3,) m, `.apply(points)`, `.rms_m`; x_reference = rotation x_moving + translation.
+
+    Raises
+    ------
+    InputError
+        For points that are too few, not finite or on a line, and for wrong keys.
     """
-    normals = reference.vertex_normals() if isinstance(reference, TriangleMesh) else None
     config = parse(icp.IcpConfig, keys, "register")
-    return icp.register(_vertices(moving, "moving"), _vertices(reference, "reference"), normals, config, KeyedRandom(seed))
+    points, normals = _surface_points(reference, "reference")
+    if normals is None and config.method == "point_to_plane" and len(points) >= _FEWEST_FOR_NORMALS:
+        normals = normals_of(points)
+    return icp.register(_surface_points(moving, "moving")[0], points, normals, config, KeyedRandom(seed))
 
 
 def difference(reference: TriangleMesh, epoch: TriangleMesh, gsd_m: float = 0.02) -> xarray.DataArray:
@@ -142,8 +165,14 @@ def difference(reference: TriangleMesh, epoch: TriangleMesh, gsd_m: float = 0.02
     return change.assign_coords(block=(("y", "x"), after.block))
 
 
-def _vertices(given: Any, name: str) -> Any:
-    return given.vertices if isinstance(given, TriangleMesh) else _table(given, name)
+def _surface_points(given: Any, name: str) -> tuple[FloatArray, FloatArray | None]:
+    """Points (n, 3) of a mesh or an array, and a mesh's vertex normals; vertices without a normal belong to no surface."""
+    if not isinstance(given, TriangleMesh):
+        return _table(given, name), None
+    normals = given.vertex_normals()
+    length = np.linalg.norm(normals, axis=1)
+    used = np.isfinite(length) & (length > 0)
+    return given.vertices[used], normals[used]
 
 
 def _table(values: ArrayLike, name: str, rows: int | None = None) -> Any:

@@ -9,7 +9,7 @@ from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, between
 from scene.common.errors import InputError
 
-SUMMARY = "mesh a point cloud, so that it can be a wall or a reference (extra poisson)"
+SUMMARY = "mesh a point cloud, so that it can be a wall or a reference"
 EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --out wall.ply
   scarpsim init --mesh wall.ply --out my_site.yaml"""
 
@@ -26,10 +26,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="where a sensor stood, in the points' coordinates [m]: the surface looks there",
     )
     parser.add_argument(
-        "--trim", type=between(0.1, 1000.0), default=3.0, metavar="N", help="how far it reaches, in point spacings (default: 3)"
+        "--method",
+        choices=("triangulation", "poisson"),
+        default="triangulation",
+        help="triangulation: through the points as the sensor sees them (default); poisson: for points from several sides",
     )
     parser.add_argument(
-        "--depth", type=int, choices=range(4, 17), metavar="N", help="of the octree, 4 to 16 (default: as the points)"
+        "--trim",
+        type=between(0.1, 1000.0),
+        default=3.0,
+        metavar="N",
+        help="poisson: how far it reaches, in point spacings (default: 3)",
+    )
+    parser.add_argument(
+        "--depth", type=int, choices=range(4, 17), metavar="N", help="poisson: of the octree, 4 to 16 (default: as the points)"
     )
     add_output_options(parser)
 
@@ -44,13 +54,14 @@ def run(arguments: argparse.Namespace) -> Answer:
 
     from pipeline.formats.meshes.ply import write_ply
     from pipeline.formats.points.points import read_points
-    from pipeline.surface.from_cloud import surface_of_cloud
-    from pipeline.surface.mesh import SurfaceConfig
+    from pipeline.surface.from_cloud import CloudConfig, surface_of_cloud
 
-    config = SurfaceConfig(method="poisson", poisson_depth=arguments.depth, poisson_trim_spacings=arguments.trim)
+    config = CloudConfig(method=arguments.method, poisson_depth=arguments.depth, poisson_trim_spacings=arguments.trim)
     cloud = read_points(arguments.cloud)
-    mesh = surface_of_cloud(cloud, np.array(arguments.seen_from), config, str(arguments.cloud))
+    surface = surface_of_cloud(cloud, np.array(arguments.seen_from), config, str(arguments.cloud))
+    mesh = surface.mesh
     write_ply(out, mesh)
     counts = {"points": len(cloud.points), "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
     told = f"{counts['points']:,} points, {counts['triangles']:,} triangles: {out}; a config of it: scarpsim init --mesh {out}"
-    return Answer(told, lambda: {"file": str(out), **counts})
+    told = "\n".join([*(f"note: {note}" for note in surface.notes), told])
+    return Answer(told, lambda: {"file": str(out), **counts, "notes": list(surface.notes)})

@@ -14,7 +14,7 @@ from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.measurement.scans import METRES, RawScan, read_scans
 from pipeline.measurement.station import Station
-from pipeline.measurement.triangulation import SeenSurface, triangulated
+from pipeline.surface.triangulation import SeenSurface, triangulated
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.meshes.ply import read_elements

@@ -21,6 +21,7 @@ from pydantic import Field
 from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.common.extras import how_to_install
+from scene.common.native_output import stderr_dropped
 from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, area_normals
 from sensors.signal_chain.observation import Observation
 
@@ -106,7 +107,7 @@ def labelled_surface(
     """
     from scipy.spatial import cKDTree
 
-    near = cKDTree(points).query(vertices, workers=-1)[0] <= config.poisson_trim_spacings * _spacing(points)
+    near = cKDTree(points).query(vertices, workers=-1)[0] <= config.poisson_trim_spacings * median_spacing(points)
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
         raise InputError(
@@ -122,11 +123,11 @@ def labelled_surface(
 def octree_depth(points: FloatArray) -> int:
     """The octree depth whose cells are as large as the median spacing of (n, 3) points; InputError where they coincide."""
     longest = float(np.ptp(points, axis=0).max())
-    return int(np.clip(np.ceil(np.log2(longest / _spacing(points))), 4, _POISSON_DEPTH_LIMIT))
+    return int(np.clip(np.ceil(np.log2(longest / median_spacing(points))), 4, _POISSON_DEPTH_LIMIT))
 
 
-def _spacing(points: FloatArray) -> float:
-    """Median distance of a point to the nearest other one, m."""
+def median_spacing(points: FloatArray) -> float:
+    """Return the median distance of points (n, 3) to their nearest neighbours, m. Raises InputError where most coincide."""
     from scipy.spatial import cKDTree
 
     spacing = float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))
@@ -271,5 +272,6 @@ def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[Flo
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     cloud.orient_normals_towards_camera_location(np.asarray(viewpoint, dtype=float))
-    surface, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
+    with stderr_dropped():
+        surface, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return np.asarray(surface.vertices).copy(), np.asarray(surface.triangles, dtype=np.int32).copy()

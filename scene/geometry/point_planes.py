@@ -35,16 +35,7 @@ class PointPlanes:
     def of(cls, points: FloatArray, viewpoint: FloatArray) -> PointPlanes:
         """Of points (n, 3) seen from a place (3,), m: the least eigenvector of their scatter (Hoppe et al. 1992, Surface
         reconstruction from unorganized points) and the root of its eigenvalue."""
-        from scipy.spatial import cKDTree
-
-        tree, count = cKDTree(points), min(_NEIGHBOURS, len(points))
-        normal, scatter = np.empty_like(points), np.empty(len(points))
-        for first in range(0, len(points), _AT_ONCE):
-            rows = slice(first, first + _AT_ONCE)
-            near = points[tree.query(points[rows], count, workers=-1)[1]]
-            near -= near.mean(axis=1, keepdims=True)
-            values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / count)
-            normal[rows], scatter[rows] = vectors[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0.0))
+        normal, scatter = _planes(points)
         ray = points - viewpoint
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         of_noise = own_noise(points, viewpoint) is not None
@@ -53,6 +44,26 @@ class PointPlanes:
     def along(self, rays: FloatArray, point: NDArray[np.int32]) -> FloatArray:
         """(n, k) scatter about the planes of some points (n, k) along unit rays (n, 3), m."""
         return _along(rays[:, None], self.normal[point], self.scatter_m[point])
+
+
+def normals_of(points: FloatArray) -> FloatArray:
+    """Estimate unit normals (n, 3), of either sign, of points (n, 3): of the plane through the 24 nearest of each."""
+    return _planes(points)[0]
+
+
+def _planes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit normals (n, 3) of the planes through each point's 24 nearest, and the (n,) scatter of the 24 about them, m."""
+    from scipy.spatial import cKDTree
+
+    tree, count = cKDTree(points), min(_NEIGHBOURS, len(points))
+    normal, scatter = np.empty_like(points), np.empty(len(points))
+    for first in range(0, len(points), _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        near = points[tree.query(points[rows], count, workers=-1)[1]]
+        near -= near.mean(axis=1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / count)
+        normal[rows], scatter[rows] = vectors[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0.0))
+    return normal, scatter
 
 
 def _along(rays: FloatArray, normal: FloatArray, scatter: FloatArray) -> FloatArray:

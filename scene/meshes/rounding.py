@@ -6,6 +6,7 @@ it in its values, whatever the type that holds them now: all of an axis are mult
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,13 +70,39 @@ def check_rounding(mesh: TriangleMesh, metres: float, where: str) -> tuple[str, 
     corners = mesh.vertices[mesh.faces[:: max(len(mesh.faces) // _FACES, 1)]]
     sides = np.abs(corners - np.roll(corners, 1, axis=1))
     edge = float(np.median(np.linalg.norm(sides, axis=2))) * metres
-    rounded = rounded_axes(mesh.vertices, metres, sides)
-    limit = max(_HARMLESS_M, _SHARE_OF_EDGE * edge)
+    return check_steps(rounded_axes(mesh.vertices, metres, sides), edge, where, "the triangles' edges are")
+
+
+def check_steps(rounded: Sequence[Rounded], spacing_m: float, where: str, spacing: str) -> tuple[str, ...]:
+    """Refuse coordinates whose rounding spoils a surface.
+
+    Parameters
+    ----------
+    rounded : sequence of Rounded
+        The axes that were rounded.
+    spacing_m : float
+        Median distance of neighbouring vertices or points, m.
+    where : str
+        What an error calls the file.
+    spacing : str
+        Subject and verb of a sentence that tells `spacing_m`.
+
+    Returns
+    -------
+    tuple of str
+        Notes on rounding that does no harm and is worth a word.
+
+    Raises
+    ------
+    InputError
+        Where a step is above 1 mm and a twentieth of the spacing or, if it comes of single precision, above 5 mm.
+    """
+    limit = max(_HARMLESS_M, _SHARE_OF_EDGE * spacing_m)
     limits = {each.axis: min(limit, _HARMFUL_M) if each.binary else limit for each in rounded}
     harmful = [each for each in rounded if each.step_m > limits[each.axis]]
     if harmful:
         raise InputError(
-            f"the coordinates were rounded, {', '.join(map(str, harmful))}; the triangles' edges are {edge:.3g} m (median)",
+            f"the coordinates were rounded, {', '.join(map(str, harmful))}; {spacing} {spacing_m:.3g} m (median)",
             where=where,
             allowed=f"steps of up to {limits[harmful[0].axis]:.2g} m",
             remedy="export it anew in double precision, or subtract an offset from the coordinates before the export",

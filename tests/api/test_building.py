@@ -70,6 +70,22 @@ def test_a_wall_of_arrays_is_scanned_meshed_registered_and_compared(tmp_path: Pa
     assert float(change.where(change.block > 0).max()) > 0.05
 
 
+@pytest.mark.parametrize("as_arrays", [False, True])
+def test_register_finds_a_known_motion_of_meshes_and_of_arrays(as_arrays: bool) -> None:
+    """Vertices that no triangle uses are left out of a mesh; an array's normals are estimated."""
+    wall = heightfield(8.0, 6.0, 0.1, roughness=0.3)
+    turn, shift = (
+        np.array([[np.cos(0.01), -np.sin(0.01), 0.0], [np.sin(0.01), np.cos(0.01), 0.0], [0.0, 0.0, 1.0]]),
+        [0.02, -0.03, 0.04],
+    )
+    stray = np.array([[100.0, 100.0, 100.0], [4.0, 3.0, 5.0]])
+    reference = TriangleMesh(np.concatenate([wall.vertices, stray]), wall.faces)
+    moving = TriangleMesh(np.concatenate([(wall.vertices - shift) @ turn, stray]), wall.faces)
+    found = register(moving.vertices[:-2], reference.vertices[:-2]) if as_arrays else register(moving, reference)
+    np.testing.assert_allclose(found.rotation, turn, atol=2e-6)
+    np.testing.assert_allclose(found.translation, shift, atol=2e-5)
+
+
 def test_a_mesh_wound_away_from_the_sensor_is_turned() -> None:
     wall = make_wall(style="pilkington", width_m=5.0, height_m=4.0, resolution_m=0.1)
     here = stage(wall, "tls", **COARSE)

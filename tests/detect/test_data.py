@@ -21,13 +21,14 @@ from pipeline.detection.inference import baseline, inference
 from pipeline.detection.inference.inference import paste, tile_places
 from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainingConfig
 from pipeline.detection.network.data import CocoFolder, batches, mirrored, network_input
-from pipeline.detection.network.keras_backend import keras_ready, stderr_dropped
+from pipeline.detection.network.keras_backend import keras_ready
 from pipeline.detection.network.normalisation import denormalised, nmad, normalised
 from pipeline.detection.products import events
 from pipeline.detection.products.run import detect, find_inputs
 from pipeline.detection.training.schedule import has_settled, learning_rate
 from pipeline.formats.rasters.geotiff import write_geotiff
 from scene.common.errors import InputError
+from scene.common.native_output import stderr_dropped
 from scene.geometry.grid import Grid
 
 

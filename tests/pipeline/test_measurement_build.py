@@ -33,7 +33,7 @@ from pipeline.measurement.build import build
 from pipeline.measurement.origin import from_order
 from pipeline.measurement.request import Request
 from pipeline.measurement.scans import orthonormal, read_scans
-from pipeline.measurement.triangulation import triangulated
+from pipeline.surface.triangulation import triangulated
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 from sensors.cameras.camera import Camera, CameraPair

@@ -195,4 +195,10 @@ def test_the_same_key_gives_the_same_bytes_and_another_seed_another_noise() -> N
 
 def test_a_pair_that_does_not_see_the_wall_is_refused() -> None:
     with pytest.raises(InputError, match="seen by both cameras"):
-        observe(plane(np.array([0, 0, -1.0]), ORIGIN), {})  # the wall's back
+        observe(plane(np.array([0, 0, 1.0]), np.array([0.0, 0.0, 300.0])), {})  # behind the cameras
+
+
+def test_a_plane_is_seen_from_its_back_as_from_its_front() -> None:
+    front, back = (observe(plane(np.array([0, 0, side]), ORIGIN), {}) for side in (1.0, -1.0))
+    np.testing.assert_array_equal(back.valid, front.valid)
+    np.testing.assert_allclose(back.points[back.valid], front.points[front.valid], atol=1e-9)

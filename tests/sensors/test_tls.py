@@ -204,7 +204,14 @@ def test_a_scanner_behind_the_rock_is_refused() -> None:
     with pytest.raises(InputError, match="in or behind it"):
         check_in_front(RayCaster(ball), np.array([1.0, 0.0, 0.0]), "station")
     with pytest.raises(InputError, match="no pulse returned"):
-        scan(plane(np.array([0, 0, -1.0]), np.zeros(3)))
+        scan(plane(np.array([0, 0, 1.0]), np.array([0.0, 0.0, 90.0])))
+
+
+def test_a_plane_is_scanned_from_its_back_as_from_its_front() -> None:
+    front, back = (scan(plane(np.array([0, 0, side]), np.zeros(3))) for side in (1.0, -1.0))
+    np.testing.assert_array_equal(back.valid, front.valid)
+    np.testing.assert_allclose(back.depth[back.valid], front.depth[front.valid], atol=1e-9)
+    np.testing.assert_array_equal(back.intensity[back.valid], front.intensity[front.valid])
 
 
 @pytest.mark.parametrize(

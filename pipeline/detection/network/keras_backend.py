@@ -5,14 +5,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
 
 from scene.common.errors import InputError
 from scene.common.extras import how_to_install
+from scene.common.native_output import stderr_dropped
 
 _MODULES = {"tensorflow": "tensorflow", "jax": "jax", "torch": "torch"}
 
@@ -75,23 +74,3 @@ def computing_in(precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
         yield
     finally:
         tf.config.optimizer.set_experimental_options({option: False})
-
-
-@contextmanager
-def stderr_dropped() -> Iterator[None]:
-    """Drop what the process writes to stderr, libraries in C as well, unless an exception leaves the body."""
-    sys.stderr.flush()
-    stderr = os.dup(2)
-    with tempfile.TemporaryFile() as written:
-        os.dup2(written.fileno(), 2)
-        try:
-            yield
-        except BaseException:
-            sys.stderr.flush()
-            written.seek(0)
-            os.write(stderr, written.read())
-            raise
-        finally:
-            sys.stderr.flush()
-            os.dup2(stderr, 2)
-            os.close(stderr)
