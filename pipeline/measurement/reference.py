@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.scan_geometry import ScanGeometry
 from pipeline.formats.points.points import SUFFIXES
-from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.formats.rasters.georeference import unit_name
+from pipeline.formats.rasters.geotiff import read_raster
 from pipeline.measurement.scans import METRES, RawScan, read_scans
 from pipeline.measurement.station import Station
 from pipeline.surface.triangulation import SeenSurface, triangulated
@@ -62,7 +63,7 @@ def from_file(
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, a DEM, or the word {HALF}")
     if path.suffix.lower() in DEMS:
-        return from_dem(path, METRES[unit])
+        return from_dem(path, unit)
     if not is_cloud(path):
         mesh, notes = read_mesh(path, unit)
         words = (f"mesh {path.name}: {len(mesh.faces):,} triangles, taken as exact", *notes)
@@ -79,9 +80,27 @@ def from_file(
     return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, of_points=True)
 
 
-def from_dem(path: Path, metres: float) -> Reference:
-    """A raster of heights as a surface: a vertex at the centre of each pixel, two triangles between four that have data."""
-    heights, grid = read_geotiff(path)
+def from_dem(path: Path, unit: str) -> Reference:
+    """Make a surface of a raster of heights: a vertex at the centre of each pixel, two triangles between four that have data.
+
+    unit: what the user says of coordinates and heights. A unit that the file states takes the place of metres, the default,
+    and has to agree with any other. Raises InputError where it does not, and where the raster holds no heights or no place.
+    """
+    raster = read_raster(path)
+    heights, place = raster.values, raster.place
+    if place.grid is None:
+        raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
+    metres, notes = METRES[unit], list(raster.notes)
+    if place.linear_m is not None and not np.isclose(place.linear_m, METRES["m"]):
+        if unit != "m" and not np.isclose(place.linear_m, metres, rtol=1e-9):
+            stated = unit_name(place.linear_m)
+            raise InputError(f"the file states {stated} and --unit is {unit}", where=str(path), remedy="leave --unit out")
+        notes.append(f"the file states {unit_name(place.linear_m)}, which were converted to metres")
+        metres = 1.0  # the grid is in metres already
+        up = place.vertical_m or place.linear_m
+    else:
+        up = place.vertical_m or metres
+    grid = place.grid
     known = np.isfinite(heights)
     if not known.any() or min(heights.shape) < 2:
         raise InputError("holds no heights", where=str(path), remedy="export the elevation model again")
@@ -94,13 +113,13 @@ def from_dem(path: Path, metres: float) -> Reference:
     if not whole.any():
         raise InputError("has no four neighbouring pixels with heights", where=str(path), remedy="export a whole elevation model")
     faces = np.concatenate([np.stack(each, axis=-1)[whole] for each in ((a, c, d), (a, d, b))]).astype(np.int32)
-    vertices = np.stack([x[known], y[known], heights[known].astype(np.float64)], axis=1) * metres
+    vertices = np.stack([x[known] * metres, y[known] * metres, heights[known].astype(np.float64) * up], axis=1)
     words = f"elevation model {path.name}: {int(known.sum()):,} heights every {grid.gsd * metres:.3g} m, taken as exact"
     limit = (
         "an elevation model has one height at each place: overhangs are missing, and steep faces are chords between pixels, "
         "whose error looks like one of the sensor"
     )
-    return Reference(TriangleMesh(vertices, faces), 0.0, (words,), (limit,))
+    return Reference(TriangleMesh(vertices, faces), 0.0, (words, *notes), (limit,))
 
 
 def half_of(scan: RawScan, station: Station) -> Reference:

@@ -16,7 +16,7 @@ from pipeline.gap.residuals.surface_residuals import NO_CAMERAS, spacing_m
 from pipeline.measurement.folder import Content, Understood, write
 from pipeline.measurement.reference import DEMS, HALF, Reference, from_dem, from_file, is_cloud
 from pipeline.measurement.request import Request
-from pipeline.measurement.scans import METRES, RawScan, read_scans
+from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.units import check_extent, check_same_unit
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
@@ -70,8 +70,9 @@ def _read(path: Path, request: Request) -> RawScan:
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM")
     if path.suffix.lower() in DEMS:
-        dem = from_dem(path, METRES[request.unit])
-        return RawScan(path.name, PointCloud(dem.mesh.vertices), words=("the heights of an elevation model",))
+        dem = from_dem(path, request.unit)
+        words = ("the heights of an elevation model", *dem.words[1:])
+        return RawScan(path.name, PointCloud(dem.mesh.vertices), words=words)
     if path.suffix.lower() in _MESHES or not is_cloud(path):
         mesh, notes = read_mesh(path, request.unit)
         found = RawScan(path.name, PointCloud(mesh.vertices), words=("the vertices of a mesh", *notes))

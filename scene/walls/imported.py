@@ -28,6 +28,8 @@ _FARTHEST_M = 1e8
 """No coordinate system of the earth reaches so far: geocentric coordinates are up to 6.4e6 m, northings up to 1e7 m."""
 _MOST_BYTES = 2_000_000_000
 """Of a file that trimesh reads, which takes it into memory as a whole, and several times that for its parts."""
+_Y_UP = {"glb", "gltf"}
+"""Formats whose standard says that y points up (glTF 2.0, section 3.4): they are turned so that z does."""
 _ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
 _COLOURS = ("red", "green", "blue")
 _TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
@@ -131,7 +133,8 @@ def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...
     where, metres = str(path), _METRES[unit]
     mesh = _read(path)
     _check_coordinates(mesh, metres, where)
-    notes = check_rounding(mesh, metres, where)
+    turned = ("y is up in glTF: turned so that z is",) if _format(path) in _Y_UP else ()
+    notes = (*turned, *check_rounding(mesh, metres, where))
     return (mesh if metres == 1 else mesh.with_vertices(mesh.vertices * metres)), notes
 
 
@@ -170,6 +173,8 @@ def _read(path: Path) -> TriangleMesh:
             remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
         )
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if kind in _Y_UP and vertices.shape[1:] == (3,):
+        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
         raise InputError(problem, where=where, allowed="3 and 3", remedy="export it anew, as triangles")

@@ -10,8 +10,10 @@ import rasterio
 import tifffile
 from format_cases import GRID, a_raster
 
-from pipeline.formats.rasters.geotiff import read_geotiff, read_tiff, write_geotiff, write_tiff
+from pipeline.formats.rasters.geotiff import read_geotiff, read_raster, read_tiff, write_geotiff, write_tiff
+from pipeline.measurement.reference import from_dem
 from scene.common.errors import InputError
+from scene.geometry.grid import Grid
 
 
 @pytest.fixture
@@ -85,4 +87,135 @@ def test_tiff_damaged_files_are_input_errors(tmp_path: Path, raster: np.ndarray)
         read_tiff(tmp_path / "none.tif")
     tifffile.imwrite(path, np.zeros((8, 8, 3), dtype=np.uint8))
     with pytest.raises(InputError, match="one band"):
+        read_tiff(path)
+
+
+HEIGHTS = (100.0 + 3.0 * np.sin(np.arange(60)[:, None] / 5.0) + np.arange(80)[None] / 8.0).astype(np.float32)
+CORNER, SIDE = (500_000.0, 5_400_030.0), 0.5
+
+
+def _gdal(
+    path: Path,
+    values: np.ndarray = HEIGHTS,
+    *,
+    tags: dict[str, str] | None = None,
+    mask: np.ndarray | None = None,
+    **more: object,
+) -> Path:
+    """A raster written by GDAL, one of the other programs that files come from."""
+    north_up = rasterio.transform.from_origin(*CORNER, SIDE, SIDE)
+    profile = {"driver": "GTiff", "height": values.shape[0], "width": values.shape[1], "count": 1, "dtype": values.dtype.name}
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
+        rasterio.open(path, "w", **{"crs": "EPSG:32632", "transform": north_up, **profile, **more}) as data,
+    ):
+        data.update_tags(**(tags or {}))
+        data.write(values, 1)
+        if mask is not None:
+            data.write_mask(mask)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["Area", "Point"])
+def test_pixels_lie_where_gdal_puts_them_whether_they_are_areas_or_points(tmp_path: Path, kind: str) -> None:
+    values, grid = read_geotiff(_gdal(tmp_path / "a.tif", tags={"AREA_OR_POINT": kind}))
+    np.testing.assert_array_equal(values, HEIGHTS)
+    assert grid == Grid(*CORNER, SIDE, 80, 60)
+
+
+@pytest.mark.parametrize(
+    "storage",
+    [
+        {"compress": "lzw"},
+        {"compress": "lzw", "predictor": 3},
+        {"compress": "deflate", "predictor": 2},
+        {"compress": "deflate", "predictor": 3},
+        {"compress": "packbits"},
+        {"compress": "zstd"},
+        {"compress": "lerc"},
+        {"compress": "lzma"},
+        {"tiled": True, "blockxsize": 32, "blockysize": 32, "compress": "lzw"},
+        {"BIGTIFF": "YES"},
+        {"ENDIANNESS": "BIG"},
+    ],
+    ids=str,
+)
+def test_every_way_in_which_gdal_stores_floats_is_read(tmp_path: Path, storage: dict[str, object]) -> None:
+    np.testing.assert_array_equal(read_geotiff(_gdal(tmp_path / "a.tif", **storage))[0], HEIGHTS)
+
+
+def test_a_raster_from_south_to_north_is_turned(tmp_path: Path) -> None:
+    south_up = rasterio.Affine(SIDE, 0, CORNER[0], 0, SIDE, CORNER[1] - 60 * SIDE)
+    values, grid = read_geotiff(_gdal(tmp_path / "a.tif", HEIGHTS[::-1], transform=south_up))
+    np.testing.assert_array_equal(values, HEIGHTS)
+    assert grid == Grid(*CORNER, SIDE, 80, 60)
+
+
+@pytest.mark.parametrize(
+    ("transform", "problem"),
+    [
+        (rasterio.Affine(0.5, 0.1, 0.0, 0.1, -0.5, 0.0), "turned against the axes"),
+        (rasterio.Affine(0.5, 0.0, 0.0, 0.0, -0.25, 0.0), r"its pixels are 0\.5 x -0\.25 units"),
+    ],
+)
+def test_pixels_that_are_turned_or_not_square_are_refused(tmp_path: Path, transform: rasterio.Affine, problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        read_geotiff(_gdal(tmp_path / "a.tif", transform=transform))
+
+
+@pytest.mark.parametrize("value", [-9999.0, -32768.0, -3.4028234663852886e38])
+def test_what_programs_write_for_no_data_is_no_height(tmp_path: Path, value: float) -> None:
+    holed = HEIGHTS.copy()
+    holed[5:20, 5:20] = value
+    raster = read_raster(_gdal(tmp_path / "a.tif", holed))
+    assert np.isnan(raster.values[5:20, 5:20]).all()
+    assert np.isnan(raster.values).sum() == 225
+    assert raster.notes == (f"225 pixels of {value:g} are taken for pixels without data, though the file does not say so",)
+    reference = from_dem(tmp_path / "a.tif", "m")
+    assert reference.mesh.bounds[0, 2] == HEIGHTS.min()
+    assert raster.notes[0] in reference.words
+
+
+def test_minus_9999_among_heights_as_low_stays_a_height(tmp_path: Path) -> None:
+    """Ocean floor: other values come half as far from zero."""
+    deep = HEIGHTS - 6000
+    deep[3, 3] = -9999
+    raster = read_raster(_gdal(tmp_path / "a.tif", deep))
+    assert raster.values[3, 3] == -9999
+    assert raster.notes == ()
+
+
+def test_a_mask_scale_and_offset_of_gdal_are_applied(tmp_path: Path) -> None:
+    stored, mask = np.round((HEIGHTS - 50) / 0.01).astype(np.int16), np.full(HEIGHTS.shape, 255, np.uint8)
+    mask[:4] = 0
+    path = _gdal(tmp_path / "a.tif", stored, mask=mask)
+    with rasterio.open(path, "r+") as data:
+        data.scales, data.offsets = (0.01,), (50.0,)
+    values, _ = read_geotiff(path)
+    assert np.isnan(values[:4]).all()
+    np.testing.assert_allclose(values[4:], HEIGHTS[4:], atol=0.0051)
+
+
+@pytest.mark.parametrize(("crs", "metres"), [("EPSG:2225", 1200 / 3937), ("EPSG:2222", 0.3048)])
+def test_a_model_in_feet_becomes_metres(tmp_path: Path, crs: str, metres: float) -> None:
+    """State planes in US survey feet and in international feet: 5,400,030 ft differ by 3.3 m."""
+    reference = from_dem(_gdal(tmp_path / "a.tif", crs=crs), "m")
+    centre = (CORNER[0] + SIDE / 2) * metres, (CORNER[1] - SIDE / 2) * metres, float(HEIGHTS[0, 0]) * metres
+    np.testing.assert_allclose(reference.mesh.vertices[0], centre, rtol=1e-9)
+    assert any("which were converted to metres" in words for words in reference.words)
+    with pytest.raises(InputError, match=r"the file states .*ft and --unit is mm"):
+        from_dem(tmp_path / "a.tif", "mm")
+
+
+def test_degrees_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"geographic coordinates"):
+        read_geotiff(_gdal(tmp_path / "a.tif", crs="EPSG:4326", transform=rasterio.transform.from_origin(8.0, 50.0, 1e-5, 1e-5)))
+
+
+def test_a_compression_that_cannot_be_read_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = _gdal(tmp_path / "a.tif", compress="lzw")
+    content = path.read_bytes()
+    tag = (259).to_bytes(2, "little") + (3).to_bytes(2, "little") + (1).to_bytes(4, "little")
+    path.write_bytes(content.replace(tag + (5).to_bytes(2, "little"), tag + (34925 + 77).to_bytes(2, "little")))
+    with pytest.raises(InputError, match=r"compressed in a way that cannot be read.*save it with deflate"):
         read_tiff(path)

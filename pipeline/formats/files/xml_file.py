@@ -22,7 +22,7 @@ def read_root(path: Path) -> ElementTree.Element:
 def parsed(text: bytes, where: str) -> ElementTree.Element:
     """The root of what stands in an XML file."""
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
-        raise InputError("declares entities, which Metashape never does", where=where)
+        raise InputError("declares entities, which could fill the memory", where=where, remedy="export it again without them")
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:

@@ -1,6 +1,6 @@
-"""Rasters as float32 TIFF, and as GeoTIFF georeferenced to the wall frame.
+"""Read and write rasters: float32 TIFF, and GeoTIFF georeferenced to the wall frame.
 
-Uncompressed: on a noisy difference map deflate saves a fifth and takes forty times as long.
+Written uncompressed: on a noisy difference map deflate saves a fifth and takes forty times as long.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +20,30 @@ import tifffile
 from numpy.typing import NDArray
 
 from pipeline.formats.files.atomic import writing
+from pipeline.formats.rasters.georeference import (
+    GEO_KEYS,
+    LINEAR_UNITS,
+    MODEL_TYPE,
+    PIXEL_SCALE,
+    RASTER_TYPE,
+    TIEPOINT,
+    Georeference,
+    georeference,
+)
 from scene.common.errors import InputError
 from scene.common.regular_file import READ_LIMIT, check_file, raised_gb
 from scene.geometry.grid import Grid
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # its complaints come as exceptions too
-_PIXEL_SCALE, _TIEPOINT, _GEO_KEYS, _GEO_ASCII, _NODATA = 33550, 33922, 34735, 34737, 42113
+_GEO_ASCII, _NODATA = 34737, 42113
 _ASCII, _SHORT, _DOUBLE = 2, 3, 12
 _MASK_PAGE = 4
 """TIFF's NewSubfileType of a transparency mask."""
 MOST_PIXELS = 250_000_000
 """Of an image that is read, 1 GB as float32: a small compressed file can claim any size."""
 _LARGEST = 1e9
-_SIDES_M, _FARTHEST_M = (1e-6, 1e6), 1e8
-"""Of pixels, and how far from its origin any coordinate system of a survey reaches."""
+_USUAL_NODATA = tuple(np.float32(value) for value in (-9999, -99999, -32768, -32767, -3.4028235e38, 3.4028235e38, -1e30, 1e20))
+"""Values that programs write where there are no data (ESRI, SRTM, float32's largest)."""
 _DAMAGE = (
     ValueError,
     IndexError,
@@ -50,7 +61,7 @@ _DECOMPRESSORS: dict[int, Callable[[], Any]] = {8: zlib.decompressobj, 32946: zl
 _SLACK = 65_536
 """Bytes that a compressed part of an image may be larger than a plain one."""
 _CITATION = "wall frame: x along the wall, y up the wall, z towards the sensors, metres"
-_MODEL_TYPE, _RASTER_TYPE, _CITATION_KEY, _LINEAR_UNITS = 1024, 1025, 1026, 3076
+_CITATION_KEY = 1026
 _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
 
 
@@ -78,43 +89,67 @@ def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = ""
     _write(path, image, description, [(_NODATA, _ASCII, 0, "nan", False)])
 
 
-def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
-    """Read a raster of one band and where its pixels lie: (h, w) float32, NaN where there is no data, and its grid.
+@dataclass(frozen=True)
+class Raster:
+    """A raster as a file holds it.
 
-    Raises InputError for a damaged file, one beyond `most_pixels`, one without a place, and pixels that are not square or not
-    along the axes.
+    values: (h, w) float32, north up, NaN where there is no data, in the file's unit of heights; place: where its pixels lie;
+    notes: what the user should know of how it was read, in words.
     """
-    raster, tags = _read(path)
-    scale, tie = tags.get(_PIXEL_SCALE), tags.get(_TIEPOINT)
-    if scale is None or tie is None or len(tie) != 6 or not np.isclose(scale[0], scale[1], rtol=1e-9, atol=0):
+
+    values: NDArray[np.float32]
+    place: Georeference
+    notes: tuple[str, ...]
+
+
+def read_raster(path: Path) -> Raster:
+    """Read a raster of one band with all that the file says of it.
+
+    Raises InputError for a damaged file, one beyond `most_pixels`, and a place or unit that cannot be used.
+    """
+    values, tags, masked = _read(path)
+    place = georeference(tags, (values.shape[0], values.shape[1]), path)
+    stated = _nodata(tags, path)
+    absent = values == stated if not np.isnan(stated) else np.zeros(values.shape, dtype=bool)
+    absent |= masked
+    usual, notes = _unstated_nodata(values, absent | np.isnan(values))
+    values = np.where(absent | usual, np.float32(np.nan), values)
+    if (place.scale, place.offset) != (1.0, 0.0):
+        values = (values * np.float64(place.scale) + place.offset).astype(np.float32)
+    _check_values(values, path)
+    return Raster(values[::-1] if place.flipped else values, place, notes)
+
+
+def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
+    """Read a raster of one band, (h, w) float32, m, NaN where there is no data, and the grid of its pixels, m.
+
+    Stated units are converted. Raises InputError as `read_raster` does, and for a file without a place.
+    """
+    raster = read_raster(path)
+    if raster.place.grid is None:
         raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
-    gsd = float(scale[0])
-    if not (_SIDES_M[0] <= gsd <= _SIDES_M[1] and (np.abs(tie) <= _FARTHEST_M).all()):
-        place = f"a pixel of {gsd:g} m with the tie point {', '.join(f'{value:g}' for value in tie)}"
-        allowed = f"sides of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m, numbers of up to {_FARTHEST_M:g} as a place"
-        raise InputError(f"has {place}", where=str(path), allowed=allowed, remedy="export it again, in metres")
-    height, width = raster.shape
-    return raster, Grid(float(tie[3] - tie[0] * gsd), float(tie[4] + tie[1] * gsd), gsd, width, height)
+    metres = raster.place.vertical_m or 1.0
+    return (raster.values if metres == 1.0 else raster.values * np.float32(metres)), raster.place.grid
 
 
 def read_tiff(path: Path) -> NDArray[np.float32]:
     """Read an image of one band as float32, NaN where there is no data; raises InputError for a damaged or too large file."""
-    return _read(path)[0]
+    return read_raster(path).values
 
 
 def _georeference(grid: Grid) -> list[tuple[int, int, int, Any, bool]]:
     citation = f"{_CITATION}|"
     keys = [
         (1, 1, 1, 4),  # version 1, revision 1.1, four keys
-        (_MODEL_TYPE, 0, 1, _USER_DEFINED),
-        (_RASTER_TYPE, 0, 1, _PIXEL_IS_AREA),
+        (MODEL_TYPE, 0, 1, _USER_DEFINED),
+        (RASTER_TYPE, 0, 1, _PIXEL_IS_AREA),
         (_CITATION_KEY, _GEO_ASCII, len(citation), 0),
-        (_LINEAR_UNITS, 0, 1, _METRE),
+        (LINEAR_UNITS, 0, 1, _METRE),
     ]
     return [
-        (_PIXEL_SCALE, _DOUBLE, 3, (grid.gsd, grid.gsd, 0.0), False),
-        (_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, grid.x_min, grid.y_max, 0.0), False),
-        (_GEO_KEYS, _SHORT, 4 * len(keys), tuple(number for key in keys for number in key), False),
+        (PIXEL_SCALE, _DOUBLE, 3, (grid.gsd, grid.gsd, 0.0), False),
+        (TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, grid.x_min, grid.y_max, 0.0), False),
+        (GEO_KEYS, _SHORT, 4 * len(keys), tuple(number for key in keys for number in key), False),
         (_GEO_ASCII, _ASCII, 0, citation, False),
         (_NODATA, _ASCII, 0, "nan", False),
     ]
@@ -137,7 +172,8 @@ def _write(
             file.write(~np.isnan(data), photometric="mask", subfiletype=_MASK_PAGE, **plain)
 
 
-def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
+def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.bool_]]:
+    """Stored values (h, w), the first page's tags, and which pixels a transparency mask leaves out."""
     check_file(path)
     try:
         with tifffile.TiffFile(path) as file:
@@ -146,22 +182,55 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any]]:
             _check_parts(file, page)
             tags = {tag.code: tag.value for tag in page.tags}
             raster = page.asarray()
+            masks = [each.asarray() for each in file.pages[1:3] if _is_mask(each, page)]
     except InputError:
         raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
     except (*_DAMAGE, tifffile.TiffFileError, zlib.error, lzma.LZMAError, struct.error) as error:
-        problem = " ".join(str(error).split())
-        raise InputError(f"is not a whole TIFF file ({problem})", where=str(path), remedy="export it again") from None
+        raise _unreadable(path, " ".join(str(error).split())) from None
     if raster.ndim != 2 or raster.dtype.kind not in "fiub":
         problem = f"has the shape {raster.shape} and values of type {raster.dtype}"
         raise InputError(problem, where=str(path), allowed="one band of numbers", remedy="export it as float32")
-    with np.errstate(over="ignore"):  # becomes infinite, which is looked for below
-        raster = raster.astype(np.float32, copy=False)
-        nodata = _nodata(tags, path)
-    raster = raster if np.isnan(nodata) else np.where(raster == nodata, np.float32(np.nan), raster)
-    _check_values(raster, path)
-    return raster, tags
+    with np.errstate(over="ignore"):  # becomes infinite, which is looked for later
+        values = raster.astype(np.float32, copy=False)
+    masked = masks[0] == 0 if masks else np.zeros(values.shape, dtype=bool)
+    return values, tags, masked
+
+
+def _is_mask(page: Any, image: Any) -> bool:
+    """Whether a page is the transparency mask of the image."""
+    return bool(int(getattr(page, "subfiletype", 0)) & _MASK_PAGE) and page.shape == image.shape
+
+
+def _unreadable(path: Path, problem: str) -> InputError:
+    """The error for a file that tifffile cannot read: a compression that it does not know is no damage."""
+    if "imagecodecs" in problem or "not supported" in problem or "not a known COMPRESSION" in problem:
+        allowed = "no compression, deflate, LZW, PackBits, LZMA, Zstandard, LERC, JPEG"
+        remedy = "save it with deflate or without compression"
+        return InputError(
+            f"is compressed in a way that cannot be read ({problem})", where=str(path), allowed=allowed, remedy=remedy
+        )
+    return InputError(f"is not a whole TIFF file ({problem})", where=str(path), remedy="export it again")
+
+
+def _unstated_nodata(values: NDArray[np.float32], absent: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+    """Pixels of a value that programs write for no data, where the file does not say so, and a note on them.
+
+    A value counts where no other value of the raster comes half as far from zero: -9999 among heights of 100 to 900 m is no
+    height.
+    """
+    for usual in _USUAL_NODATA:
+        found = (values == usual) & ~absent
+        if not found.any():
+            continue
+        others = values[~found & ~absent]
+        if not len(others) or np.abs(others).max() > abs(float(usual)) / 2:
+            continue
+        return found, (
+            f"{int(found.sum()):,} pixels of {usual:g} are taken for pixels without data, though the file does not say so",
+        )
+    return np.zeros(values.shape, dtype=bool), ()
 
 
 def _nodata(tags: dict[int, Any], path: Path) -> np.float32:

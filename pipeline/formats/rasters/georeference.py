@@ -1,0 +1,148 @@
+"""Read where a TIFF's pixels lie and in which units, from the tags of GeoTIFF 1.1 and of GDAL.
+
+The tie point of GeoTIFF belongs to the outer corner of a pixel, or to its centre where the file says that a pixel is a point.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.files.xml_file import parsed
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+
+PIXEL_SCALE, TIEPOINT, TRANSFORMATION, GEO_KEYS, GDAL_METADATA = 33550, 33922, 34264, 34735, 42112
+MODEL_TYPE, RASTER_TYPE, LINEAR_UNITS, VERTICAL_UNITS = 1024, 1025, 3076, 4099
+_GEOGRAPHIC, _PIXEL_IS_POINT = 2, 2
+_METRES_OF_UNIT = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937, 9036: 1000.0}
+"""EPSG codes of linear units: metre, international foot, US survey foot, kilometre."""
+_UNIT_NAMES = {9001: "m", 9002: "ft", 9003: "US survey ft", 9036: "km"}
+_SIDES_M, _FARTHEST_M = (1e-6, 1e6), 1e8
+"""Sides of a pixel, and how far from its origin any coordinate system of a survey reaches."""
+_SQUARE = 1e-9
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """What a file says of its pixels.
+
+    grid: in metres, None where the file has no place; flipped: the first row of the file is the southernmost; linear_m,
+    vertical_m: metres of the stated units of coordinates and heights, None where the file states none; scale, offset: by
+    which stored values become true ones.
+    """
+
+    grid: Grid | None
+    flipped: bool
+    linear_m: float | None
+    vertical_m: float | None
+    scale: float
+    offset: float
+
+
+def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Georeference:
+    """Read the georeference from TIFF tags.
+
+    Parameters
+    ----------
+    tags : dict
+        Values of the first page's tags by their code.
+    shape : (int, int)
+        Rows and columns of the raster.
+    path : Path
+        The file, for errors.
+
+    Returns
+    -------
+    Georeference
+
+    Raises
+    ------
+    InputError
+        For geographic coordinates, unknown units, pixels that are not square or not along the axes, and a place that is none.
+    """
+    keys = _geo_keys(tags, path)
+    linear, vertical = (_unit(keys, key, path) for key in (LINEAR_UNITS, VERTICAL_UNITS))
+    scale, offset = _scale_and_offset(tags, path)
+    corner = _affine(tags, path)
+    if corner is None:
+        return Georeference(None, False, linear, vertical, scale, offset)
+    if keys.get(MODEL_TYPE) == _GEOGRAPHIC:
+        remedy = "reproject it to the projected coordinates of the points, in metres"
+        raise InputError("is in geographic coordinates, degrees", where=str(path), allowed="metres or feet", remedy=remedy)
+    gsd, step_y, x, y = (value * (linear or 1.0) for value in corner)
+    if not (_SIDES_M[0] <= gsd <= _SIDES_M[1] and max(abs(x), abs(y)) <= _FARTHEST_M):
+        place = f"a pixel of {gsd:g} m with its first corner at {x:g}, {y:g}"
+        allowed = f"sides of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m, coordinates of up to {_FARTHEST_M:g} m"
+        raise InputError(f"has {place}", where=str(path), allowed=allowed, remedy="export it again, in metres")
+    if keys.get(RASTER_TYPE) == _PIXEL_IS_POINT:
+        x, y = x - gsd / 2, y - step_y / 2
+    flipped = step_y > 0
+    y_max = y + shape[0] * step_y if flipped else y
+    return Georeference(Grid(x, y_max, gsd, shape[1], shape[0]), flipped, linear, vertical, scale, offset)
+
+
+def unit_name(metres: float) -> str:
+    """Return what a unit of so many metres is called."""
+    codes = (code for code, size in _METRES_OF_UNIT.items() if math.isclose(size, metres, rel_tol=1e-9))
+    return next((_UNIT_NAMES[code] for code in codes), f"{metres:g} m")
+
+
+def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, float] | None:
+    """Side of a pixel, step of y from row to row (negative: north is up), x and y of the first corner or centre; None: no
+    place."""
+    scale, tie, matrix = tags.get(PIXEL_SCALE), tags.get(TIEPOINT), tags.get(TRANSFORMATION)
+    if scale is not None and tie is not None and len(tie) == 6:
+        step_x, step_y = float(scale[0]), -float(scale[1])
+        x, y = float(tie[3]) - float(tie[0]) * step_x, float(tie[4]) - float(tie[1]) * step_y
+        turned = False
+    elif matrix is not None and len(matrix) == 16:
+        step_x, step_y, x, y = (float(matrix[place]) for place in (0, 5, 3, 7))
+        turned = max(abs(float(matrix[1])), abs(float(matrix[4]))) > _SQUARE * abs(step_x)
+    else:
+        return None
+    if turned or not step_x > 0 or not np.isclose(step_x, abs(step_y), rtol=_SQUARE, atol=0):
+        problem = "its pixels are turned against the axes" if turned else f"its pixels are {step_x:g} x {step_y:g} units"
+        remedy = "resample it to square pixels along the axes (gdalwarp)"
+        raise InputError(problem, where=str(path), allowed="square pixels, columns towards larger x", remedy=remedy)
+    return step_x, step_y, x, y
+
+
+def _geo_keys(tags: dict[int, Any], path: Path) -> dict[int, int]:
+    """The GeoTIFF keys whose value is a number of 16 bits."""
+    values = tags.get(GEO_KEYS)
+    if values is None:
+        return {}
+    rows = list(zip(*(tuple(values)[4 + part :: 4] for part in range(4)), strict=False))
+    if len(values) < 4 or len(rows) < values[3]:
+        problem = f"states {values[3] if len(values) > 3 else 0} GeoTIFF keys and holds {len(rows)}"
+        raise InputError(problem, where=str(path), remedy="export it again")
+    return {int(key): int(value) for key, location, _, value in rows if location == 0}
+
+
+def _unit(keys: dict[int, int], key: int, path: Path) -> float | None:
+    code = keys.get(key)
+    if code is None:
+        return None
+    if code not in _METRES_OF_UNIT:
+        allowed = ", ".join(f"{name} (EPSG {number})" for number, name in _UNIT_NAMES.items())
+        raise InputError(f"states the unit EPSG {code}", where=str(path), allowed=allowed, remedy="export it in metres")
+    return _METRES_OF_UNIT[code]
+
+
+def _scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
+    """Scale and offset of the stored values, from GDAL's metadata."""
+    found = {"scale": 1.0, "offset": 0.0}
+    text = tags.get(GDAL_METADATA)
+    if not text or "role=" not in str(text):
+        return found["scale"], found["offset"]
+    items = parsed(str(text).strip("\0 ").encode(), f"{path}: GDAL_METADATA")
+    try:
+        found |= {str(item.get("role")): float(item.text or "") for item in items if item.get("role") in found}
+    except ValueError:
+        raise InputError("its scale or offset is no number", where=f"{path}: GDAL_METADATA", remedy="export it again") from None
+    return found["scale"], found["offset"]
