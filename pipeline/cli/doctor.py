@@ -32,7 +32,6 @@ _MEMORY_GIB, _DISK_GIB = 2.0, 1.0
 """What the demo needs, with room to spare."""
 EXTRAS = {
     "colmap": ("surfaces by COLMAP from depth maps", "0.1 GB"),
-    "crs": ("projected coordinate systems in Metashape's files", "30 MB"),
     "dataset": ("data sets by several workers", "30 MB"),
     "detect": ("the detector, by TensorFlow", "2.0 GB"),
     "huggingface": ("data sets for Hugging Face's datasets", "0.2 GB"),

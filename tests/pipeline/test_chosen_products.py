@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -83,9 +82,3 @@ def test_a_wrong_system_is_told_before_anything_is_simulated(crs: str, problem: 
     with pytest.raises(InputError, match=problem):
         simulate(configure(products={"crs": crs}), "tls", out=tmp_path / "run", progress=False)
     assert not (tmp_path / "run").exists()
-
-
-def test_without_pyproj_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyproj", None)
-    with pytest.raises(InputError, match="make setup EXTRAS=crs"):
-        simulate(configure(products={"crs": "EPSG:28356"}), "tls", out=tmp_path / "run", progress=False)

@@ -44,13 +44,13 @@ def test_missing_things_are_told_with_their_remedy(monkeypatch: pytest.MonkeyPat
 
 
 def test_an_extra_that_is_not_there_is_no_problem_and_says_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metadata, "requires", lambda _: ["nonesuch>=3; extra == 'detect'", "numpy; extra == 'crs'"])
+    monkeypatch.setattr(metadata, "requires", lambda _: ["nonesuch>=3; extra == 'detect'", "numpy; extra == 'm3c2'"])
     found = {finding.name: finding for finding in doctor._extras()}
     assert found["extra detect"].ok is None
     assert "not installed: nonesuch, 2.0 GB" in found["extra detect"].found
     assert found["extra detect"].remedy.startswith("make setup EXTRAS=detect, in /")
-    assert found["extra crs"].found.endswith("installed")
-    assert not found["extra crs"].remedy
+    assert found["extra m3c2"].found.endswith("installed")
+    assert not found["extra m3c2"].remedy
 
 
 def test_the_libraries_of_an_extra_are_wanted_with_it_only(monkeypatch: pytest.MonkeyPatch) -> None:

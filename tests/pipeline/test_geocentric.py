@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -72,7 +70,6 @@ def row(values: np.ndarray) -> str:
 
 def test_on_the_central_meridian_the_northing_is_the_scaled_arc_and_north_is_north(tmp_path: Path) -> None:
     """Transverse Mercator: E = 500 km, N = 0.9996 times the arc of the meridian, no convergence (Snyder 1987, eq. 3-21)."""
-    pytest.importorskip("pyproj")
     arc = quad(lambda latitude: A * (1 - E2) / (1 - E2 * np.sin(latitude) ** 2) ** 1.5, 0, LATITUDE, epsabs=1e-6, epsrel=1e-13)[0]
     found = read_metashape(written(tmp_path / "cameras.xml", np.radians(9.0), UTM)).cameras["one"]
     np.testing.assert_allclose(found.position, [500_000.0, 0.9996 * arc, HEIGHT], atol=1e-5)
@@ -81,7 +78,6 @@ def test_on_the_central_meridian_the_northing_is_the_scaled_arc_and_north_is_nor
 
 def test_beside_it_attitudes_turn_by_the_convergence_of_the_meridians(tmp_path: Path) -> None:
     """tan gamma = tan(difference of longitude) sin(latitude) on the sphere; the ellipsoid's is the same to 1e-5 at 1 degree."""
-    pytest.importorskip("pyproj")
     found = read_metashape(written(tmp_path / "cameras.xml", np.radians(10.0), UTM)).cameras["one"]
     gamma = np.arctan(np.tan(np.radians(1.0)) * np.sin(LATITUDE))
     turn = Rotation.from_euler("z", gamma).as_matrix()  # true north lies west of the grid's north, east of the meridian
@@ -107,26 +103,9 @@ def test_poses_in_a_local_system_stay(tmp_path: Path, reference: str) -> None:
     ],
 )
 def test_what_cannot_be_converted_is_named_in_one_line(tmp_path: Path, reference: str, words: str) -> None:
-    pytest.importorskip("pyproj")
     path = written(tmp_path / "cameras.xml", np.radians(9.0), reference)
     with pytest.raises(InputError, match=words) as caught:
         read_metashape(path)
     assert str(caught.value).startswith(str(path))
     assert "convert the chunk's reference" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_without_pyproj_the_cause_and_both_ways_out_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def absent(name: str, *rest: Any, **more: Any) -> Any:
-        if name.split(".")[0] == "pyproj":
-            raise ImportError(name)
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", absent)
-    path = written(tmp_path / "cameras.xml", np.radians(9.0), UTM)
-    with pytest.raises(
-        InputError, match=r"geocentric coordinates, and pyproj is not installed.*make setup EXTRAS=crs.*convert the chunk"
-    ):
-        read_metashape(path)

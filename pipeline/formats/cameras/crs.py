@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from scene.common.errors import InputError
-from scene.common.extras import how_to_install
 
 
 def wkt_of(name: str, where: str) -> str:
     """The WKT (version 1, as LAS has it) of a coordinate system in metres with two or three axes, such as EPSG:28356.
 
-    Raises InputError for one that is not known or not in metres, and where pyproj, the extra `crs`, is not installed.
+    Raises InputError for one that is not known or not in metres.
     """
-    try:
-        from pyproj import CRS
-        from pyproj.exceptions import CRSError
-    except ImportError:
-        raise InputError("needs pyproj, which is not installed", where=where, remedy=how_to_install("crs")) from None
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
     try:
         crs = CRS.from_user_input(name)
     except (CRSError, UnicodeError) as error:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from scene.common.errors import InputError
-from scene.common.extras import how_to_install
 from scene.geometry.mesh import FloatArray
 
 _EARTH_M = 6.3e6, 6.45e6
@@ -60,15 +59,9 @@ class Projection:
 
     @cached_property
     def _crs(self) -> Any:
-        try:
-            from pyproj import CRS
-            from pyproj.exceptions import CRSError
-        except ImportError:
-            raise InputError(
-                "holds poses in geocentric coordinates, and pyproj is not installed, which takes them to the survey's",
-                where=self.where,
-                remedy=f"{how_to_install('crs')}, or {_REMEDY}",
-            ) from None
+        from pyproj import CRS
+        from pyproj.exceptions import CRSError
+
         try:
             crs = CRS.from_user_input(self.text)
         except (CRSError, UnicodeError) as error:
