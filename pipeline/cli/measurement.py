@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.cli.answer import Answer
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
+from scene.common.lengths import METRES
 
 if TYPE_CHECKING:
     from pipeline.measurement.folder import Understood
@@ -49,10 +50,13 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         help="where the scanner stood, m, in the points' frame, if no header says; with --photographs any place before the wall",
     )
     parser.add_argument(
-        "--unit", type=one_of("m", "cm", "mm", "ft"), default="m", metavar="m|cm|mm|ft", help="of the scan (default: m)"
+        "--unit",
+        type=one_of(*METRES),
+        metavar="|".join(METRES),
+        help="of the scan (default: as the file states, m where it states none); us-ft: US survey foot",
     )
     parser.add_argument(
-        "--reference-unit", type=one_of("m", "cm", "mm", "ft"), default="m", metavar="m|cm|mm|ft", help="(default: m)"
+        "--reference-unit", type=one_of(*METRES), metavar="|".join(METRES), help="of the reference (default: as for --unit)"
     )
     parser.add_argument(
         "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"

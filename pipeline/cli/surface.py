@@ -63,5 +63,6 @@ def run(arguments: argparse.Namespace) -> Answer:
     write_ply(out, mesh)
     counts = {"points": len(cloud.points), "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
     told = f"{counts['points']:,} points, {counts['triangles']:,} triangles: {out}; a config of it: scarpsim init --mesh {out}"
-    told = "\n".join([*(f"note: {note}" for note in surface.notes), told])
-    return Answer(told, lambda: {"file": str(out), **counts, "notes": list(surface.notes)})
+    notes = [*(f"{arguments.cloud.name}: {note}" for note in cloud.notes), *surface.notes]
+    told = "\n".join([*(f"note: {note}" for note in notes), told])
+    return Answer(told, lambda: {"file": str(out), **counts, "notes": notes})

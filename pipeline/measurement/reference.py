@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.scan_geometry import ScanGeometry
 from pipeline.formats.points.points import SUFFIXES
-from pipeline.formats.rasters.georeference import unit_name
 from pipeline.formats.rasters.geotiff import read_raster
-from pipeline.measurement.scans import METRES, RawScan, read_scans
+from pipeline.formats.units import AxisUnits, agreed_units
+from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.station import Station
 from pipeline.surface.triangulation import SeenSurface, triangulated
 from scene.common.errors import InputError
@@ -56,50 +56,48 @@ def is_cloud(path: Path) -> bool:
 
 
 def from_file(
-    path: Path, unit: str, position: FloatArray, rotation: FloatArray, seen_from: str = "from the scanner"
+    path: Path, unit: str | None, position: FloatArray, rotation: FloatArray, seen_from: str = "from the scanner"
 ) -> Reference:
     """A reference out of a file, seen from `position` (3,) m with `rotation` (3, 3), `seen_from` in words; InputError where it
     cannot be used."""
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, a DEM, or the word {HALF}")
     if path.suffix.lower() in DEMS:
-        return from_dem(path, unit)
+        return from_dem(path, unit, "--reference-unit")
     if not is_cloud(path):
-        mesh, notes = read_mesh(path, unit)
+        mesh, notes = read_mesh(path, unit or "m")
         words = (f"mesh {path.name}: {len(mesh.faces):,} triangles, taken as exact", *notes)
         limit = "an error of the mesh (its noise, chords across curved rock, cut edges) looks like one of the sensor"
         return Reference(mesh, 0.0, words, (limit,))
-    scans = read_scans(path, unit)
+    scans = read_scans(path, unit, option="--reference-unit")
     points = np.concatenate([scan.cloud.points for scan in scans])
     surface = triangulated(points, position, rotation, str(path))
     said = f"cloud {path.name}: {len(points):,} points, meshed as seen {seen_from}, {len(surface.mesh.faces):,} triangles"
+    words = tuple(dict.fromkeys(f"cloud {path.name}: {word}" for scan in scans for word in scan.cloud.notes))
     limits = (
         "the reference is a measurement itself: errors that both share (same scanner, same place) cannot be seen, and rock that "
         "moved between the two is told from errors only where it has edges",
     )
-    return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, of_points=True)
+    return Reference(surface.mesh, surface.error_m, (said, *words, _of_noise(surface)), limits, of_points=True)
 
 
-def from_dem(path: Path, unit: str) -> Reference:
+def from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Reference:
     """Make a surface of a raster of heights: a vertex at the centre of each pixel, two triangles between four that have data.
 
-    unit: what the user says of coordinates and heights. A unit that the file states takes the place of metres, the default,
-    and has to agree with any other. Raises InputError where it does not, and where the raster holds no heights or no place.
+    unit: what the user says of coordinates and heights by `option`, None where the file's own word holds, metres where it has
+    none. Raises InputError where the two contradict each other, and where the raster holds no heights or no place.
     """
     raster = read_raster(path)
     heights, place = raster.values, raster.place
     if place.grid is None:
         raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
-    metres, notes = METRES[unit], list(raster.notes)
-    if place.linear_m is not None and not np.isclose(place.linear_m, METRES["m"]):
-        if unit != "m" and not np.isclose(place.linear_m, metres, rtol=1e-9):
-            stated = unit_name(place.linear_m)
-            raise InputError(f"the file states {stated} and --unit is {unit}", where=str(path), remedy="leave --unit out")
-        notes.append(f"the file states {unit_name(place.linear_m)}, which were converted to metres")
-        metres = 1.0  # the grid is in metres already
-        up = place.vertical_m or place.linear_m
-    else:
-        up = place.vertical_m or metres
+    level, upright = place.linear_m, place.vertical_m
+    stated = None if level is None else AxisUnits((level, level, upright or level), "its GeoTIFF keys")
+    units, notes = agreed_units(stated, unit, str(path), option), list(raster.notes)
+    if stated and not units.in_metres:
+        notes.append(f"the file states {units.name}, which were converted to metres")
+    metres = 1.0 if stated else units.metres[0]  # the grid of a file with a unit is in metres already
+    up = units.metres[2] if stated else upright or metres
     grid = place.grid
     known = np.isfinite(heights)
     if not known.any() or min(heights.shape) < 2:

@@ -3,7 +3,7 @@ words on what was guessed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.checks import finite
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.points import TEXT, check_reach, placed, read_points
-from pipeline.formats.points.ptx import read_ptx
-from pipeline.formats.points.xyz import read_table, read_xyz
+from pipeline.formats.points.points import read_placed_scans
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+_OF_GRID = {"row", "column", "line", "scan", "pixel_x", "pixel_y"}
+_OF_RETURNS = {"return_number", "number_of_returns", "return_index", "return_count"}
+"""Channels that a measurement is made of, beside intensity and time."""
 _FEWEST = 100
 """Points below which nothing can be said of a scan."""
 
@@ -50,74 +50,28 @@ def part_of(cloud: PointCloud, rows: NDArray[Any]) -> PointCloud:
     )
 
 
-def read_scans(path: Path, unit: str = "m", columns: Sequence[str] = ()) -> list[RawScan]:
-    """All scans of a file.
+def read_scans(path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit") -> list[RawScan]:
+    """Read all scans of a file.
 
-    unit: of the file's coordinates; columns: names of a text file's columns. Raises InputError for a format that is not known,
-    whatever is wrong in the file, and a scan without points to speak of.
+    Parameters
+    ----------
+    path : of any format that `read_placed_scans` reads
+    unit : of the file's coordinates; None: as the file states, metres where it states none
+    columns : names of a text file's columns
+    option : by which the user gives the unit, for errors
+
+    Raises
+    ------
+    InputError
+        For a format that is not known, whatever is wrong in the file, and a scan without points to speak of.
     """
-    suffix = path.suffix.lower()
-    reader = {".e57": _from_e57, ".ptx": _from_ptx}.get(suffix)
-    scans = [_from_text(path, columns)] if suffix in TEXT else list(reader(path)) if reader else [_plain(path)]
-    return [_checked(_in_metres(scan, METRES[unit]), str(path)) for scan in scans]
-
-
-def _plain(path: Path) -> RawScan:
-    return RawScan(path.name, read_points(path))
-
-
-def _from_text(path: Path, columns: Sequence[str]) -> RawScan:
-    if columns:
-        return RawScan(path.name, read_xyz(path, columns))
-    table = read_table(path)
-    words = () if table.told else (f"the columns have no names and were taken for {', '.join(table.names)} (else: --columns)",)
-    return RawScan(path.name, read_xyz(path, table.names), words=words)
-
-
-def _from_e57(path: Path) -> Iterator[RawScan]:
-    from pipeline.formats.points.e57 import read_e57  # the library takes a tenth of a second to load
-
-    for number, scan in enumerate(read_e57(path), start=1):
-        name = f"{path.name} ({number}: {scan.name})"
-        if not scan.position.any() and np.array_equal(scan.rotation, np.eye(3)):  # what programs write that know no pose
-            yield RawScan(name, scan.cloud, words=("its header holds no pose, or that of the file's own frame",))
-        else:
-            yield RawScan(name, scan.placed, scan.position, scan.rotation, ("position and rotation are from the E57 header",))
-
-
-def _from_ptx(path: Path) -> Iterator[RawScan]:
-    for number, scan in enumerate(read_ptx(path), start=1):
-        rotation, words = orthonormal(scan.rotation, f"{path.name}, scan {number}")
-        cloud = placed(replace(scan, rotation=rotation))
-        yield RawScan(
-            f"{path.name} ({number})", cloud, scan.position, rotation, ("position and rotation are from the PTX header", *words)
-        )
-
-
-def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """The nearest rotation matrix to one with few digits, and a word where that changed more than rounding does.
-
-    Raises InputError where it is off by more than a hundredth, or turns left into right.
-    """
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
-    if off > 0.02 or np.linalg.det(rotation) < 0:
-        remedy = "rows must be orthonormal, determinant +1; give more digits"
-        raise InputError("the rotation is no rotation matrix", where=where, remedy=remedy)
-    left, _, right = np.linalg.svd(rotation)
-    words = (f"the rotation was off from orthonormal by {off:.1g} and is made so",) if off > 1e-6 else ()
-    return np.asarray(left @ right), words
-
-
-def _in_metres(scan: RawScan, metres: float) -> RawScan:
-    if metres == 1:
-        return scan
-    cloud = replace(scan.cloud, points=scan.cloud.points * metres)
-    return replace(scan, cloud=cloud, position=None if scan.position is None else scan.position * metres)
+    scans = read_placed_scans(path, unit, columns, option)
+    raw = (RawScan(scan.name, scan.cloud, scan.position, scan.rotation, scan.cloud.notes) for scan in scans)
+    return [_checked(scan, str(path)) for scan in raw]
 
 
 def _checked(scan: RawScan, where: str) -> RawScan:
     """The scan without points that are no numbers, and with an intensity that is a power."""
-    check_reach(scan.cloud.points, where)
     cloud = finite(scan.cloud, where)
     words = list(scan.words)
     if (lost := len(scan.cloud.points) - len(cloud.points)) > 0:
@@ -126,6 +80,8 @@ def _checked(scan: RawScan, where: str) -> RawScan:
         raise InputError(
             f"holds {len(cloud.points)} points", where=where, allowed=f"{_FEWEST} and more", remedy="give a whole scan"
         )
+    if unused := sorted(set(cloud.extra) - _OF_GRID - _OF_RETURNS):
+        words.append(f"the file also holds {', '.join(unused)}, which {'is' if len(unused) == 1 else 'are'} not used")
     if cloud.intensity is not None:
         power, said = _power(np.asarray(cloud.intensity, dtype=np.float64))
         cloud = replace(cloud, intensity=power)

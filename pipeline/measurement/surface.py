@@ -74,7 +74,7 @@ def _read(path: Path, request: Request) -> RawScan:
         words = ("the heights of an elevation model", *dem.words[1:])
         return RawScan(path.name, PointCloud(dem.mesh.vertices), words=words)
     if path.suffix.lower() in _MESHES or not is_cloud(path):
-        mesh, notes = read_mesh(path, request.unit)
+        mesh, notes = read_mesh(path, request.unit or "m")
         found = RawScan(path.name, PointCloud(mesh.vertices), words=("the vertices of a mesh", *notes))
     else:
         scans = read_scans(path, request.unit, request.columns)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.measurement.scans import METRES
 from scene.common.errors import InputError
+from scene.common.lengths import METRES
 from scene.geometry.mesh import FloatArray
 
 _WIDEST_M, _SPARSEST_M = 20_000.0, 5.0
@@ -14,15 +14,15 @@ _ALIKE = 1.3
 """Two surfaces whose sizes, once converted, agree to this factor are taken for the same wall."""
 
 
-def check_extent(points: FloatArray, where: str, unit: str) -> None:
-    """Raise InputError where a cloud (n, 3), m if it is in `unit`, is wider or sparser than any scan."""
+def check_extent(points: FloatArray, where: str, unit: str | None) -> None:
+    """Raise InputError where a cloud (n, 3), m if it is in `unit` (None: in metres), is wider or sparser than any scan."""
     wide, high = np.sort(np.ptp(points, axis=0))[:0:-1]
     apart = float(np.sqrt(wide * high / len(points)))
     if wide > _WIDEST_M or apart > _SPARSEST_M:
         raise InputError(
-            f"taken as {unit}, the points would be {wide:,.0f} m wide and {apart:.3g} m apart", where=where,
+            f"taken as {unit or 'm'}, the points would be {wide:,.0f} m wide and {apart:.3g} m apart", where=where,
             allowed=f"up to {_WIDEST_M:,.0f} m and {_SPARSEST_M:g} m",
-            remedy=f"say --unit mm (or cm, ft) if that is the file's unit{_merged(wide, apart)}",
+            remedy=f"say --unit mm (or cm, ft, us-ft) if that is the file's unit{_merged(wide, apart)}",
         )  # fmt: skip
 
 
@@ -30,7 +30,7 @@ def _merged(wide: float, apart: float) -> str:
     return "; a cloud of single points far away is to be cut first" if wide > 1e5 and apart < _SPARSEST_M else ""
 
 
-def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: str, reference_unit: str) -> None:
+def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: str | None, reference_unit: str | None) -> None:
     """Raise InputError where a scan (n, 3) and its reference (m, 3), both m by what was said, are as large as each other in
     another unit, or lie in two coordinate systems."""
     ends = [np.stack([np.min(each, axis=0), np.max(each, axis=0)]) for each in (points, surface)]
@@ -44,14 +44,19 @@ def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: s
         ("--reference-unit", reference_unit, sizes[0] / sizes[1], "reference"),
     ):
         for name, metres in METRES.items():
-            factor = metres / METRES[other]
+            factor = metres / METRES[other or "m"]
             if (factor < 0.1 or (apart and factor < 1)) and 1 / _ALIKE < ratio / factor < _ALIKE:
                 raise InputError(
                     f"the points span {sizes[0]:.4g} m and the reference {sizes[1]:.4g} m, as if the {named} were in {name}",
-                    where=where, remedy=f"say {flag} {name} if so",
+                    where=where, remedy=f"say {flag} {_choices(name)} if so",
                 )  # fmt: skip
     away = float(np.linalg.norm(ends[0].mean(axis=0) - ends[1].mean(axis=0)))
     if apart and away > 3 * sum(sizes):
         raise InputError(
             f"the points lie {away:,.0f} m from the reference", where=where, remedy="export both in one coordinate system (m)"
         )
+
+
+def _choices(unit: str) -> str:
+    """The units that are as good as one as long, to be chosen by who knows the survey."""
+    return "ft (international foot) or us-ft (US survey foot)" if unit in ("ft", "us-ft") else unit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.common.errors import InputError
+from scene.common.number_rows import RowForm, read_rows, split_row
 from scene.common.regular_file import bounded_lines, check_file
 
 _LONGEST_HEADER = 65536
@@ -43,9 +45,14 @@ def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
         with path.open("rb") as file:
             order, elements = _header(file)
             wanted = itertools.islice(elements, _last(elements, only))
-            return {element.name: _columns(file, element, order) for element in wanted}
+            found = {element.name: _columns(file, element, order) for element in wanted}
+            if len(found) == len(elements):
+                _check_end(file, elements, order)
+            return found
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
+    except InputError as error:  # of a row of numbers
+        raise InputError(error.what, where=f"{path}, {error.where}", allowed=error.allowed, remedy=error.remedy) from None
     except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise InputError(f"is not a whole PLY file ({error})", where=str(path), remedy="export it again") from None
 
@@ -78,7 +85,7 @@ def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
 
 
 def _header_lines(file: BinaryIO) -> Iterator[list[str]]:
-    if file.readline(16).strip() != b"ply":
+    if file.readline(16).removeprefix(codecs.BOM_UTF8).strip() != b"ply":
         raise ValueError("it does not begin with 'ply'")
     while (line := file.readline(_LONGEST_HEADER)).strip() != b"end_header":
         if not line.endswith(b"\n") or file.tell() > _LONGEST_HEADER:
@@ -127,7 +134,12 @@ def _fields(element: _Element, order: str, lengths: Mapping[str, int]) -> list[A
 
 
 def _ascii_rows(file: BinaryIO, element: _Element) -> NDArray[Any]:
-    table = np.loadtxt(bounded_lines(file, element.count), ndmin=2, comments=None, encoding="ascii")
+    start = file.tell()
+    try:
+        table = np.loadtxt(bounded_lines(file, element.count), ndmin=2, comments=None, encoding="ascii")
+    except ValueError:  # its words are about NumPy, not about the file
+        file.seek(start)
+        table = _rows_by_line(file, element)
     if len(table) < element.count:
         raise ValueError(f"{len(table):,} of {element.count:,} {element.name} lines")
     lengths, column = {}, 0
@@ -137,6 +149,29 @@ def _ascii_rows(file: BinaryIO, element: _Element) -> NDArray[Any]:
         column += lengths.get(name, 0) + 1
     rows = np.empty(len(table), dtype=_fields(element, "<", lengths))
     return _filled(rows, table)
+
+
+def _rows_by_line(file: BinaryIO, element: _Element) -> NDArray[np.float64]:
+    """The same line by line, which says where it is wrong: the line counts from the first one of the element."""
+    lines = [line.decode("ascii", errors="replace") for line in bounded_lines(file, element.count)]
+    width = len(split_row(lines[0], None)) if lines else 0
+    return read_rows(lines, RowForm(columns=width), f"the {element.name} lines")[0]
+
+
+def _check_end(file: BinaryIO, elements: list[_Element], order: str) -> None:
+    """Raise ValueError where more stands behind the last element than its count says."""
+    last = elements[-1] if elements else None
+    if last is None:
+        return
+    if not order:
+        more = sum(bool(line.strip()) for line in file)
+        if more:
+            raise ValueError(f"{last.count:,} {last.name} lines are stated, and {more:,} more follow")
+        return
+    size = sum(np.dtype(counter or kind).itemsize for kind, counter in last.properties.values())
+    left = _size(file) - file.tell()
+    if size and left >= size:
+        raise ValueError(f"{last.count:,} {last.name} records are stated, and {left:,} bytes of more follow")
 
 
 def _filled(rows: NDArray[Any], table: NDArray[np.float64]) -> NDArray[Any]:

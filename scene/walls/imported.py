@@ -14,6 +14,7 @@ from pydantic import Field, field_validator
 
 from scene.common.config import Config
 from scene.common.errors import InputError, nearest
+from scene.common.lengths import METRES
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
 from scene.meshes.cleaning import clean, drop_unused, flipped
@@ -21,7 +22,6 @@ from scene.meshes.ply import read_elements
 from scene.meshes.rounding import check_rounding
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it cannot do comes as an exception, or is a texture
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
 """A wall smaller or larger than this is likely to be in another unit."""
 _FARTHEST_M = 1e8
@@ -44,7 +44,7 @@ class ImportedWall(Config):
     mesh: Path | tuple[Path, ...] = Field(
         description="mesh file (ply, obj, stl, off, glb, ...), or a list of files that make up the scene; in survey coordinates"
     )
-    unit: Literal["m", "cm", "mm", "ft"] = Field("m", description="of the file's coordinates")
+    unit: Literal["m", "cm", "mm", "ft", "us-ft"] = Field("m", description="of the file's coordinates")
     flipped: bool = Field(
         False,
         description="the file's triangles are clockwise seen from the sensors' side; told by itself where the sensor's place is "
@@ -88,7 +88,7 @@ class ImportedWall(Config):
     def _check_extent(self, mesh: TriangleMesh, where: str) -> None:
         extent = _extent(mesh)
         if not _SMALLEST_M <= extent <= _LARGEST_M:
-            likely = [unit for unit, metres in _METRES.items() if 2 <= extent / _METRES[self.unit] * metres <= 1000]
+            likely = [unit for unit, metres in METRES.items() if 2 <= extent / METRES[self.unit] * metres <= 1000]
             remedy = f"set `unit` to {' or '.join(likely)} if that is the file's unit" if likely else "check the file"
             raise InputError(
                 f"the wall is {extent:.4g} m in size with `unit: {self.unit}`",
@@ -130,7 +130,7 @@ def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...
 
     Raises InputError where the file cannot be read, and for coordinates that are not finite, no place on earth or rounded away.
     """
-    where, metres = str(path), _METRES[unit]
+    where, metres = str(path), METRES[unit]
     mesh = _read(path)
     _check_coordinates(mesh, metres, where)
     turned = ("y is up in glTF: turned so that z is",) if _format(path) in _Y_UP else ()

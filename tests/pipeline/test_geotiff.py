@@ -171,7 +171,7 @@ def test_what_programs_write_for_no_data_is_no_height(tmp_path: Path, value: flo
     assert np.isnan(raster.values[5:20, 5:20]).all()
     assert np.isnan(raster.values).sum() == 225
     assert raster.notes == (f"225 pixels of {value:g} are taken for pixels without data, though the file does not say so",)
-    reference = from_dem(tmp_path / "a.tif", "m")
+    reference = from_dem(tmp_path / "a.tif")
     assert reference.mesh.bounds[0, 2] == HEIGHTS.min()
     assert raster.notes[0] in reference.words
 
@@ -199,11 +199,11 @@ def test_a_mask_scale_and_offset_of_gdal_are_applied(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("crs", "metres"), [("EPSG:2225", 1200 / 3937), ("EPSG:2222", 0.3048)])
 def test_a_model_in_feet_becomes_metres(tmp_path: Path, crs: str, metres: float) -> None:
     """State planes in US survey feet and in international feet: 5,400,030 ft differ by 3.3 m."""
-    reference = from_dem(_gdal(tmp_path / "a.tif", crs=crs), "m")
+    reference = from_dem(_gdal(tmp_path / "a.tif", crs=crs))
     centre = (CORNER[0] + SIDE / 2) * metres, (CORNER[1] - SIDE / 2) * metres, float(HEIGHTS[0, 0]) * metres
     np.testing.assert_allclose(reference.mesh.vertices[0], centre, rtol=1e-9)
     assert any("which were converted to metres" in words for words in reference.words)
-    with pytest.raises(InputError, match=r"the file states .*ft and --unit is mm"):
+    with pytest.raises(InputError, match=r"states its unit, .*ft.*, and --unit says mm"):
         from_dem(tmp_path / "a.tif", "mm")
 
 

@@ -26,13 +26,13 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.e57 import E57Scan, write_e57
 from pipeline.formats.points.laz import PulseChannels, write_laz
 from pipeline.formats.points.points import read_points
-from pipeline.formats.points.ptx import read_ptx
+from pipeline.formats.points.ptx import orthonormal, read_ptx
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.measurement.build import build
 from pipeline.measurement.origin import from_order
 from pipeline.measurement.request import Request
-from pipeline.measurement.scans import orthonormal, read_scans
+from pipeline.measurement.scans import read_scans
 from pipeline.surface.triangulation import triangulated
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -401,7 +401,7 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "another place": (move(lambda points: points + UTM), "export both in one coordinate system"),
     "behind the scanner": (move(lambda points: 2 * POSITION - points), "export both|in a direction in which"),
     "position of two numbers": (asked("--position", "1,2"), "3 numbers between commas"),
-    "no such unit": (asked("--unit", "inch"), "allowed: m, cm, mm, ft"),
+    "no such unit": (asked("--unit", "inch"), "allowed: m, cm, mm, ft, us-ft"),
     "columns": (asked("--columns", "x,y"), "has 4 columns, named x, y"),
     "second scan of one": (asked("--scan", "2"), "allowed: 1 to 1"),
 }  # fmt: skip

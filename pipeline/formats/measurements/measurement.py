@@ -357,7 +357,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
             check_pixels(cameras.left, each, name)
     said = [(reference, (*material.notes, words))]
     for name, each in zip(material.points, clouds, strict=True):
-        said.append((name, _rounding(each.points, config, material, name)))
+        said.append((name, (*each.notes, *_rounding(each.points, config, material, name))))
     cloud = joined(clouds, SCAN if config.scanners else "epoch")
     found = _of_sensor(
         config,

@@ -6,9 +6,10 @@ pose beside them. What E57 has no field for (channels of truth) is not written.
 
 from __future__ import annotations
 
+import struct
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from pye57 import libe57
 
 from pipeline.formats.files.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.units import not_understood, understood_crs, units_of_crs
 from scene.common.errors import InputError
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import FloatArray
@@ -25,6 +27,10 @@ from scene.geometry.mesh import FloatArray
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+"""1: the direction is valid, the distance is not; 2: nothing is."""
+_INVALID_INTENSITY = "isIntensityInvalid"
+_SIGNATURE, _HEADER_BYTES, _LENGTH_AT = b"ASTM-E57", 48, 16
+"""Of the header: its first bytes, its length, and where the length of the whole file stands."""
 _TYPES = {
     "intensity": "f", "timeStamp": "d", "rowIndex": "q", "columnIndex": "q", "returnIndex": "q", "returnCount": "q",
     "colorRed": "H", "colorGreen": "H", "colorBlue": "H",
@@ -55,7 +61,7 @@ class E57Scan:
     def placed(self) -> PointCloud:
         """The cloud in the file's frame."""
         points = np.einsum("ij,nj->ni", self.rotation, self.cloud.points) + self.position
-        return PointCloud(points, self.cloud.intensity, self.cloud.gps_time, self.cloud.extra)
+        return replace(self.cloud, points=points)
 
 
 def write_e57(path: Path, scans: Sequence[E57Scan]) -> None:
@@ -74,57 +80,120 @@ def write_e57(path: Path, scans: Sequence[E57Scan]) -> None:
 
 
 def read_e57(path: Path) -> list[E57Scan]:
-    """Read all scans; points that their scan marks as invalid are left out.
+    """Read all scans; records that their scan marks as invalid are left out.
 
-    Raises InputError for a missing or damaged file and one without points.
+    Raises InputError for a missing or damaged file, one without points, and a coordinate system that is not in metres.
     """
-    check_file(path)
+    where = str(check_file(path))
+    _check_length(path)
     try:
-        image = libe57.ImageFile(str(path), "r")
+        image = libe57.ImageFile(where, "r")
         try:
-            nodes = image.root()["data3D"]
-            scans = [_read_scan(image, nodes[number], number) for number in range(len(nodes))]
+            root = image.root()
+            notes = _check_metres(root, where)
+            nodes = root["data3D"] if root.isDefined("data3D") else ()
+            scans = [_read_scan(image, nodes[number], number, where) for number in range(len(nodes))]
         finally:
             image.close()
     except (libe57.E57Exception, RuntimeError, ValueError, KeyError) as error:
-        problem = " ".join(str(error).split())[:200]
-        raise InputError(f"is not a whole E57 file ({problem})", where=str(path), remedy="export it again") from None
+        if isinstance(error, InputError):
+            raise
+        problem = f"is damaged: its {_part_of(error)} cannot be read"
+        raise InputError(problem, where=where, remedy="copy the file again from where it is whole, or export it again") from None
     if not any(len(scan.cloud.points) for scan in scans):
-        raise InputError("holds no points", where=str(path))
-    return scans
+        problem = "holds no scans" if not scans else "holds no points: all records are marked as invalid, or there are none"
+        raise InputError(problem, where=where, remedy="export it again, with its points")
+    return [replace(scan, cloud=scan.cloud.noted(*notes)) for scan in scans]
 
 
 # --- reading
 
 
-def _read_scan(image: Any, node: Any, number: int) -> E57Scan:
-    columns = _read_columns(image, node["points"])
+def _check_length(path: Path) -> None:
+    """Raise InputError for a file that is no E57, or shorter than its header states."""
+    with path.open("rb") as file:
+        start = file.read(_HEADER_BYTES)
+    size, where = path.stat().st_size, str(path)
+    if not start.startswith(_SIGNATURE):
+        begins = f"begins with {start[:8]!r}, not with {_SIGNATURE!r}" if start else "is empty"
+        problem = f"is not a whole E57 file: it {begins}"
+        raise InputError(problem, where=where, remedy="export it as E57, or give it the suffix of its format")
+    stated = struct.unpack_from("<Q", start, _LENGTH_AT)[0] if len(start) == _HEADER_BYTES else _HEADER_BYTES
+    if size < stated:
+        problem = f"is not a whole E57 file: its header states {stated:,} bytes, and it has {size:,}"
+        raise InputError(problem, where=where, remedy="the file was cut off: copy or export it again")
+
+
+def _check_metres(root: Any, where: str) -> tuple[str, ...]:
+    """A note on a coordinate system that is not understood.
+
+    Raises InputError where its unit is none that E57 has: the standard's lengths are metres.
+    """
+    text = root["coordinateMetadata"].value().strip() if root.isDefined("coordinateMetadata") else ""
+    if not text:
+        return ()
+    crs = understood_crs(text)
+    if crs is None:
+        return (not_understood(text, where),)
+    units = units_of_crs(crs, where)
+    if units is not None and not units.in_metres:
+        raise InputError(
+            f"states {units.source}, whose unit is {units.name}, and E57 files hold metres", where=where,
+            remedy="export it with a coordinate system in metres, or as LAS with the one it has",
+        )  # fmt: skip
+    return ()
+
+
+def _part_of(error: Exception) -> str:
+    """Which part of the file is damaged, by libE57Format's words."""
+    text = str(error).lower()
+    parts = {"checksum": "pages (a checksum does not agree)", "crc": "pages (a checksum does not agree)", "xml": "header in XML"}
+    return next((part for word, part in parts.items() if word in text), "points")
+
+
+def _read_scan(image: Any, node: Any, number: int, where: str) -> E57Scan:
+    name = node["name"].value() if node.isDefined("name") else f"scan {number}"
+    columns, unread = _read_columns(image, node["points"], f"{where} ({number + 1}: {name})")
     valid = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
-    for name in _INVALID:
-        valid &= columns.pop(name) == 0 if name in columns else True
+    for state in _INVALID:
+        valid &= columns.pop(state) == 0 if state in columns else True
     if not valid.all():
-        columns = {name: column[valid] for name, column in columns.items()}
-    points = _points(columns)
+        columns = {field: column[valid] for field, column in columns.items()}
+    notes = [f"{int((~valid).sum()):,} records that the file marks as invalid are left out"] if not valid.all() else []
+    notes += [f"fields that are not read: {', '.join(unread)}"] if unread else []
     cloud = PointCloud(
-        points=points,
-        intensity=columns.get("intensity"),
+        points=_points(columns, where),
+        intensity=_intensity(columns),
         gps_time=columns.get("timeStamp"),
-        extra={label: columns[name].astype(np.int32) for name, label in _NAMES.items() if name in columns},
+        extra={label: columns[field].astype(np.int32) for field, label in _NAMES.items() if field in columns},
+        notes=tuple(notes),
     )
     position, rotation = _pose(node)
-    return E57Scan(node["name"].value() if node.isDefined("name") else f"scan {number}", cloud, position, rotation)
+    return E57Scan(name, cloud, position, rotation)
 
 
-def _read_columns(image: Any, points: Any) -> dict[str, NDArray[Any]]:
-    """The fields of a scan's points, read in pieces: memory is taken for what is there, not for what is said to be."""
+def _intensity(columns: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
+    """The intensity, NaN where the file marks it as invalid; None where it does so throughout."""
+    intensity, invalid = columns.get("intensity"), columns.pop(_INVALID_INTENSITY, None)
+    if intensity is None or invalid is None or not invalid.any():
+        return intensity
+    return None if invalid.all() else np.where(invalid == 0, intensity, np.float32(np.nan))
+
+
+def _read_columns(image: Any, points: Any, where: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """The fields of a scan's points, and the names of those that are not read.
+
+    They are read in pieces: memory is taken for what is there, not for what is said to be. Raises InputError where that differs.
+    """
     count = points.childCount()
     prototype = libe57.StructureNode(points.prototype())
     fields = {prototype[number].elementName() for number in range(prototype.childCount())}
-    types = dict.fromkeys(_CARTESIAN + _SPHERICAL, "d") | dict.fromkeys(_INVALID, "b") | _TYPES
-    piece = min(count, _PIECE)
+    types = dict.fromkeys(_CARTESIAN + _SPHERICAL, "d") | dict.fromkeys((*_INVALID, _INVALID_INTENSITY), "b") | _TYPES
+    unread = sorted(fields - set(types))
+    piece = max(min(count, _PIECE), 0)
     columns = {name: np.empty(piece, dtype=kind) for name, kind in types.items() if name in fields}
     if count <= 0:
-        return columns
+        return columns, unread
     pieces: list[dict[str, NDArray[Any]]] = []
     reader = points.reader(_buffers(image, columns, piece))
     while read := reader.read():
@@ -132,16 +201,20 @@ def _read_columns(image: Any, points: Any) -> dict[str, NDArray[Any]]:
     reader.close()
     found = sum(len(next(iter(each.values()), ())) for each in pieces)
     if found != count:
-        raise ValueError(f"{found:,} points, where it says {count:,}")
-    return {name: np.concatenate([each[name] for each in pieces]) for name in columns}
+        raise InputError(
+            f"holds {found:,} points, where it says {count:,}", where=where,
+            remedy="copy the file again from where it is whole, or export it again",
+        )  # fmt: skip
+    return {name: np.concatenate([each[name] for each in pieces]) for name in columns}, unread
 
 
-def _points(columns: dict[str, NDArray[Any]]) -> FloatArray:
+def _points(columns: dict[str, NDArray[Any]], where: str) -> FloatArray:
     """(n, 3) Cartesian points, m; spherical ones have an elevation above the horizon, not a zenith angle."""
     if all(name in columns for name in _CARTESIAN):
         return np.stack([columns[name] for name in _CARTESIAN], axis=1)
     if not all(name in columns for name in _SPHERICAL):
-        raise ValueError("points without coordinates")
+        problem, allowed = "has points without coordinates", "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation"
+        raise InputError(problem, where=where, allowed=allowed, remedy="export it again, with its coordinates")
     distance, azimuth, elevation = (columns[name] for name in _SPHERICAL)
     level = distance * np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)

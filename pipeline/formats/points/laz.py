@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.formats.files.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.las_statements import check_box, check_counts, flagged, stated_units
 from scene.common.errors import InputError
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import FloatArray
@@ -29,6 +30,9 @@ _LARGEST = 2**31 - 1
 _USER, _FULL_SCALE_RECORD = "scarpsim", 1
 _MOST_RETURNS = 15
 _SCAN_ANGLE_STEP = math.radians(0.006)
+_FURTHER = ("classification", "user_data", "point_source_id", "scanner_channel", "red", "green", "blue", "nir")
+"""Fields of LAS that are kept as channels, where any point has one above zero."""
+_COPY = "copy the file again from where it is whole, or export it again"
 EXACT_INTENSITY = "intensity_relative"
 """An extra dimension of this name is read as the intensity, in place of the 16-bit field."""
 
@@ -119,31 +123,52 @@ def read_laz(path: Path) -> PointCloud:
 
     Intensity is relative received power: of files of ours on the scale they hold, of others as counts / 65535. Intensity and
     GPS time that are zero throughout count as not recorded. Where there are several returns of a pulse, or scan angles, the extra
-    channels `return_number` and `number_of_returns`, or `scan_angle_rad` (from straight down), hold them. Raises InputError for a
-    missing, truncated or foreign file.
+    channels `return_number` and `number_of_returns`, or `scan_angle_rad` (from straight down), hold them. Points that the file
+    has withheld or classified as noise are left out, with a note; `stated_units` is what its coordinate system says. Raises
+    InputError for a missing, truncated or foreign file, and a header that the points contradict.
     """
-    check_file(path)
+    where = str(check_file(path))
     try:
         _check_extent(path)
         las = laspy.read(path)
+    except InputError:
+        raise
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
+        raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the path") from None
     except (laspy.LaspyException, LazrsError, ValueError, struct.error, MemoryError, OverflowError) as error:
-        raise InputError(f"is not a whole LAS or LAZ file ({_line(error)})", where=str(path), remedy="export it again") from None
+        raise _damaged(path, error) from None
     if len(las.points) < las.header.point_count:
         problem = f"holds {len(las.points):,} of the {las.header.point_count:,} points it announces"
-        raise InputError(problem, where=str(path), remedy="export it again")
+        raise InputError(problem, where=where, remedy=_COPY)
     _check_quantisation(las.header, path)
+    units, notes = stated_units(las.header, where)
     extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names} | _standard_channels(las)
     counts = las.points.array["intensity"]
     intensity = counts.astype(np.float32) * np.float32(_stored_full_scale(las.header) / _COUNTS) if counts.any() else None
     timed = "gps_time" in las.point_format.dimension_names and np.any(las.points.array["gps_time"])
-    return PointCloud(
-        points=np.ascontiguousarray(las.xyz),
+    points = np.ascontiguousarray(las.xyz)
+    left_out, words = flagged(las)
+    cloud = PointCloud(
+        points=points,
         intensity=extra.pop(EXACT_INTENSITY, intensity),
         gps_time=np.array(las.points.array["gps_time"]) if timed else None,
         extra=extra,
+        notes=(*notes, *check_box(las.header, points, where), *words),
+        stated_units=units,
     )
+    return cloud.part(~left_out) if left_out.any() else cloud
+
+
+def _damaged(path: Path, error: BaseException) -> InputError:
+    """The error for a file that laspy or lazrs cannot read: what of it is wrong, in place of the library's words."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start != b"LASF":
+        problem = f"is no LAS or LAZ file: it begins with {start!r}, not with b'LASF'" if start else "is empty"
+        return InputError(problem, where=str(path), remedy="export it as LAS or LAZ, or give it the suffix of its format")
+    told = f" ({error})" if type(error) is ValueError else ""
+    problem = f"is not a whole LAS or LAZ file{told}: its header is there, and what it announces is not, or is damaged"
+    return InputError(problem, where=str(path), remedy=_COPY)
 
 
 def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
@@ -155,11 +180,14 @@ def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
 
 
 def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
-    """Returns and scan angles, where any were recorded; point formats below 6 hold angles in degrees."""
-    channels = {}
+    """Returns, scan angles and the like, where any were recorded; point formats below 6 hold angles in degrees."""
+    channels: dict[str, NDArray[Any]] = {}
+    for field in _FURTHER:
+        if field in las.point_format.dimension_names and np.any(values := np.asarray(las[field])):
+            channels[field] = np.array(values)
     count = np.asarray(las["number_of_returns"], dtype=np.uint8)
     if np.any(count > 1):
-        channels = {"return_number": np.asarray(las["return_number"], dtype=np.uint8), "number_of_returns": count}
+        channels |= {"return_number": np.asarray(las["return_number"], dtype=np.uint8), "number_of_returns": count}
     name, step = ("scan_angle", _SCAN_ANGLE_STEP) if las.point_format.id >= 6 else ("scan_angle_rank", math.radians(1.0))
     angle = np.asarray(las[name])
     return channels | ({"scan_angle_rad": angle * step} if np.any(angle) else {})
@@ -173,9 +201,10 @@ def _check_extent(path: Path) -> None:
         header = laspy.LasHeader.read_from(file)
         if path.stat().st_size < header.offset_to_point_data:
             raise ValueError("cut off within the header")
+        check_counts(header, path)
         if not header.are_points_compressed:
             return
-        _check_chunk_size(header)
+        chunk = _check_chunk_size(header)
         file.seek(header.offset_to_point_data)
         (table,) = struct.unpack("<q", file.read(8))
         if table < 0:  # written as a stream: the place of the table stands at the end
@@ -183,7 +212,7 @@ def _check_extent(path: Path) -> None:
             (table,) = struct.unpack("<q", file.read(8))
         file.seek(table + 4)
         (chunks,) = struct.unpack("<I", file.read(4))
-        if chunks > header.point_count:
+        if chunks > header.point_count or (chunk and chunks != -(-header.point_count // chunk)):
             raise ValueError(f"{chunks:,} chunks for {header.point_count:,} points")
 
 
@@ -195,12 +224,17 @@ def _check_records(start: bytes, size: int) -> None:
         raise ValueError(f"{count + extended:,} records in {size:,} bytes")
 
 
-def _check_chunk_size(header: laspy.LasHeader) -> None:
-    """Raise ValueError for chunks far larger than any program makes: lazrs takes the memory of a whole one, or aborts."""
+def _check_chunk_size(header: laspy.LasHeader) -> int:
+    """The points of a chunk, 0 where that varies or is not said.
+
+    Raises ValueError for chunks far larger than any program makes: lazrs takes the memory of a whole one, or aborts.
+    """
     for record in header.vlrs.get("LasZipVlr"):
         (size,) = struct.unpack_from("<I", record.record_data, _CHUNK_SIZE_AT)
         if max(header.point_count, _LARGEST_CHUNK) < size < _VARIABLE_CHUNKS:
             raise ValueError(f"chunks of {size:,} points for {header.point_count:,} points")
+        return 0 if size == _VARIABLE_CHUNKS else int(size)
+    return 0
 
 
 def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.LasHeader:
@@ -264,7 +298,3 @@ def _stored_full_scale(header: laspy.LasHeader) -> float:
         if record.user_id == _USER and record.record_id == _FULL_SCALE_RECORD:
             return float(struct.unpack("<d", record.record_data)[0])
     return 1.0
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

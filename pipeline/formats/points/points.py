@@ -1,16 +1,20 @@
-"""Point clouds of any format, told by the file's suffix."""
+"""Point clouds of any format, told by the file's suffix: the one door through which every command and function reads points."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.formats.meshes.ply import read_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.fillers import without_fillers
 from pipeline.formats.points.laz import read_laz
-from pipeline.formats.points.ptx import PtxScan, read_ptx
+from pipeline.formats.points.ptx import orthonormal, read_ptx
 from pipeline.formats.points.xyz import read_xyz
+from pipeline.formats.units import AxisUnits, agreed_units
 from scene.common.errors import InputError
 from scene.common.plug_ins import plugged
 from scene.common.regular_file import check_file
@@ -20,24 +24,68 @@ PLUG_INS = "scarpsim.readers"
 """The group of entry points by which other packages add readers: named like the suffix, without its dot."""
 TEXT = (".xyz", ".txt", ".asc", ".csv", ".pts")
 SUFFIXES = (".laz", ".las", ".ply", ".e57", ".ptx", *TEXT)
-
-
 _LARGEST_M = 1e8
 """No coordinate system of a survey reaches farther, not even one with its origin in the middle of the Earth."""
 
 
-def read_points(path: Path) -> PointCloud:
-    """Read a point cloud; the points of an E57 file are put into the file's frame by the poses in it.
+@dataclass(frozen=True)
+class PlacedScan:
+    """One scan of a file. cloud: points in the file's frame; position: (3,) and rotation: (3, 3), scanner to the file's frame,
+    None where the file does not say."""
 
-    An E57 file of several scans gives one cloud, with the number of the scan as extra channel `scan`. Points may be NaN or
-    infinite, as some programs write what did not return. Raises InputError for a format that is not known, whatever is wrong in
-    the file, and coordinates that are none.
+    name: str
+    cloud: PointCloud
+    position: FloatArray | None = None
+    rotation: FloatArray | None = None
+
+    def in_metres(self, units: AxisUnits) -> PlacedScan:
+        """The scan out of a file with these units."""
+        if units.in_metres:
+            return replace(self, cloud=replace(self.cloud, stated_units=None))
+        factors = units.factors()
+        note = f"the coordinates were converted from {units.name} by {units.source}"
+        cloud = replace(self.cloud, points=self.cloud.points * factors, stated_units=None).noted(note)
+        position = None if self.position is None else self.position * factors
+        return replace(self, cloud=cloud, position=position)
+
+
+def read_points(path: Path) -> PointCloud:
+    """Read a point cloud; the points of E57 and PTX files are put into the file's frame by the poses in it.
+
+    A file of several scans gives one cloud, with the number of the scan as extra channel `scan`. Points may be NaN or
+    infinite, as some programs write what did not return. Raises InputError as `read_placed_scans` does.
     """
-    cloud = _read(check_file(path))
-    if not len(cloud.points):
-        raise InputError("holds no points", where=str(path), remedy="export it again")
-    check_reach(cloud.points, str(path))
-    return cloud
+    return joined([scan.cloud for scan in read_placed_scans(path)])
+
+
+def read_placed_scans(
+    path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit"
+) -> list[PlacedScan]:
+    """Read all scans of a file, in metres and without the records that stand for no return.
+
+    Parameters
+    ----------
+    path : of a format in SUFFIXES, or one that another package reads
+    unit : of the coordinates, a key of METRES; None: as the file states, metres where it states none
+    columns : a name for each column of a text file, in place of the file's own
+    option : by which the user gives the unit, for errors
+
+    Raises
+    ------
+    InputError
+        For a format that is not known, whatever is wrong in the file, a unit that the file contradicts, and coordinates that are
+        none.
+    """
+    where = str(check_file(path))
+    scans = _read(path, columns)
+    if not any(len(scan.cloud.points) for scan in scans):
+        raise InputError("holds no points", where=where, remedy="export it again, with its points")
+    found = []
+    for scan in scans:
+        units = agreed_units(scan.cloud.stated_units, unit, where, option)
+        found.append(scan.in_metres(units))
+        check_reach(found[-1].cloud.points, where)
+    return found
 
 
 def check_reach(points: FloatArray, where: str) -> None:
@@ -51,19 +99,26 @@ def check_reach(points: FloatArray, where: str) -> None:
         )  # fmt: skip
 
 
-def _read(path: Path) -> PointCloud:
-    suffix = path.suffix.lower()
+def _read(path: Path, columns: Sequence[str]) -> list[PlacedScan]:
+    """The scans in the file's unit, without fillers."""
+    suffix, where = path.suffix.lower(), str(path)
+    if suffix == ".e57":
+        return _read_e57(path)
+    if suffix == ".ptx":
+        return _read_ptx(path)
     if suffix in TEXT:
-        return read_xyz(path)
-    match suffix:
-        case ".laz" | ".las":
-            return read_laz(path)
-        case ".ply":
-            return read_ply_points(path)
-        case ".e57":
-            return _read_e57(path)
-        case ".ptx":
-            return joined([placed(scan) for scan in read_ptx(path)])
+        cloud = read_xyz(path, columns)
+    elif suffix in (".laz", ".las"):
+        cloud = read_laz(path)
+    elif suffix == ".ply":
+        cloud = read_ply_points(path)
+    else:
+        cloud = _read_plugged(path)
+    return [PlacedScan(path.name, without_fillers(cloud, where))]
+
+
+def _read_plugged(path: Path) -> PointCloud:
+    """A cloud of a format that another package reads."""
     further = plugged(PLUG_INS, "a function of a path that returns a PointCloud", callable, [each[1:] for each in SUFFIXES])
     reader = further.get(path.suffix.lower()[1:])
     if reader is None:
@@ -75,16 +130,30 @@ def _read(path: Path) -> PointCloud:
     return cloud
 
 
-def _read_e57(path: Path) -> PointCloud:
+def _read_e57(path: Path) -> list[PlacedScan]:
     from pipeline.formats.points.e57 import read_e57  # the library takes a tenth of a second to load
 
-    return joined([scan.placed for scan in read_e57(path)])
+    found = []
+    for number, scan in enumerate(read_e57(path), start=1):
+        name = f"{path.name} ({number}: {scan.name})"
+        scan = replace(scan, cloud=without_fillers(scan.cloud, name, grid=True))
+        if not scan.position.any() and np.array_equal(scan.rotation, np.eye(3)):  # what programs write that know no pose
+            found.append(PlacedScan(name, scan.cloud.noted("its header holds no pose, or that of the file's own frame")))
+        else:
+            cloud = scan.placed.noted("position and rotation are from the E57 header")
+            found.append(PlacedScan(name, cloud, scan.position, scan.rotation))
+    return found
 
 
-def placed(scan: PtxScan) -> PointCloud:
-    """The cloud of a PTX scan in the file's world frame."""
-    points = np.einsum("ij,nj->ni", scan.rotation, scan.cloud.points) + scan.position
-    return PointCloud(points, scan.cloud.intensity, None, scan.cloud.extra)
+def _read_ptx(path: Path) -> list[PlacedScan]:
+    found = []
+    for number, scan in enumerate(read_ptx(path), start=1):
+        rotation, words = orthonormal(scan.rotation, f"{path.name}, scan {number}")
+        name = f"{path.name} ({number})"
+        cloud = without_fillers(scan.cloud, name, grid=True).noted("position and rotation are from the PTX header", *words)
+        cloud = replace(cloud, points=np.einsum("ij,nj->ni", rotation, cloud.points) + scan.position)
+        found.append(PlacedScan(name, cloud, scan.position, rotation))
+    return found
 
 
 def joined(clouds: list[PointCloud]) -> PointCloud:
@@ -101,4 +170,5 @@ def joined(clouds: list[PointCloud]) -> PointCloud:
         intensity=np.concatenate(intensities) if len(intensities) == len(clouds) else None,
         gps_time=np.concatenate(times) if len(times) == len(clouds) else None,
         extra=extra,
+        notes=tuple(dict.fromkeys(note for cloud in clouds for note in cloud.notes)),
     )

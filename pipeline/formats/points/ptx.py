@@ -7,7 +7,7 @@ left: world = [x y z 1] M) and a line `x y z intensity [r g b]` for each cell, c
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -15,12 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.text_layout import encoding_of, form_of
 from scene.common.errors import InputError
+from scene.common.number_rows import RowForm, read_rows, split_row
 from scene.common.regular_file import bounded_lines, check_file
 from scene.geometry.mesh import FloatArray
 
 _LINES_BEFORE_POINTS = 10
 _LONGEST_LINE = 4096
+_CHANNELS = ("red", "green", "blue")
+_ALIKE_M, _ALIKE = 0.01, 1e-3
+"""Places, and axes, this near to each other are one pose with few digits."""
+_EXPORT = "copy or export the file again, whole"
 
 
 @dataclass(frozen=True)
@@ -33,43 +39,146 @@ class PtxScan:
     rotation: FloatArray
 
 
+@dataclass
+class _Lines:
+    """The open file and the number of lines that were read from it."""
+
+    file: TextIO
+    where: str
+    number: int = 0
+
+    def next(self) -> str:
+        self.number += 1
+        return self.file.readline(_LONGEST_LINE).strip()
+
+    @property
+    def here(self) -> str:
+        return f"{self.where}, line {self.number:,}"
+
+
 def read_ptx(path: Path) -> list[PtxScan]:
-    """Read all scans without their missing returns. Raises InputError for a missing, truncated or foreign file."""
-    check_file(path)
+    """Read all scans without their missing returns.
+
+    Raises InputError for a missing or truncated file, a grid that the lines do not fill, and a pose that contradicts itself.
+    """
+    where = str(check_file(path))
     try:
-        with path.open(encoding="ascii") as file:
-            scans = list(_scans(file))
+        with path.open(encoding=encoding_of(path), errors="replace") as file:
+            scans = list(_scans(_Lines(file, where)))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except (ValueError, IndexError) as error:
-        problem = " ".join(str(error).split())[:200]
-        raise InputError(f"is not a whole PTX file ({problem})", where=str(path), remedy="export it again") from None
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
+    if not scans:
+        raise InputError("holds no scans", where=where, remedy="export it again, with its points")
     if not any(len(scan.cloud.points) for scan in scans):
-        raise InputError("holds no points", where=str(path), remedy="export it again")
+        raise InputError("holds no points: all cells are missing returns", where=where, remedy="export it again, with its points")
     return scans
 
 
-def _scans(file: TextIO) -> Iterator[PtxScan]:
-    while first := file.readline(_LONGEST_LINE).strip():
-        header = [first, *(file.readline(_LONGEST_LINE) for _ in range(_LINES_BEFORE_POINTS - 1))]
-        columns, rows = (int(line) for line in header[:2])
+def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str, ...]]:
+    """The nearest rotation matrix to one with few digits, and a word where that changed more than rounding does.
+
+    Raises InputError where it is off by more than a hundredth, or turns left into right.
+    """
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
+    if off > 0.02 or np.linalg.det(rotation) < 0:
+        remedy = "rows must be orthonormal, determinant +1; give more digits"
+        raise InputError("the rotation is no rotation matrix", where=where, remedy=remedy)
+    left, _, right = np.linalg.svd(rotation)
+    words = (f"the rotation was off from orthonormal by {off:.1g} and is made so",) if off > 1e-6 else ()
+    return np.asarray(left @ right), words
+
+
+def _scans(lines: _Lines) -> Iterator[PtxScan]:
+    count = 0
+    while first := lines.next():
+        count += 1
+        columns, rows = _grid_size(first, lines, count), _grid_size(lines.next(), lines, count)
         if columns < 1 or rows < 1:
-            raise ValueError(f"a grid of {columns} x {rows}")
-        matrix = np.array([[float(word) for word in line.split()] for line in header[6:]])
-        if matrix.shape != (4, 4):
-            raise ValueError("no 4 x 4 matrix in the header")
-        yield _scan(_table(file, columns * rows), rows, matrix)
+            problem = f"has a grid of {columns} x {rows}"
+            raise InputError(problem, where=lines.here, allowed="1 x 1 and more", remedy=_EXPORT)
+        stated = np.array([_row(lines, 3) for _ in range(4)])
+        matrix = np.array([_row(lines, 4) for _ in range(4)])
+        _check_pose(stated, matrix, f"{lines.where}, scan {count}")
+        yield _scan(_table(lines, columns, rows, count), rows, matrix)
 
 
-def _table(file: TextIO, count: int) -> FloatArray:
-    table = np.loadtxt(bounded_lines(file, count), ndmin=2)
-    if len(table) < count or table.shape[1] < 4:
-        raise ValueError(f"{len(table):,} lines of {table.shape[1]} numbers, for {count:,} cells of x y z intensity")
+def _grid_size(text: str, lines: _Lines, count: int) -> int:
+    """A number of columns or rows. What stands in its place behind a scan is a cell too many."""
+    if text.isdecimal():
+        return int(text)
+    if count > 1:
+        problem = f"has more lines than the grid of scan {count - 1} has cells: '{text:.60}' is no header of a further scan"
+        raise InputError(problem, where=lines.here, remedy=_EXPORT)
+    problem = f"begins with '{text:.60}', where a PTX file has its number of columns, and rows"
+    raise InputError(problem, where=lines.here, remedy="export it as PTX, or give it the suffix of its format")
+
+
+def _row(lines: _Lines, count: int) -> list[float]:
+    """A line of so many numbers of the header."""
+    text = lines.next()
+    values, _ = read_rows([text or "-"], RowForm(None, "," in text, count, lines.number), lines.where)
+    return [float(value) for value in values[0]]
+
+
+def _check_pose(stated: FloatArray, matrix: FloatArray, where: str) -> None:
+    """Raise InputError where the scanner's place and axes (4, 3) are not those of the matrix (4, 4): the header says both.
+
+    Some programs leave one of the two at its default, the origin and the identity, which states nothing.
+    """
+    default = np.vstack([np.zeros(3), np.eye(3)])
+    other = np.vstack([matrix[3, :3], matrix[:3, :3]])
+    if np.array_equal(stated, default):
+        return
+    place, axes = np.abs(stated[0] - other[0]).max(), np.abs(stated[1:] - other[1:]).max()
+    if place > _ALIKE_M or axes > _ALIKE:
+        there, here = (" ".join(f"{value:.6g}" for value in each[0]) for each in (stated, other))
+        problem = f"states two poses of the scanner: its place is {there} in lines 3 to 6 of the header and {here} in its matrix"
+        raise InputError(problem, where=where, allowed="the same pose in both", remedy="export it again, registered")
+
+
+def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
+    """(columns * rows, k) the cells of a scan."""
+    cells, start, before = columns * rows, lines.file.tell(), lines.number
+    first = lines.next()
+    form = form_of([first], lines.number, lines.where) if first else RowForm(None, False, 4)
+    lines.file.seek(start)
+    try:
+        if form.decimal_comma or form.separator is not None:
+            raise ValueError("not plain")
+        table = np.loadtxt(bounded_lines(lines.file, cells), ndmin=2)
+    except ValueError:
+        lines.file.seek(start)
+        form = replace(form, first_line=before + 1, counts=False)
+        table, _ = read_rows(_cells(lines, cells, count), form, lines.where)
+    lines.number = before + cells
+    if len(table) < cells:
+        raise InputError(
+            f"scan {count} states {columns:,} x {rows:,} = {cells:,} cells and has {len(table):,} lines", where=lines.where,
+            remedy="the file was cut off, or its numbers of columns and rows are wrong: copy or export it again",
+        )  # fmt: skip
+    if table.shape[1] < 4:
+        problem = f"the cells of scan {count} have {table.shape[1]} values"
+        raise InputError(problem, where=lines.where, allowed="x y z intensity, and r g b", remedy=_EXPORT)
     return np.asarray(table, dtype=np.float64)
+
+
+def _cells(lines: _Lines, cells: int, count: int) -> Iterator[str]:
+    """The lines of a scan's cells; a line with one number is the header of the next scan, which comes too early."""
+    for number, line in enumerate(bounded_lines(lines.file, cells)):
+        words = split_row(line, None)
+        if len(words) == 1 and words[0].isdecimal():
+            problem = f"scan {count} states {cells:,} cells and has {number:,} lines before the next scan begins"
+            raise InputError(problem, where=lines.where, remedy=_EXPORT)
+        yield line
 
 
 def _scan(table: FloatArray, rows: int, matrix: FloatArray) -> PtxScan:
     cell = np.flatnonzero(np.any(table[:, :3] != 0, axis=1))
     extra: dict[str, NDArray[Any]] = {"row": (cell % rows).astype(np.int32), "column": (cell // rows).astype(np.int32)}
+    further = table[cell, 4:].T
+    names = _CHANNELS if len(further) == len(_CHANNELS) else [f"column_{number}" for number in range(5, 5 + len(further))]
+    extra |= {name: np.ascontiguousarray(values) for name, values in zip(names, further, strict=True)}
     cloud = PointCloud(table[cell, :3], intensity=table[cell, 3], extra=extra)
+    missing = len(table) - len(cell)
+    cloud = cloud.noted(f"{missing:,} of {len(table):,} cells without a return (0 0 0) are left out") if missing else cloud
     return PtxScan(cloud, matrix[3, :3], matrix[:3, :3].T)

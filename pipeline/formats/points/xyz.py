@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,35 +12,18 @@ from numpy.typing import NDArray
 
 from pipeline.formats.files.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.column_names import SKIPPED, Column, named_columns, understood, with_stated_units
+from pipeline.formats.points.text_layout import LONGEST_LINE, TextLayout, layout_of
+from pipeline.formats.units import AxisUnits
 from scene.common.errors import InputError
+from scene.common.number_rows import RowsFound, read_rows
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import FloatArray
 
 _CHUNK = 200_000
 """Points in memory as text at a time while writing."""
-_HEADER_LINES = 100
-_LONGEST_LINE = 65_536
-_COMMENT = ("#", "//")
 _SAMPLE = 10_000
 _COLOURS = ["red", "green", "blue"]
-SKIPPED = "-"
-"""A column of this name is left out."""
-_SYNONYMS = {
-    "e": "x", "east": "x", "easting": "x", "x_m": "x", "x[m]": "x", "n": "y", "north": "y", "northing": "y", "y_m": "y",
-    "y[m]": "y", "h": "z", "height": "z", "elevation": "z", "alt": "z", "z_m": "z", "z[m]": "z", "i": "intensity",
-    "reflectance": "intensity", "amplitude": "intensity", "scalar_intensity": "intensity", "r": "red", "g": "green", "b": "blue",
-    "time": "gps_time", "gpstime": "gps_time", "timestamp": "gps_time",
-}  # fmt: skip
-"""Words that programs write above a column, in lower case, and its name here."""
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """values: (n, k); names: of the k columns; told: whether the file names them, otherwise they are guessed."""
-
-    values: FloatArray
-    names: list[str]
-    told: bool
 
 
 def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
@@ -63,73 +44,131 @@ def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
 
 
 def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
-    """Read points; separators are spaces, tabs, commas or semicolons.
+    """Read the points of a text file.
 
-    columns: a name for each column, x, y and z among them; by default as `read_table` finds them. A line with nothing but a count
-    is passed over. Intensity is as the file has it. Raises InputError for a missing file and lines that are not numbers.
+    Encoding, separator, decimal mark and the names of the columns are found in the file (`layout_of`, `named_columns`). Without
+    names a fourth column is the intensity, of more whole numbers from 0 to 255 in threes are colours, and what is left alone
+    beside them is the intensity; others are `column_4`, `column_5` ...
+
+    Parameters
+    ----------
+    path : .xyz, .txt, .asc, .csv or .pts
+    columns : a name for each column, x, y and z among them, in place of the file's own
+
+    Returns
+    -------
+    The points in the file's unit, which `stated_units` holds where the names of the columns state it; `notes` say what was
+    guessed, converted and left out.
+
+    Raises
+    ------
+    InputError
+        For a missing file, a line that is no row of numbers, a count that the rows do not agree with, and names that do not fit.
     """
-    table = read_table(path)
-    names = list(columns) or table.names
-    if len(names) != table.values.shape[1] or not set("xyz") <= set(names):
-        raise InputError(
-            f"has {table.values.shape[1]} columns, named {', '.join(names)}", where=str(path),
-            allowed="a name for each, x, y and z among them", remedy="name them with --columns, as x,y,z,intensity",
-        )  # fmt: skip
-    channels = {name: np.ascontiguousarray(table.values[:, index]) for index, name in enumerate(names) if name != SKIPPED}
-    points = np.stack([channels.pop(name) for name in "xyz"], axis=1)
-    return PointCloud(points, channels.pop("intensity", None), channels.pop("gps_time", None), channels)
-
-
-def read_table(path: Path) -> TextTable:
-    """The numbers of a file and the names of its columns.
-
-    Names are taken from the last line before the numbers, behind `#` or `//` or bare, and other words for them understood
-    (Easting, H, Reflectance ...). Without names a fourth column is the intensity, of more whole numbers from 0 to 255 in threes
-    are colours, and what is left alone beside them is the intensity; others are `column_4`, `column_5` ...
-    """
-    check_file(path)
+    where = str(check_file(path))
     try:
         _check_lines(path)
-        before, names, separator = _layout(path)
-        values = np.loadtxt(path, delimiter=separator, skiprows=before, ndmin=2, comments=None, encoding="utf-8")
+        layout = layout_of(path)
+        values, found = _values(path, layout)
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except ValueError as error:
-        raise InputError(f"is not XYZ text ({_plain(error)})", where=str(path), remedy="one point a line: x y z ...") from None
-    if values.size == 0 or values.shape[1] < 3:
-        problem = "holds no points" if values.size == 0 else f"has {values.shape[1]} columns"
-        raise InputError(problem, where=str(path), remedy="one point a line: x y z ...")
-    understood = [_SYNONYMS.get(name, name) for name in names]
-    named = len(names) == values.shape[1] and set("xyz") <= set(understood) and len(set(understood)) == len(understood)
-    return TextTable(values, understood, True) if named else TextTable(values, _guessed_names(values), False)
+        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
+    _check_counts(len(values), layout, found, where)
+    given, notes = _columns(layout, values, columns, where)
+    if found.missing:
+        notes = (*notes, f"{found.missing:,} values are empty or no numbers")
+    if layout.form.decimal_comma:
+        notes = (*notes, "commas in numbers are taken as decimal marks")
+    return _cloud(values, given, notes)
+
+
+def _values(path: Path, layout: TextLayout) -> tuple[FloatArray, RowsFound]:
+    """The numbers of a file: by NumPy where it is plain, else line by line, which says where it is wrong."""
+    form, before = layout.form, layout.form.first_line - 1
+    if not form.decimal_comma:
+        try:
+            options: dict[str, Any] = {"delimiter": form.separator, "skiprows": before, "encoding": layout.encoding}
+            values = np.loadtxt(path, ndmin=2, comments=None, **options)
+            if values.shape[1] == form.columns:
+                return values, RowsFound()
+        except ValueError:
+            pass  # its words are about NumPy, not about the file
+    with path.open(encoding=layout.encoding, errors="replace") as file:
+        return read_rows(itertools.islice(file, before, None), form, str(path))
+
+
+def _check_counts(rows: int, layout: TextLayout, found: RowsFound, where: str) -> None:
+    """Raise InputError where a count in the file is not the number of rows behind it."""
+    first = rows - sum(count for _, count, _ in found.blocks)
+    for stated, count, place in ((layout.stated, first, where), *((s, n, f"{where}, line {at:,}") for s, n, at in found.blocks)):
+        if stated is not None and stated != count:
+            raise InputError(
+                f"states {stated:,} points and holds {count:,}", where=place,
+                remedy="the file was cut off or changed: copy or export it again; or correct or remove the line with the count",
+            )  # fmt: skip
+
+
+def _columns(
+    layout: TextLayout, values: FloatArray, given: Sequence[str], where: str
+) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+    """What the columns are: as given, as the file names them, or guessed; and notes on it."""
+    count = values.shape[1]
+    if given:
+        columns = understood(given, "--columns")
+        names = [column.name for column in columns]
+        if len(names) != count or not set("xyz") <= set(names):
+            raise InputError(
+                f"has {count} columns, named {', '.join(given)}", where=where,
+                allowed="a name for each, x, y and z among them", remedy="name them with --columns, as x,y,z,intensity",
+            )  # fmt: skip
+        return with_stated_units(columns, layout, where), ()
+    if count < 3:
+        raise InputError(f"has {count} columns", where=where, allowed="x y z and more", remedy="export x, y and z")
+    found = named_columns(layout, where)
+    if found.columns:
+        return found.columns, found.notes
+    guessed = _guessed_names(values)
+    note = f"the columns have no names and were taken for {', '.join(guessed)} (else: --columns)"
+    return tuple(map(Column, guessed)), (note, *found.notes)
+
+
+def _cloud(values: FloatArray, columns: Sequence[Column], notes: tuple[str, ...]) -> PointCloud:
+    """The cloud of a table: coordinates in the file's unit, other channels in the SI unit that the names state."""
+    channels = {column.name: _in_si(values[:, index], column) for index, column in enumerate(columns) if column.name != SKIPPED}
+    points = np.stack([channels.pop(name) for name in "xyz"], axis=1)
+    converted = [column for column in columns if column.name not in "xyz" and (column.factor != 1 or column.decibels)]
+    said = tuple(f"{column.name} was converted from {column.unit}" for column in converted)
+    return PointCloud(
+        points, channels.pop("intensity", None), channels.pop("gps_time", None), channels, (*notes, *said), _units(columns)
+    )  # fmt: skip
+
+
+def _in_si(values: FloatArray, column: Column) -> FloatArray:
+    if column.name in "xyz":
+        return values  # in metres with the pose and the user's word, by `read_scans_of`
+    if column.decibels:
+        return np.asarray(10 ** (values / 10))
+    return np.ascontiguousarray(values) if column.factor == 1 else values * column.factor
+
+
+def _units(columns: Sequence[Column]) -> AxisUnits | None:
+    """The unit that the names of x, y and z state, None where none does; an axis without one has that of the first with one."""
+    axes = {column.name: column for column in columns if column.name in "xyz"}
+    stated = [axes[name] for name in "xyz" if axes[name].unit]
+    if not stated:
+        return None
+    x, y, z = (axes[name].factor if axes[name].unit else stated[0].factor for name in "xyz")
+    return AxisUnits((x, y, z), "the names of its columns")
 
 
 def _check_lines(path: Path) -> None:
-    """Raise ValueError for a line so long that it cannot be one point: a reader would take it into memory as a whole."""
+    """Raise InputError for a line so long that it cannot be one point: a reader would take it into memory as a whole."""
     with path.open("rb") as file:
-        while len(part := file.read(_LONGEST_LINE)) == _LONGEST_LINE:
+        while len(part := file.read(LONGEST_LINE)) == LONGEST_LINE:
             if b"\n" not in part and b"\r" not in part:
-                raise ValueError(f"a line of more than {_LONGEST_LINE:,} bytes")
-
-
-def _layout(path: Path) -> tuple[int, list[str], str | None]:
-    """Lines before the first point, column names ([] where there are none), separator (None: white space)."""
-    names: list[str] = []
-    with path.open(encoding="utf-8") as file:
-        for number, line in enumerate(itertools.islice(file, _HEADER_LINES)):
-            words = re.split(r"[\s,;]+", line.strip().lstrip("#/").strip().lower())
-            if len(words) >= 3 and not line.lstrip().startswith(_COMMENT) and _is_number(words[0]):
-                return number, names, next((mark for mark in ",;" if mark in line), None)
-            names = words if len(words) >= 3 else names
-    raise ValueError(f"no line of numbers among the first {_HEADER_LINES}")
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+                raise InputError(
+                    f"has a line of more than {LONGEST_LINE:,} bytes", where=str(path), allowed="one point a line",
+                    remedy="give a file of points in text",
+                )  # fmt: skip
 
 
 def _guessed_names(values: FloatArray) -> list[str]:
@@ -154,7 +193,3 @@ def _form(name: str, column: NDArray[Any], decimals: int) -> str:
     if name in ("x", "y", "z"):
         return f"%.{decimals}f"
     return "%d" if column.dtype.kind in "iub" else "%.9g" if column.dtype == np.float32 else "%.17g"
-
-
-def _plain(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

@@ -1,0 +1,158 @@
+"""What a LAS file says of itself: coordinate system, counts, box about the points; held against the points that are there."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+
+from pipeline.formats.units import AxisUnits, metres_of_epsg_unit, not_understood, understood_crs, units_of_crs
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+
+_OUTSIDE = 0.01
+"""In the file's unit: so far points may lie outside of the header's box, whose numbers programs round."""
+_MUCH_LARGER = 1.5
+"""Times the points' extent: a header's box that is larger is told of."""
+_MODEL, _GEOGRAPHIC, _PROJECTED, _LINEAR_UNIT, _VERTICAL, _VERTICAL_UNIT = 1024, 2048, 3072, 3076, 4096, 4099
+"""GeoTIFF keys: kind of the coordinates, codes of their systems, codes of their units."""
+_IN_DEGREES, _GEOCENTRIC = 2, 3
+_USER_DEFINED = 32767
+_OLDER_COUNT_AT = 107
+"""Place of the number of points up to LAS 1.3, which later versions leave 0 or repeat."""
+_NOISE = (7, 18)
+"""Classes of LAS 1.4: low and high noise."""
+_PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
+
+
+def stated_units(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None, tuple[str, ...]]:
+    """The unit of the coordinates by the file's WKT or GeoTIFF keys, and notes; None where neither states one.
+
+    Raises InputError for coordinates in degrees, and where WKT and keys state different units.
+    """
+    by_wkt, notes = _by_wkt(header, where)
+    by_keys = _by_keys(header, where)
+    if by_wkt is not None and by_keys is not None and not np.allclose(by_wkt.metres, by_keys.metres, rtol=1e-8, atol=0):
+        raise InputError(
+            f"states two units: {by_wkt.name} in {by_wkt.source}, {by_keys.name} in {by_keys.source}", where=where,
+            remedy="export it with one coordinate system",
+        )  # fmt: skip
+    return by_wkt or by_keys, notes
+
+
+def _records(header: laspy.LasHeader, kind: type) -> list[Any]:
+    return [record for record in (*header.vlrs, *(header.evlrs or ())) if isinstance(record, kind)]
+
+
+def _by_wkt(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None, tuple[str, ...]]:
+    for record in _records(header, laspy.vlrs.known.WktCoordinateSystemVlr):
+        text = record.string.strip("\0 \n")
+        if text:
+            crs = understood_crs(text)
+            return (None, (not_understood(text, where),)) if crs is None else (units_of_crs(crs, where), ())
+    return None, ()
+
+
+def _by_keys(header: laspy.LasHeader, where: str) -> AxisUnits | None:
+    """By GeoTIFF keys: the codes of coordinate systems, before them the codes of units."""
+    keys: dict[int, int] = {}
+    for record in _records(header, laspy.vlrs.known.GeoKeyDirectoryVlr):
+        keys |= {key.id: key.value_offset for key in record.geo_keys if key.tiff_tag_location == 0}
+    codes = {name: keys.get(name, 0) for name in (_PROJECTED, _VERTICAL)}
+    known = {name: code for name, code in codes.items() if 0 < code < _USER_DEFINED}
+    if keys.get(_MODEL) in (_IN_DEGREES, _GEOCENTRIC) or (keys.get(_GEOGRAPHIC) and not codes[_PROJECTED] and _MODEL not in keys):
+        what = "from the Earth's centre" if keys.get(_MODEL) == _GEOCENTRIC else "in degrees"
+        problem = f"has coordinates {what}, by its GeoTIFF keys (geographic system {keys.get(_GEOGRAPHIC, 'not named')})"
+        raise InputError(problem, where=where, allowed="projected coordinates", remedy=_PROJECT)
+    plane, height = (_of_code(known.get(name), where) for name in (_PROJECTED, _VERTICAL))
+    across = _agreed(plane, keys.get(_LINEAR_UNIT), "coordinates", where)
+    up = _agreed(height, keys.get(_VERTICAL_UNIT), "heights", where)
+    if across is None:
+        return None
+    name = f"EPSG:{known[_PROJECTED]}" if _PROJECTED in known else "a system of its own"
+    return AxisUnits((across, across, across if up is None else up), f"its GeoTIFF keys ({name})")
+
+
+def _of_code(code: int | None, where: str) -> float | None:
+    """Metres of the unit of a projected or vertical coordinate system by its EPSG code; None where there is no such system."""
+    crs = None if code is None else understood_crs(f"EPSG:{code}")
+    if crs is None:
+        return None
+    if crs.is_vertical:
+        return float(crs.axis_info[0].unit_conversion_factor)
+    units = units_of_crs(crs, where)
+    return None if units is None else units.metres[0]
+
+
+def _agreed(by_system: float | None, unit_code: int | None, what: str, where: str) -> float | None:
+    """The unit by a coordinate system and by a unit's own key. Raises InputError where the two differ."""
+    by_unit = None if not unit_code or unit_code >= _USER_DEFINED else metres_of_epsg_unit(unit_code)
+    if by_system is not None and by_unit is not None and not np.isclose(by_system, by_unit, rtol=1e-8, atol=0):
+        units = f"{by_system:.10g} m by the coordinate system, {by_unit:.10g} m by the unit"
+        problem = f"states two units of its {what} in its GeoTIFF keys: {units}"
+        raise InputError(problem, where=where, remedy="export it with one coordinate system")
+    return by_system if by_unit is None else by_unit
+
+
+def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[str, ...]:
+    """A note where the header's box is much larger than the points (n, 3), in the file's unit.
+
+    Raises InputError where points lie outside of it. A box of zeros, or turned inside out, states nothing.
+    """
+    low, high = np.array(header.mins), np.array(header.maxs)
+    if not len(points) or not np.isfinite([low, high]).all() or (low > high).any() or not (low.any() or high.any()):
+        return ()
+    found_low, found_high = points.min(axis=0), points.max(axis=0)
+    reach = np.maximum(_OUTSIDE, 2 * np.array(header.scales))
+    said = f"a box from {_place(low)} to {_place(high)} in its header"
+    said = f"{said}, and its points lie from {_place(found_low)} to {_place(found_high)}"
+    if ((found_low < low - reach) | (found_high > high + reach)).any():
+        raise InputError(
+            f"states {said}", where=where,
+            remedy="its scale, offset or box is wrong: export it again, or mend the header, as LAStools' lasinfo -repair_bb does",
+        )  # fmt: skip
+    larger = np.linalg.norm(high - low) > _MUCH_LARGER * np.linalg.norm(found_high - found_low) + 1
+    return (f"the file states {said}: a part of a larger one, or a wrong scale",) if larger else ()
+
+
+def _place(values: FloatArray) -> str:
+    return f"({', '.join(f'{value:.10g}' for value in values)})"
+
+
+def check_counts(header: laspy.LasHeader, path: Path) -> None:
+    """Raise InputError where a header states two counts, and where an uncompressed file has not the room that it states."""
+    with path.open("rb") as file:
+        (older,) = struct.unpack_from("<I", file.read(_OLDER_COUNT_AT + 4), _OLDER_COUNT_AT)
+    if older and older != header.point_count:
+        problem = f"states {header.point_count:,} points and, in the field of older versions, {older:,}"
+        raise InputError(problem, where=str(path), remedy="copy or export it again")
+    if header.are_points_compressed or header.global_encoding.waveform_data_packets_internal:
+        return
+    start = header.offset_to_point_data
+    later = getattr(header, "start_of_first_evlr", 0) if header.number_of_evlrs else 0
+    size = (later or path.stat().st_size) - start
+    room = size // header.point_format.size
+    if room != header.point_count:
+        raise InputError(
+            f"states {header.point_count:,} points and has room for {room:,}", where=str(path),
+            remedy="the file was cut off, or its header was not brought up to date: copy or export it again",
+        )  # fmt: skip
+
+
+def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, ...]]:
+    """(n,) points that the file takes out of use, withheld and synthetic ones and those classified as noise; and notes."""
+    out = np.zeros(len(las.points), dtype=bool)
+    notes = []
+    classes = np.asarray(las.classification)
+    for what, rows in (
+        ("flagged as withheld", np.asarray(las.withheld, dtype=bool)),
+        ("flagged as synthetic", np.asarray(las.synthetic, dtype=bool)),
+        ("classified as noise", np.isin(classes, _NOISE)),
+    ):
+        if count := int((rows & ~out).sum()):
+            notes.append(f"{count:,} points that the file has {what} are left out")
+        out |= rows
+    return out, tuple(notes)

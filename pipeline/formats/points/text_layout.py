@@ -1,0 +1,193 @@
+"""How a text file of points is written: encoding, lines before the points, separator, decimal mark, counts.
+
+Every reader of points in text asks here, so that XYZ, CSV, PTS and PTX understand the same files.
+"""
+
+from __future__ import annotations
+
+import codecs
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from scene.common.errors import InputError
+from scene.common.number_rows import COMMENTS, GROUPED, RowForm, is_grouped, split_row
+
+_HEADER_LINES = 100
+_SAMPLE_LINES = 200
+LONGEST_LINE = 65_536
+_BYTE_ORDER_MARKS = (
+    (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"), (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"),
+)  # fmt: skip
+"""Each with the codec that takes it off; the mark of UTF-32 begins with that of UTF-16."""
+_HEAD_BYTES = 4096
+_SEPARATORS = (";", "\t", "|")
+_DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|\d*,\d+)([eE][+-]?\d+)?")
+_THREE_DIGITS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+"""A number that may have three decimals behind a comma, or a comma between thousands."""
+_GRID = ("ncols", "nrows", "xllcorner", "xllcenter")
+"""What the header of a grid of heights begins with."""
+_FEW = 0.05
+"""Share of a column's values from which whole numbers beside ones with a comma tell that the comma is no decimal mark."""
+_ROWS = "one point a line, x y z and what else there is, separated by spaces, tabs, commas or semicolons"
+
+
+@dataclass(frozen=True)
+class HeaderLine:
+    """A line before the points. number: from 1; text: without the marks of a comment; comment: whether it had them."""
+
+    number: int
+    text: str
+    comment: bool
+
+
+@dataclass(frozen=True)
+class TextLayout:
+    """How a file is written. encoding: a codec of Python; header: lines before the first point that are neither empty nor a
+    count; stated: the number of points that such a count states, None without one; form: of the rows."""
+
+    encoding: str
+    header: tuple[HeaderLine, ...]
+    form: RowForm
+    stated: int | None = None
+
+
+def encoding_of(path: Path) -> str:
+    """The codec of a text: as its byte-order mark says, UTF-16 by its null bytes, else UTF-8 or Western European.
+
+    Raises InputError for a file that holds other null bytes, which no text does.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    for mark, name in _BYTE_ORDER_MARKS:
+        if head.startswith(mark):
+            return name
+    if b"\0" not in head:
+        try:
+            codecs.getincrementaldecoder("utf-8")().decode(head)
+        except UnicodeDecodeError:
+            return "cp1252"
+        return "utf-8"
+    if not any(head[::2]) or not any(head[1::2]):
+        return "utf-16-be" if not any(head[::2]) else "utf-16-le"
+    even, odd = head[::2].count(0), head[1::2].count(0)
+    if max(even, odd) > 0.8 * len(head) / 2 and min(even, odd) < 0.1 * len(head) / 2:
+        return "utf-16-be" if even > odd else "utf-16-le"
+    raise InputError("holds null bytes, as binary files do", where=str(path), allowed=_ROWS, remedy="export it as text")
+
+
+def layout_of(path: Path) -> TextLayout:
+    """How a file of points is written, by its first lines.
+
+    Raises InputError where no line of numbers is among them, and where digits are grouped by thousands separators.
+    """
+    encoding = encoding_of(path)
+    with path.open(encoding=encoding, errors="replace") as file:
+        lines = list(itertools.islice(file, _HEADER_LINES + _SAMPLE_LINES))
+    first = next((index for index, line in enumerate(lines[:_HEADER_LINES]) if _is_row(line)), None)
+    if first is None:
+        raise _no_rows(lines, str(path))
+    if any(line.lower().startswith(_GRID) for line in lines[:first]):
+        remedy = "convert it to a GeoTIFF, as gdal_translate does, and give that as an elevation model"
+        raise InputError("is a grid of heights (ESRI ASCII), no list of points", where=str(path), allowed=_ROWS, remedy=remedy)
+    sample = list(itertools.takewhile(_is_row, lines[first : first + _SAMPLE_LINES]))
+    form = form_of(sample, first + 1, str(path))
+    header, stated = _header(lines[:first])
+    return TextLayout(encoding, header, form, stated)
+
+
+def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
+    """How rows are written, by some of them. first_line: number of the first of them.
+
+    Raises InputError for thousands separators.
+    """
+    separator, decimal_comma = _separator(sample)
+    rows = [split_row(line, separator) for line in sample]
+    columns = len(rows[0])
+    if columns > 1 and all(len(row) == columns and not row[-1] for row in rows):  # a separator ends each line
+        columns -= 1
+    if separator != ",":
+        commas = sum(bool(_DECIMAL_COMMA.fullmatch(word)) for row in rows for word in row)
+        decimal_comma |= commas > sum("." in word and "," not in word for row in rows for word in row)
+    _check_grouping(rows, decimal_comma, first_line, where)
+    return RowForm(separator, decimal_comma, columns, first_line, counts=True)
+
+
+def _separator(sample: Sequence[str]) -> tuple[str | None, bool]:
+    """The separator of rows, and whether commas between digits are decimal marks beside white space."""
+    for mark in _SEPARATORS:
+        if all(mark in line.strip(" \r\n") for line in sample):
+            several = mark == "\t" and any(re.search(r"\d\s+[+-]?\d", word) for line in sample for word in split_row(line, mark))
+            return (None if several else mark), False
+    if not all("," in line for line in sample):
+        return None, False
+    apart = [split_row(line, None) for line in sample]
+    if all(len(words) >= 3 and any(map(_DECIMAL_COMMA.fullmatch, words)) for words in apart):
+        inside = all("," not in word or re.fullmatch(r"[^,]*\d,\d[^,]*", word) for words in apart for word in words)
+        if inside:
+            return None, True
+    return ",", False
+
+
+def _check_grouping(rows: Sequence[Sequence[str]], decimal_comma: bool, first_line: int, where: str) -> None:
+    for number, row in enumerate(rows, start=first_line):
+        for word in row:
+            if is_grouped(word, decimal_comma=decimal_comma):
+                raise _grouped(word, number, where)
+    if not decimal_comma:
+        return
+    for column in itertools.zip_longest(*rows, fillvalue=""):
+        with_comma = [word for word in column if "," in word]
+        whole = sum(word.lstrip("+-").isdecimal() for word in column)
+        if with_comma and whole > _FEW * len(column) and all(map(_THREE_DIGITS.fullmatch, with_comma)):
+            raise _grouped(with_comma[0], first_line, where)
+
+
+def _grouped(word: str, number: int, where: str) -> InputError:
+    return InputError(
+        f"'{word:.40}': {GROUPED}", where=f"{where}, line {number:,}", allowed="plain numbers",
+        remedy="export the numbers without thousands separators, as 6389450.123",
+    )  # fmt: skip
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line begins with three numbers, whatever separates them and their digits."""
+    text = line.strip(" \t\r\n,;|")
+    mark = next((each for each in _SEPARATORS if each in text), None)
+    words = re.split(r"[ \t,]+", text) if mark is None else split_row(text, mark)
+    return len(words) >= 3 and all(map(_is_number, words[:3]))
+
+
+def _is_number(word: str) -> bool:
+    plain = word.strip("\"'")
+    if _DECIMAL_COMMA.fullmatch(plain) or is_grouped(plain, decimal_comma=False):
+        return True
+    try:
+        float(plain)
+    except ValueError:
+        return False
+    return "_" not in plain
+
+
+def _header(lines: Sequence[str]) -> tuple[tuple[HeaderLine, ...], int | None]:
+    """The lines before the points, and the count among them."""
+    header, stated = [], None
+    for number, line in enumerate(lines, start=1):
+        text = line.strip()
+        plain = text.lstrip("".join(COMMENTS)).strip()
+        if plain.isdecimal() and not text.startswith(COMMENTS):
+            stated = int(plain)
+        elif plain:
+            header.append(HeaderLine(number, plain, text.startswith(COMMENTS)))
+    return tuple(header), stated
+
+
+def _no_rows(lines: Sequence[str], where: str) -> InputError:
+    if not any(line.strip() for line in lines):
+        return InputError("holds no points, no line of numbers", where=where, allowed=_ROWS, remedy="export it again")
+    first = next(line.strip() for line in lines if line.strip())
+    problem = f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')"
+    return InputError(problem, where=where, allowed=_ROWS, remedy="give a file of points, or remove the lines before them")

@@ -1,0 +1,179 @@
+"""Units that files state: in their coordinate system, in the names of their columns; and those of the command line."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scene.common.errors import InputError
+from scene.common.lengths import METRES, US_FOOT_M
+from scene.geometry.mesh import FloatArray
+
+_ALIKE = 1e-8
+"""Two factors this near to each other are one unit: files state the US survey foot with 9 to 15 digits."""
+_NAMES = {1.0: "m", 0.01: "cm", 0.001: "mm", 0.3048: "ft (international foot)", US_FOOT_M: "us-ft (US survey foot)"}
+_PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
+
+
+@dataclass(frozen=True)
+class AxisUnits:
+    """The unit of the coordinates as a file states it. metres: of one unit along x, y and z; source: where the file says so."""
+
+    metres: tuple[float, float, float]
+    source: str
+
+    @property
+    def name(self) -> str:
+        """The unit in words; of axes with different units one after the other."""
+        names = [unit_name(each) for each in self.metres]
+        if len(set(names)) == 1:
+            return names[0]
+        return ", ".join(f"{axis} in {name}" for axis, name in zip("xyz", names, strict=True))
+
+    @property
+    def in_metres(self) -> bool:
+        return all(same_unit(each, 1.0) for each in self.metres)
+
+    def factors(self) -> FloatArray:
+        """(3,) metres of one unit."""
+        return np.array(self.metres)
+
+
+def unit_name(metres: float) -> str:
+    """A unit of so many metres in words."""
+    return next((name for known, name in _NAMES.items() if same_unit(metres, known)), f"units of {metres:.12g} m")
+
+
+def same_unit(metres: float, other: float) -> bool:
+    """Whether two units, each in metres, are the same but for the digits in which they are written."""
+    return math.isclose(metres, other, rel_tol=_ALIKE)
+
+
+def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option: str = "--unit") -> AxisUnits:
+    """The unit of a file's coordinates by what the file states and by what the user gives; metres where nobody says.
+
+    Parameters
+    ----------
+    stated : what the file says of itself, None where it says nothing
+    given : a key of METRES, None where the user says nothing
+    where : what errors call the file
+    option : by which the user gives it
+
+    Raises
+    ------
+    InputError
+        Where the two contradict each other.
+    """
+    if stated is None:
+        return AxisUnits((METRES[given or "m"],) * 3, option)
+    if given is None or all(same_unit(each, METRES[given]) for each in stated.metres):
+        return stated
+    raise InputError(
+        f"states its unit, {stated.name}, in {stated.source}, and {option} says {unit_name(METRES[given])}", where=where,
+        remedy=f"leave {option} out if the file is right, else export it with the right coordinate system or names",
+    )  # fmt: skip
+
+
+def understood_crs(text: str) -> Any:
+    """The coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260; None for a text that PROJ does not understand."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        return CRS.from_user_input(text)
+    except (CRSError, UnicodeError):
+        return None
+
+
+def not_understood(text: str, where: str) -> str:
+    """A note on a coordinate system that PROJ does not understand, whose coordinates are taken for metres.
+
+    Raises InputError where its text has a word for another unit.
+    """
+    problem = f"states a coordinate system that is not understood: '{text:.60}'"
+    if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):
+        remedy = "export the file with its EPSG code or valid WKT"
+        raise InputError(f"{problem}, in which stands '{word[0]}'", where=where, remedy=remedy)
+    return f"the file {problem}; its coordinates are taken for metres"
+
+
+def units_of_crs(crs: Any, where: str) -> AxisUnits | None:
+    """The unit of projected coordinates in a coordinate system; None where it states none.
+
+    Parameters
+    ----------
+    crs : a pyproj.CRS
+    where : what errors call the file
+
+    Returns
+    -------
+    AxisUnits of easting, northing and height. Without a vertical system heights have the unit of the plane.
+
+    Raises
+    ------
+    InputError
+        For coordinates in degrees, coordinates from the Earth's centre, and units that are no length.
+    """
+    plane, *further = [_plain(each) for each in (crs.sub_crs_list if crs.is_compound else [_plain(crs)])]
+    if plane.is_geographic:
+        problem = f"has coordinates in degrees, of the coordinate system '{crs.name}'"
+        raise InputError(problem, where=where, allowed="projected coordinates", remedy=_PROJECT)
+    if plane.is_geocentric:
+        problem = f"has coordinates from the Earth's centre, of the coordinate system '{crs.name}', in which z is not up"
+        raise InputError(problem, where=where, allowed="projected coordinates", remedy=_PROJECT)
+    level = [axis for axis in plane.axis_info if axis.direction not in ("up", "down")]
+    upright = [axis for part in (plane, *further) for axis in part.axis_info if axis.direction in ("up", "down")]
+    if not level:
+        return None
+    across, along = (_metres(axis, crs.name, where) for axis in (level[0], level[-1]))
+    up = _metres(upright[0], crs.name, where) if upright else across
+    return AxisUnits((across, along, up), f"the coordinate system '{crs.name}'")
+
+
+def metres_of_epsg_unit(code: int) -> float | None:
+    """Metres of a unit of length by its EPSG code, such as 9003 of the US survey foot; None for one that is none."""
+    from pyproj.database import get_units_map
+
+    units = get_units_map(auth_name="EPSG", category="linear", allow_deprecated=True).values()
+    factor = next((unit.conv_factor for unit in units if unit.code == str(code)), None)
+    return None if factor is None else _exact(factor)
+
+
+def _plain(crs: Any) -> Any:
+    """A coordinate system without the transformation to another datum that may be bound to it."""
+    return crs.source_crs if crs.is_bound else crs
+
+
+def _metres(axis: Any, name: str, where: str) -> float:
+    """Metres of one unit of a CRS's axis; of local systems PROJ gives the unit's name and no factor."""
+    factor = axis.unit_conversion_factor
+    if not factor:
+        factor = metres_of_word(axis.unit_name)
+    if not factor or "degree" in axis.unit_name:
+        problem = f"states the unit '{axis.unit_name}' in the coordinate system '{name}'"
+        raise InputError(problem, where=where, allowed="a unit of length", remedy=_PROJECT)
+    return _exact(float(factor))
+
+
+def _exact(metres: float) -> float:
+    """A factor with few digits as the exact one of its unit."""
+    return next((known for known in _NAMES if same_unit(metres, known)), metres)
+
+
+_WORDS = {
+    "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0, "mtr": 1.0, "dm": 0.1, "cm": 0.01, "centimetre": 0.01,
+    "centimeter": 0.01, "mm": 0.001, "millimetre": 0.001, "millimeter": 0.001, "km": 1000.0, "kilometre": 1000.0,
+    "kilometer": 1000.0, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "ift": 0.3048, "internationalfoot": 0.3048,
+    "internationalfeet": 0.3048, "usft": US_FOOT_M, "ftus": US_FOOT_M, "ussurveyfoot": US_FOOT_M, "ussurveyfeet": US_FOOT_M,
+    "usfoot": US_FOOT_M, "usfeet": US_FOOT_M, "surveyfoot": US_FOOT_M, "surveyfeet": US_FOOT_M, "footus": US_FOOT_M,
+    "in": 0.0254, "inch": 0.0254, "yd": 0.9144, "yard": 0.9144,
+}  # fmt: skip
+
+
+def metres_of_word(word: str) -> float | None:
+    """Metres of a unit of length as people write it; None for another word."""
+    return _WORDS.get(re.sub(r"[\s._-]+", "", word.lower()))

@@ -1,0 +1,142 @@
+"""Rows of numbers in text, read line by line, so that an error says which line is wrong, and why.
+
+NumPy's own reader is faster and is tried first where a file is plain; this one is for what it refuses: decimal commas, comments
+between the rows, missing values, and the message.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.common.errors import InputError
+
+COMMENTS = ("#", "//", "%", "!")
+"""What a line of text begins with that is no row."""
+_POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
+_COMMA = re.compile(r"[+-]?(\d+,\d*|\d*,\d+)([eEdD][+-]?\d+)?")
+_GROUPED = re.compile(r"[+-]?\d{1,3}([.,'\u2019\u00a0\u202f_ ]\d{3})+([.,]\d*)?")
+_MISSING = {"", "null", "none", "na", "n/a", "nil", "nan", "+nan", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "1.#ind"}
+_INFINITE = {"inf", "+inf", "-inf", "infinity", "-infinity", "1.#inf"}
+GROUPED = "digits are grouped by a thousands separator"
+_UNGROUPED = "export the numbers without thousands separators, as 6389450.123"
+
+
+@dataclass(frozen=True)
+class RowForm:
+    """How the rows of a text are written.
+
+    separator: between values, None for white space; decimal_comma: whether numbers have a comma for the decimal mark; columns:
+    values of a row; first_line: number, from 1, of the first line in the file; counts: whether a line of one whole number
+    between the rows states how many follow.
+    """
+
+    separator: str | None = None
+    decimal_comma: bool = False
+    columns: int = 0
+    first_line: int = 1
+    counts: bool = False
+
+
+@dataclass
+class RowsFound:
+    """What was found beside the values. missing: values that are none; blocks: stated and found rows of each block, and the
+    line that states them."""
+
+    missing: int = 0
+    blocks: list[tuple[int, int, int]] = field(default_factory=list)
+
+
+def split_row(line: str, separator: str | None) -> list[str]:
+    """The values of a line, without quotation marks; the last one is empty where a separator ends the line."""
+    words = line.split() if separator is None else [word.strip() for word in line.strip(" \r\n").split(separator)]
+    return [word.strip("\"'") if word[:1] in "\"'" else word for word in words]
+
+
+def is_grouped(word: str, *, decimal_comma: bool) -> bool:
+    """Whether a word is a number with thousands separators: 6,389,450.1, 6.389.450,1, 6'389'450 or 6 389 450."""
+    if not _GROUPED.fullmatch(word):
+        return False
+    return not (_POINT.fullmatch(word) or (decimal_comma and _COMMA.fullmatch(word)))
+
+
+def read_rows(lines: Iterable[str], form: RowForm, where: str) -> tuple[NDArray[np.float64], RowsFound]:
+    """The numbers of lines of text.
+
+    Parameters
+    ----------
+    lines : from `form.first_line` on; empty ones and comments are passed over
+    form : how the rows are written
+    where : what errors call the file
+
+    Returns
+    -------
+    (n, columns) values, NaN for missing ones, and what else was found.
+
+    Raises
+    ------
+    InputError
+        With the number of the line that is no row.
+    """
+    found = RowsFound()
+    values = np.fromiter(_values(lines, form, found, where), dtype=np.float64)
+    return values.reshape(-1, form.columns), found
+
+
+def _values(lines: Iterable[str], form: RowForm, found: RowsFound, where: str) -> Iterator[float]:
+    for number, line in enumerate(lines, start=form.first_line):
+        text = line.strip()
+        if not text or text.startswith(COMMENTS):
+            continue
+        words = split_row(line, form.separator)
+        if form.counts and len(words) == 1 and words[0].isdecimal():
+            found.blocks.append((int(words[0]), 0, number))
+            continue
+        if len(words) == form.columns + 1 and not words[-1]:
+            words.pop()
+        if len(words) != form.columns:
+            raise _wrong_width(text, len(words), number, form, where)
+        if found.blocks:
+            stated, rows, at = found.blocks[-1]
+            found.blocks[-1] = (stated, rows + 1, at)
+        for column, word in enumerate(words, start=1):
+            yield _value(word, form, found, f"{where}, line {number:,}, column {column}")
+
+
+def _value(word: str, form: RowForm, found: RowsFound, where: str) -> float:
+    plain = word.lower().removeprefix("-") if "#" in word else word.lower()
+    if form.decimal_comma and _COMMA.fullmatch(word):
+        return float(plain.replace(",", ".").replace("d", "e"))
+    if _POINT.fullmatch(word):
+        if form.decimal_comma and "." in word:
+            problem = f"'{word:.40}' has a decimal point, where other numbers of the file have decimal commas"
+            raise InputError(problem, where=where, remedy="export all numbers with decimal points")
+        return float(plain.replace("d", "e"))
+    if plain in _MISSING:
+        found.missing += 1
+        return float("nan")
+    if plain in _INFINITE:
+        return float("-inf" if plain.startswith("-") else "inf")
+    raise _no_number(word, form, where)
+
+
+def _no_number(word: str, form: RowForm, where: str) -> InputError:
+    if is_grouped(word, decimal_comma=form.decimal_comma):
+        return InputError(f"'{word:.40}': {GROUPED}", where=where, allowed="plain numbers", remedy=_UNGROUPED)
+    if _COMMA.fullmatch(word):
+        problem = f"'{word:.40}' has a decimal comma, where other numbers of the file have decimal points"
+        return InputError(problem, where=where, remedy="export all numbers with decimal points")
+    remedy = "correct or remove the line, or export the file again"
+    return InputError(f"'{word:.40}' is no number", where=where, allowed="numbers, one point a line", remedy=remedy)
+
+
+def _wrong_width(text: str, width: int, number: int, form: RowForm, where: str) -> InputError:
+    values = "value" if width == 1 else "values"
+    return InputError(
+        f"has {width} {values} ('{text:.60}')", where=f"{where}, line {number:,}", allowed=f"{form.columns}, as the rows before",
+        remedy="correct or remove the line; where it is the last one, the file was cut off: copy or export it again",
+    )  # fmt: skip

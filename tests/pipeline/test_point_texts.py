@@ -1,0 +1,226 @@
+"""Text files of points as people have them: encodings, names with units, separators, decimal commas, counts, and their errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.formats.points.points import read_placed_scans, read_points
+from pipeline.formats.units import US_FOOT_M
+from pipeline.measurement.scans import read_scans
+from scene.common.errors import InputError
+
+POINTS = np.array([[345215.25, 6389450.5, 120.125], [345216.5, 6389451.75, 121.0], [345217.0, 6389452.0, 122.5]])
+
+
+def written(folder: Path, text: str, encoding: str = "utf-8", name: str = "a.txt") -> Path:
+    (folder / name).write_bytes(text.encode(encoding))
+    return folder / name
+
+
+def rows(separator: str = " ", decimal: str = ".", order: str = "xyz", tail: str = "") -> str:
+    """POINTS as text, their axes in some order, further values behind them."""
+    lines = (separator.join(f"{point['xyz'.index(axis)]:.4f}" for axis in order) + tail for point in POINTS)
+    return "\n".join(lines).replace(".", decimal) + "\n"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin-1", "cp1252"])
+@pytest.mark.parametrize("header", ["", "Northing,Easting,Height\n", "# Höhe über Meer\nNorthing,Easting,Höhe\n"])
+def test_the_encoding_takes_no_point_and_no_name(tmp_path: Path, encoding: str, header: str) -> None:
+    """A byte-order mark is part of no name and no number; words before the points may be in any of the usual encodings."""
+    path = written(tmp_path, header + rows(",", order="yxz" if header else "xyz"), encoding, "a.csv")
+    np.testing.assert_array_equal(read_points(path).points, POINTS)
+
+
+def test_a_comment_in_another_encoding_between_the_rows_is_passed_over(tmp_path: Path) -> None:
+    text = rows() + "# Profil über den Fels\n" + rows() + "\n// Ende\n"
+    for encoding in ("utf-8-sig", "latin-1", "utf-16"):
+        found = read_points(written(tmp_path, text, encoding)).points
+        np.testing.assert_array_equal(found, np.concatenate([POINTS, POINTS]))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Northing [m]\tEasting [m]\tHeight [m]\n",
+        "Northing (m)\tEasting (m)\tHeight (m)\n",
+        '"Northing"\t"Easting"\t"Height"\n',
+        "Y Coordinate\tX Coordinate\tZ Coordinate\n",
+        "N_m\tE_m\tH_m\n",
+        "Hochwert\tRechtswert\tHöhe\n",
+        "// Northing Easting Height\n",
+        "\n# exported\n#Northing;Easting;Height\n3\n",
+    ],
+)
+def test_names_are_split_at_the_separator(tmp_path: Path, header: str) -> None:
+    np.testing.assert_array_equal(read_points(written(tmp_path, header + rows("\t", order="yxz"))).points, POINTS)
+
+
+def test_names_with_spaces_keep_their_columns(tmp_path: Path) -> None:
+    """CloudCompare's header, and names with units between white space."""
+    text = "//X;Y;Z;Roughness (0.01);Intensity\n3\n" + rows(";", tail=";0.002;7")
+    found = read_points(written(tmp_path, text))
+    np.testing.assert_array_equal(found.intensity, [7, 7, 7])
+    np.testing.assert_array_equal(found.extra["roughness (0.01)"], [0.002] * 3)
+    found = read_points(written(tmp_path, "X [m] Y [m] Z [m] Intensity (dB) Range (mm) Time [ms]\n" + rows(tail=" -20 81500 5")))
+    np.testing.assert_array_equal(found.points, POINTS)
+    np.testing.assert_allclose(found.intensity, [0.01] * 3)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.extra["range_m"], [81.5] * 3)
+    np.testing.assert_allclose(found.gps_time, [0.005] * 3)  # type: ignore[arg-type]
+    assert "intensity was converted from db" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("units", "factors"),
+    [
+        (("ft", "ft", "ft"), (0.3048,) * 3),
+        (("US survey foot",) * 3, (US_FOOT_M,) * 3),
+        (("ftUS", "ftUS", "m"), (US_FOOT_M, US_FOOT_M, 1.0)),
+        (("mm", "mm", "mm"), (0.001,) * 3),
+        (("ft", "ft", ""), (0.3048,) * 3),
+    ],
+)
+def test_a_unit_in_the_names_is_applied(tmp_path: Path, units: tuple[str, str, str], factors: tuple[float, ...]) -> None:
+    names = ";".join(f"{axis} [{unit}]" if unit else axis for axis, unit in zip("XYZ", units, strict=True))
+    path = written(tmp_path, names + "\n" + rows(";"))
+    found = read_points(path)
+    np.testing.assert_allclose(found.points, POINTS * factors, rtol=1e-15)
+    assert "converted from" in " ".join(found.notes)
+    by_columns = read_placed_scans(path, columns=["y", "x", "z"])[0].cloud
+    np.testing.assert_allclose(by_columns.points, (POINTS * factors)[:, [1, 0, 2]], rtol=1e-15)
+    with pytest.raises(InputError, match=r"states its unit, .* in the names of its columns, and --unit says cm"):
+        read_placed_scans(path, unit="cm")
+
+
+@pytest.mark.parametrize("units", ["[ft];[ft];[ft];[dB]", "ft;ft;ft;-", "(ft);(ft);(ft);"])
+def test_a_line_of_units_under_the_names_is_applied(tmp_path: Path, units: str) -> None:
+    found = read_points(written(tmp_path, f"Northing;Easting;Height;Intensity\n{units}\n" + rows(";", order="yxz", tail=";-10")))
+    np.testing.assert_allclose(found.points, POINTS * 0.3048, rtol=1e-15)
+    assert found.intensity is not None
+    np.testing.assert_allclose(found.intensity, 0.1 if "dB" in units else -10)
+
+
+def test_a_grid_of_heights_is_no_list_of_points(tmp_path: Path) -> None:
+    text = "ncols 4\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\nNODATA_value -9999\n1 2 3 4\n5 6 7 8\n"
+    with pytest.raises(InputError, match=r"grid of heights \(ESRI ASCII\).*gdal_translate"):
+        read_points(written(tmp_path, text, name="a.asc"))
+
+
+@pytest.mark.parametrize(
+    ("header", "problem"),
+    [
+        ("Latitude;Longitude;Height\n", "coordinates in degrees"),
+        ("X [deg];Y [deg];Z [m]\n", "coordinates in degrees"),
+        ("X [cubit];Y [cubit];Z [cubit]\n", "a unit that is not known: 'cubit'"),
+        ("X;Y;Z;Intensity\n", "names 4 columns .* and the rows have 3"),
+        ("Vorn;Seite;Oben\n", "of which not all of x, y and z are understood"),
+        ("azimuth;elevation;range\n", "of which not all of x, y and z are understood"),
+    ],
+)
+def test_names_that_are_not_understood_are_errors(tmp_path: Path, header: str, problem: str) -> None:
+    with pytest.raises(InputError, match=problem) as caught:
+        read_points(written(tmp_path, header + rows(";")))
+    assert "line 1" in caught.value.where
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize("separator", [";", "\t", " ", "|", "; "])
+def test_decimal_commas_are_read(tmp_path: Path, separator: str) -> None:
+    found = read_points(written(tmp_path, rows(separator, ",")))
+    np.testing.assert_array_equal(found.points, POINTS)
+    assert "commas in numbers are taken as decimal marks" in found.notes
+
+
+def test_commas_between_values_are_no_decimal_marks(tmp_path: Path) -> None:
+    for separator in (",", ", ", " ,"):
+        np.testing.assert_array_equal(read_points(written(tmp_path, rows(separator))).points, POINTS)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "345,215.25;6,389,450.5;120.125",
+        "345.215,25;6.389.450,5;120,125",
+        "345'215.25;6'389'450.5;120.125",
+        "345 215.25;6 389 450.5;120.125",
+        "345\u00a0215,25;6\u00a0389\u00a0450,5;120,125",
+        "345,215;6,389,450;120",
+    ],
+)
+@pytest.mark.parametrize("place", ["first", "later"])
+def test_thousands_separators_are_refused_by_name(tmp_path: Path, line: str, place: str) -> None:
+    decimal = "," if ",1" in line and "." not in line.split(";")[2] and line.endswith(",125") else "."
+    before = "" if place == "first" else rows(";", decimal) * 200
+    with pytest.raises(InputError, match=r"line \d+.*digits are grouped by a thousands separator.*without thousands separators"):
+        read_points(written(tmp_path, before + line + "\n" + rows(";", decimal)))
+
+
+def test_whole_numbers_beside_commas_before_three_digits_are_grouped(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="thousands separator"):
+        read_points(written(tmp_path, "1,234;5,678;987\n1,300;999;1,001\n" * 20))
+    three_decimals = "1,234;5,678;0,987\n1,300;0,999;1,001\n"
+    np.testing.assert_array_equal(read_points(written(tmp_path, three_decimals)).points[0], [1.234, 5.678, 0.987])
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "problem"),
+    [
+        (rows() + "4 five 6\n" + rows(), 4, "'five' is no number"),
+        (rows() + "4 5\n" + rows(), 4, r"has 2 values \('4 5'\).*allowed: 3"),
+        (rows() + "345217.0 63894", 4, "the file was cut off"),
+        ("# a\n\n" + rows(";") + "4,5;5;6\n", 6, "decimal comma, where other numbers"),
+        (rows(";", ",") + "4.5;5,1;6,1\n", 4, "decimal point, where other numbers"),
+    ],
+)
+def test_a_line_that_is_no_row_is_named(tmp_path: Path, text: str, line: int, problem: str) -> None:
+    """The line's number, what it holds, what is allowed; no words of NumPy's."""
+    with pytest.raises(InputError, match=rf"a\.txt, line {line}\b.*{problem}") as caught:
+        read_points(written(tmp_path, text))
+    assert "usecols" not in str(caught.value)
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize(("stated", "suffix"), [(2, ".pts"), (4, ".pts"), (9, ".xyz")])
+def test_a_count_that_the_rows_do_not_agree_with_is_an_error(tmp_path: Path, stated: int, suffix: str) -> None:
+    with pytest.raises(InputError, match=f"states {stated} points and holds 3"):
+        read_points(written(tmp_path, f"{stated}\n" + rows(), name=f"a{suffix}"))
+    np.testing.assert_array_equal(read_points(written(tmp_path, "3\n" + rows(), name=f"a{suffix}")).points, POINTS)
+
+
+def test_a_pts_file_of_several_scans_has_a_count_before_each(tmp_path: Path) -> None:
+    both = read_points(written(tmp_path, "3\n" + rows() + "3\n" + rows(), name="a.pts")).points
+    np.testing.assert_array_equal(both, np.concatenate([POINTS, POINTS]))
+    with pytest.raises(InputError, match=r"line 5.*states 5 points and holds 3"):
+        read_points(written(tmp_path, "3\n" + rows() + "5\n" + rows(), name="a.pts"))
+
+
+def test_missing_values_are_left_out_with_a_word(tmp_path: Path) -> None:
+    """As 1.#QNAN, null or nothing between separators; a measurement then leaves the points out."""
+    text = rows(";", tail=";1;") + "1.#QNAN;null;;1;\n" + rows(";", tail=";1;")
+    found = read_points(written(tmp_path, text))
+    assert np.isnan(found.points[3]).all()
+    assert "3 values are empty or no numbers" in found.notes
+    rng = np.random.default_rng(1)
+    many = "".join(f"{x} {y} {z}\n" for x, y, z in rng.uniform(0, 9, (200, 3)))
+    (scan,) = read_scans(written(tmp_path, many + "nan nan nan\n" * 7))
+    assert len(scan.cloud.points) == 200
+    assert "7 points that are no numbers are left out" in scan.words
+
+
+def test_a_binary_file_with_a_suffix_of_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_bytes(bytes(range(256)) * 20)
+    with pytest.raises(InputError, match=r"null bytes, as binary files do.*export it as text"):
+        read_points(tmp_path / "a.xyz")
+
+
+def test_a_line_that_is_passed_over_is_said(tmp_path: Path) -> None:
+    found = read_points(written(tmp_path, "Scan of the north face, 3 March\n" + rows()))
+    np.testing.assert_array_equal(found.points, POINTS)
+    assert any("line 1 is passed over: 'Scan of the north face" in note for note in found.notes)
+
+
+def test_sentences_before_the_points_are_no_names(tmp_path: Path) -> None:
+    for line in ("# north face, morning", "# lat 47.1 lon 8.2 of the station", "// x y z are in the local grid of the mine"):
+        np.testing.assert_array_equal(read_points(written(tmp_path, line + "\n" + rows())).points, POINTS)
