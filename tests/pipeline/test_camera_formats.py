@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.config.simulation import CamerasFile
-from pipeline.formats.cameras.camera_files import read_lens, read_oriented
+from pipeline.formats.cameras.camera_files import read_lens, read_oriented, stereo_pair
 from pipeline.formats.cameras.cameras import read_cameras_yaml, write_cameras_yaml
 from pipeline.formats.cameras.colmap import read_colmap, read_map, write_colmap, write_map
 from pipeline.formats.cameras.metashape import read_calibration, read_metashape, write_calibration, write_metashape
@@ -203,6 +203,22 @@ def test_metashape_conventions(tmp_path: Path) -> None:
     np.testing.assert_allclose(b.rotation, np.eye(3), atol=1e-12)
 
 
+def test_metashape_parameters_and_motions_of_zero_change_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "export.xml"
+    harmless = EXPORT.replace("<k1>", "<p3>0</p3><k1>")
+    path.write_text(harmless.replace("</transform></camera>", "</transform><rolling_shutter>0 0 0</rolling_shutter></camera>"))
+    assert read_metashape(path).cameras["A"].k1 == -0.05
+
+
+def test_a_camera_of_a_rig_is_no_unaligned_one(tmp_path: Path) -> None:
+    path = tmp_path / "export.xml"
+    path.write_text(EXPORT.replace('label="C"', 'label="C" master_id="0"'))
+    found = read_metashape(path)
+    assert (found.unaligned, found.rigged) == ((), ("C",))
+    with pytest.raises(InputError, match="'C' belongs to a rig"):
+        stereo_pair(found, "A", "C", "export.xml")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
@@ -217,6 +233,12 @@ def test_metashape_conventions(tmp_path: Path) -> None:
         ("<document", "<!DOCTYPE x><document", "entities"),
         ("</document>", "", "not valid XML"),
         ("document", "calibration", "no Metashape camera XML"),
+        ("<k1>-0.05</k1>", "<k1>-0.05</k1><p3>0.001</p3>", "lens parameter p3 = 0.001"),
+        (
+            "0 0 0 1</transform></camera>",
+            "0 0 0 1</transform><rolling_shutter>0 0.002 0 0 0 0</rolling_shutter></camera>",
+            "camera A: was aligned with rolling shutter compensation",
+        ),
     ],
 )
 def test_metashape_mistakes_are_named(tmp_path: Path, old: str, new: str, what: str) -> None:

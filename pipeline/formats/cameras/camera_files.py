@@ -62,6 +62,7 @@ def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, wh
     known = ", ".join(found.cameras)
     for label in (label for label in (left, right) if label is not None and label not in found.cameras):
         why = "is not aligned" if label in found.unaligned else "is not in the file"
+        why = "belongs to a rig, whose relative poses are not read" if label in found.rigged else why
         raise InputError(f"camera '{label}' {why}", where=where, allowed=known)
     if left is not None and right is not None:
         return CameraPair(found.cameras[left], found.cameras[right])
@@ -70,6 +71,9 @@ def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, wh
         raise InputError(what, where=where, allowed=known, remedy="name both as cameras.left and cameras.right")
     if found.unaligned:
         warnings.warn(f"{where}: left out as not aligned: {', '.join(found.unaligned)}", stacklevel=2)
+    if found.rigged:
+        words = f"{where}: left out, as their poses are those of a rig, which are not read: {', '.join(found.rigged)}"
+        warnings.warn(words, stacklevel=2)
     first, second = found.cameras.values()
     swapped = first.rotation[:, 0] @ (second.position - first.position) < 0
     return CameraPair(second, first) if swapped else CameraPair(first, second)

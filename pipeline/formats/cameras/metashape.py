@@ -4,14 +4,16 @@ Camera XML (File > Export > Export Cameras): a sensor may hold two calibrations,
 are 0. A camera without a transform is not aligned. A transform is row-major, camera to chunk; the similarity (s, R, t) of the
 camera's component, or where that has none of the chunk, leads on: x_world = s R x_chunk + t. In a chunk with a projected
 coordinate system (the tag `reference`) that leads to geocentric coordinates, which are taken to the projected ones. A project
-(.psx) holds the same of its active chunk.
+(.psx) holds the same of its active chunk. What would change the rays and has no place in the camera model is refused: rolling
+shutter motion, and lens parameters beyond ours.
 Calibration XML (Tools > Camera Calibration > Save): one interior orientation.
 """
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,16 +28,19 @@ from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera, checked_camera
 
 _TAGS = {"f": "f_px", "cx": "cx_px", "cy": "cy_px"} | {name: name for name in ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")}
+_PARAMETER = re.compile(r"[a-z]\d")
+"""What the tags of lens parameters look like: k5, p3, b3."""
 _LARGEST = 1e12
 """No coordinate, pixel or lens parameter is larger; products of such numbers stay finite."""
 
 
 @dataclass(frozen=True)
 class MetashapeCameras:
-    """Cameras by label, world frame, and the labels of those that were not aligned."""
+    """Cameras by label, world frame; the labels of those that were not aligned, and of those whose pose is that of a rig."""
 
     cameras: dict[str, Camera]
     unaligned: tuple[str, ...]
+    rigged: tuple[str, ...] = ()
 
 
 def read_metashape(path: Path) -> MetashapeCameras:
@@ -54,12 +59,14 @@ def read_metashape(path: Path) -> MetashapeCameras:
     reference = (chunk.findtext("reference") or "").strip()
     projection = None if _is_metric(reference) else Projection(reference, str(path))
     cameras: dict[str, Camera] = {}
-    unaligned = []
+    unaligned: list[str] = []
+    rigged: list[str] = []
     for element in chunk.iterfind("cameras//camera"):
         label, transform = element.get("label", element.get("id", "")), element.findtext("transform")
         if transform is None:
-            unaligned.append(label)
+            (rigged if element.get("master_id") else unaligned).append(label)
             continue
+        _check_shutter(element, f"{path}: camera {label}")
         if label in cameras:
             raise InputError(f"two cameras are labelled '{label}'", where=str(path), remedy="rename one of them in Metashape")
         sensor = sensors.get(element.get("sensor_id", ""))
@@ -70,7 +77,7 @@ def read_metashape(path: Path) -> MetashapeCameras:
         if projection is not None and is_geocentric(pose[:3, 3]):
             pose = projection.pose(pose)
         cameras[label] = _sensor_camera(sensor, pose, f"{path}: sensor {sensor.get('label', sensor.get('id'))}")
-    return MetashapeCameras(cameras, tuple(unaligned))
+    return MetashapeCameras(cameras, tuple(unaligned), tuple(rigged))
 
 
 def write_metashape(path: Path, cameras: Mapping[str, Camera]) -> None:
@@ -160,7 +167,43 @@ def _sensor_camera(sensor: ElementTree.Element, pose: FloatArray, where: str) ->
     return _camera(adjusted[0], (width, height), pose, where)
 
 
+def _check_shutter(camera: ElementTree.Element, where: str) -> None:
+    """Raise InputError for a camera whose rows were exposed from different poses, as Metashape's shutter compensation found."""
+    for motion in camera.iter("rolling_shutter"):
+        if any(value != 0 for value in _numbers_of(motion.itertext())):
+            raise InputError(
+                "was aligned with rolling shutter compensation: each row has a pose of its own, which the camera model has not",
+                where=where,
+                allowed="one pose a picture",
+                remedy="switch the compensation off in Metashape's camera calibration, align again and export",
+            )
+
+
+def _check_parameters(calibration: ElementTree.Element, where: str) -> None:
+    """Raise InputError for a lens parameter that is not zero and that the camera model has not, such as p3 of old versions."""
+    for child in calibration:
+        unknown = child.tag not in _TAGS and _PARAMETER.fullmatch(child.tag) is not None
+        if unknown and any(value != 0 for value in _numbers_of([child.text or ""])):
+            problem = f"has the lens parameter {child.tag} = {(child.text or '').strip()[:20]}, which would be left out"
+            allowed = ", ".join(_TAGS)
+            raise InputError(
+                problem, where=where, allowed=allowed, remedy=f"fix {child.tag} at 0 in Metashape and optimise again"
+            )
+
+
+def _numbers_of(texts: Iterable[str]) -> list[float]:
+    """The numbers that stand in some texts; NaN for other words."""
+    found = []
+    for word in " ".join(texts).split():
+        try:
+            found.append(float(word))
+        except ValueError:
+            found.append(float("nan"))
+    return found
+
+
 def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: FloatArray, where: str) -> Camera:
+    _check_parameters(calibration, where)
     interior = {name: float(_numbers(calibration.findtext(tag, "0"), 1, where)[0]) for tag, name in _TAGS.items()}
     if interior["f_px"] <= 0 or min(size) <= 0:
         raise InputError("has no frame size or no f", where=where, allowed="width, height and f greater than 0")
