@@ -69,7 +69,7 @@ class SensorPlan:
     @property
     def table(self) -> pandas.DataFrame:
         """A row for each map: its value in the middle of the wall, median, 5 and 95 % quantile; SI."""
-        middle = self.promise.middle()
+        middle = self.promise.in_middle
         return frame({"map": each.name, **each.summary(middle)} for each in self.promise.maps).set_index("map")
 
     def summary(self) -> str:

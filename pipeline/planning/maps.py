@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.config.simulation import SimulationConfig
+from pipeline.planning.curves import Curve, Views, middle_places, probability_curves
 from pipeline.precision import stereo_geometry as stereo
 from pipeline.precision import tls_geometry as tls
 from pipeline.precision.detectability import (
@@ -28,16 +28,16 @@ from sensors.cameras.rectification import rectify
 from sensors.laser.tls import LaserScanner
 from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
-_MIDDLE_SHARE = 0.1
-"""The middle of the wall are the places within this share of its smaller side from the middle of its extent."""
-_CURVE_POINTS = 80
 _FACES = {1: "", 2: "mean of two faces"}
 
 
 @dataclass(frozen=True)
 class PlanMap:
-    """One quantity over the wall. name: of its file, with the SI unit; title, unit, factor: to show it, unit = factor * SI;
-    values: (n,) of the raster's places, NaN where it has no meaning."""
+    """One quantity over the wall.
+
+    name: of its file, with the SI unit; title, unit, factor: to show it, unit = factor * SI; values: (n,) of the raster's places,
+    NaN where it has no meaning.
+    """
 
     name: str
     title: str
@@ -51,11 +51,16 @@ class PlanMap:
         return next((unit for unit in ("m", "rad") if self.name.endswith(f"_{unit}")), "1")
 
     def summary(self, middle: BoolArray) -> dict[str, float | None]:
-        """Median in the middle of the wall, and median and 5 and 95 % quantiles over all of it, SI; None where there are none."""
-        values, centre = self.values[np.isfinite(self.values)], self.values[middle & np.isfinite(self.values)]
+        """Summarise the map: median in the middle of the wall, and median and 5 and 95 % quantiles over all of it, SI.
+
+        middle: (n,) the places in the middle. A place without a value counts as infinite there: no block is large enough for it.
+        None: no value.
+        """
+        values, centre = self.values[np.isfinite(self.values)], np.nan_to_num(self.values[middle], nan=np.inf)
+        there = float(np.median(centre)) if centre.size else np.nan
         low, median, high = np.quantile(values, [0.05, 0.5, 0.95]).tolist() if values.size else (None, None, None)
         return {
-            "middle": float(np.median(centre)) if centre.size else None,
+            "middle": None if not np.isfinite(there) else there,
             "median": median,
             "quantile_5": low,
             "quantile_95": high,
@@ -63,21 +68,11 @@ class PlanMap:
 
 
 @dataclass(frozen=True)
-class Curve:
-    """Detection probability against one quantity, all else as in the middle of the wall. x, at: (k,) and the set-up's own value,
-    in the label's unit; probability: by the block's side, m, (k,)."""
-
-    label: str
-    x: FloatArray
-    at: float
-    probability: dict[float, FloatArray]
-
-
-@dataclass(frozen=True)
 class Plan:
     """What a sensor promises on a wall. instrument: what it is called; station: its number where a scanner has several, None for
     the only one and for all together; figures: single numbers, SI, by name; curves: detection probability; ignored: effects of
-    the model that a plan does not count."""
+    the model that a plan does not count; in_middle: (n,) the places of which headline, table and curves
+    speak where they say "in the middle of the wall"."""
 
     sensor: str
     instrument: str
@@ -89,21 +84,16 @@ class Plan:
     curves: list[Curve]
     ignored: list[str]
     config: PlanningConfig
+    in_middle: BoolArray
 
     @property
     def prefix(self) -> str:
         """What the names of its files begin with."""
         return self.sensor if self.station is None else f"{self.sensor}_station_{self.station}"
 
-    def middle(self) -> BoolArray:
-        """(n,) the places in the middle of the wall."""
-        points = self.raster.places.points[:, :2]
-        low, high = points.min(axis=0), points.max(axis=0)
-        return np.hypot(*(points - (low + high) / 2).T) <= _MIDDLE_SHARE * (high - low).min()
-
     def to_dict(self) -> dict[str, Any]:
         """Everything but the maps' pixels, for JSON."""
-        middle = self.middle()
+        middle = self.in_middle
         return {
             "sensor": self.sensor,
             "instrument": self.instrument,
@@ -152,6 +142,7 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
     right = found.in_right & seen_from(caster, places, nominal.right.position)
     both = left & right
     _require_seen(both, "no part of the wall is seen by both cameras", "cameras")
+    middle = middle_places(raster, both)
     sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
     orientation = np.sqrt(np.einsum("nii->ni", found.orientation_covariance))
     maps = [
@@ -180,15 +171,16 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
         "disparity_sigma_px": float(np.hypot(noise.white, noise.smooth)),
         "normal_case_sigma_z_m": _normal_case(pair, found.distance_m[both], noise),
     }
-    views = _middle_views(raster, both, (nominal.left.position + nominal.right.position) / 2, nominal.left.rotation[:, 1])
+    views = Views.of(places.at(middle), (nominal.left.position + nominal.right.position) / 2, nominal.left.rotation[:, 1])
 
     def sampling_of(virtual: Places) -> tuple[Sampling, BoolArray]:
         geometry = stereo.stereo_geometry(pair, virtual, config.image_sigma_px)
         return geometry.sampling, geometry.in_left & geometry.in_right
 
-    curves = _curves(sampling_of, views, config, ("depth map's cell, px of the frame", float(REDUCTION[pair.quality])))
+    curves = probability_curves(sampling_of, views, config, ("depth map's cell, px of the frame", float(REDUCTION[pair.quality])))
     ignored = _ignored(effect.name for effect in pair.model.effects if not effect.planned)
-    return Plan("stereo", "Stereo pair", None, wall, raster, maps, figures, curves, ignored, config)
+    found_there = maps, figures, curves, ignored, config, middle
+    return Plan("stereo", "Stereo pair", None, wall, raster, *found_there)
 
 
 def _tls_plan(
@@ -201,6 +193,7 @@ def _tls_plan(
     _require_seen(
         seen, "no part of the wall is seen by the scanner", "station" if station is None else f"station, number {station}"
     )
+    middle = middle_places(raster, seen)
     sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
     maps = [
         PlanMap("views", "Scanners that see the wall", seen.astype(float), "scanners"),
@@ -235,12 +228,12 @@ def _tls_plan(
         return geometry.sampling, geometry.reached
 
     step = float(np.sqrt(scanner.pattern.azimuth_step * scanner.pattern.zenith_step))
-    views = _middle_views(raster, seen, scanner.position, scanner.rotation[:, 2])
-    curves = _curves(sampling_of, views, config, ("angular step, mrad", step * 1e3))
+    views = Views.of(places.at(middle), scanner.position, scanner.rotation[:, 2])
+    curves = probability_curves(sampling_of, views, config, ("angular step, mrad", step * 1e3))
     ignored = _ignored(effect.name for effect in scanner.model.effects if not effect.planned)
     words = "Laser scanner", scanner.config.name, station and f"station {station}", _FACES[scanner.config.faces]
     instrument = ", ".join(str(word) for word in words if word)
-    return Plan("tls", instrument, station, wall, raster, maps, figures, curves, ignored, config)
+    return Plan("tls", instrument, station, wall, raster, maps, figures, curves, ignored, config, middle)
 
 
 def _together(single: list[Plan]) -> Plan:
@@ -260,7 +253,8 @@ def _together(single: list[Plan]) -> Plan:
         **{name: sum(plan.figures[name] for plan in single) for name in ("pulses", "seconds_to_scan")},
     }
     name = first.instrument.replace("station 1", f"{len(single)} stations together")
-    return replace(first, instrument=name, station=None, maps=maps, figures=figures, curves=[])
+    middle = middle_places(first.raster, seen > 0)
+    return replace(first, instrument=name, station=None, maps=maps, figures=figures, curves=[], in_middle=middle)
 
 
 def _values(plan: Plan, name: str) -> FloatArray:
@@ -288,76 +282,15 @@ def _if_any(found: PlanMap) -> list[PlanMap]:
 def _detection_maps(sampling: Sampling, seen: BoolArray, config: PlanningConfig) -> list[PlanMap]:
     title = f"Smallest block seen in {100 * config.probability:g} % of cases"
     maps = [_map("smallest_block_m", title, smallest_block(sampling, config), seen, "cm", 100.0)]
-    findable = f"Smallest block that any detector could see (S/N {FINDABLE:g})"
+    findable = f"Smallest block that stands out wherever it is (S/N {FINDABLE:g})"
     maps.append(_map("smallest_findable_m", findable, smallest_findable(sampling, config), seen, "cm", 100.0))
     for size in config.block_size_m:
         probability = np.where(seen, detection_probability(sampling, size, config), 0.0)
-        maps.append(
-            PlanMap(f"probability_{size * 1e3:.0f}mm", f"Probability to see a block of {size:g} m", probability, "%", 100.0)
-        )
+        name, words = f"probability_{size * 1e3:.0f}mm", f"Probability to see a block of {size:g} m"
+        maps.append(PlanMap(name, words, probability, "%", 100.0))
     return maps
 
 
 def _normal_case(pair: StereoPair, distance: FloatArray, noise: stereo.DisparityNoise) -> float:
     """sigma_Z = Z^2 / (c B) sigma_p at the median distance, m, as a check by a rule of thumb."""
     return float(np.median(distance) ** 2 / (rectify(pair.cameras).f * pair.cameras.base_m) * np.hypot(noise.white, noise.smooth))
-
-
-@dataclass(frozen=True)
-class _Views:
-    """Squarely or obliquely hit planes in the direction of the middle of the wall. upright: (3,) the axis by which they turn."""
-
-    viewpoint: FloatArray
-    towards: FloatArray
-    upright: FloatArray
-    range_m: float
-    incidence_rad: float
-    albedo: float
-
-    def places(self, range_m: FloatArray, incidence_rad: FloatArray) -> Places:
-        """Planes at these ranges and angles of incidence, (k,) each."""
-        back = -np.broadcast_to(self.towards, (len(range_m), 3))
-        sideways = np.cross(self.upright, self.towards)
-        sideways = sideways / np.linalg.norm(sideways)
-        normals = np.cos(incidence_rad)[:, None] * back + np.sin(incidence_rad)[:, None] * sideways
-        return Places(self.viewpoint + range_m[:, None] * self.towards, normals, np.full(len(range_m), self.albedo))
-
-
-def _middle_views(raster: WallRaster, seen: BoolArray, viewpoint: FloatArray, upright: FloatArray) -> _Views:
-    """The middle of the wall: median range and incidence of the tenth of the seen places that are nearest to it."""
-    points = raster.places.points[seen]
-    middle = (raster.places.points.min(axis=0) + raster.places.points.max(axis=0)) / 2
-    near = np.argsort(np.hypot(*(points - middle)[:, :2].T), kind="stable")[: max(len(points) // 10, 1)]
-    sight = points[near] - viewpoint
-    distance = np.linalg.norm(sight, axis=1)
-    cosine = -np.einsum("ni,ni->n", sight, raster.places.normals[seen][near]) / distance
-    towards = sight.mean(axis=0) / np.linalg.norm(sight.mean(axis=0))
-    incidence, albedo = float(np.arccos(np.clip(np.median(cosine), -1, 1))), float(np.median(raster.places.albedo[seen][near]))
-    return _Views(viewpoint, towards, upright, float(np.median(distance)), incidence, albedo)
-
-
-def _curves(
-    sampling_of: Callable[[Places], tuple[Sampling, BoolArray]], view: _Views, config: PlanningConfig, step: tuple[str, float]
-) -> list[Curve]:
-    """Detection probability against range, step and incidence. step: label of the step's axis and the set-up's value there."""
-    ranges = np.geomspace(view.range_m / 5, view.range_m * 5, _CURVE_POINTS)
-    angles = np.linspace(0, np.radians(85), _CURVE_POINTS)
-    steps = np.geomspace(0.1, 10, _CURVE_POINTS)
-    flat = np.ones(_CURVE_POINTS)
-
-    def curve(label: str, x: FloatArray, at: float, places: Places, scale: FloatArray = flat) -> Curve:
-        sampling, reached = sampling_of(places)
-        stretched = replace(sampling, step_a=sampling.step_a * scale, step_b=sampling.step_b * scale)
-        sizes = config.block_size_m
-        return Curve(
-            label, x, at, {size: np.where(reached, detection_probability(stretched, size, config), 0.0) for size in sizes}
-        )
-
-    at_range = view.places(ranges, flat * view.incidence_rad)
-    here = view.places(flat * view.range_m, flat * view.incidence_rad)
-    tilted = view.places(flat * view.range_m, angles)
-    return [
-        curve("range, m", ranges, view.range_m, at_range),
-        curve(step[0], steps * step[1], step[1], here, steps),
-        curve("angle of incidence, deg", np.degrees(angles), float(np.degrees(view.incidence_rad)), tilted),
-    ]

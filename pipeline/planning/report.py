@@ -11,6 +11,7 @@ import yaml
 
 from pipeline.formats.files.atomic import write_text
 from pipeline.planning.maps import Plan, PlanMap
+from pipeline.precision.detectability import FINDABLE
 from pipeline.report.figures import CurvePanel, curves_figure, map_figure
 from pipeline.report.page import percent, template
 
@@ -78,14 +79,16 @@ def answer(plan: Plan) -> str:
     name = plan.instrument
     if middle is None or least is None:
         return f"{name}: in the middle of the wall no block is seen in {share} of cases."
+    points = plan.config.minimum_points
     return (
-        f"{name}: the smallest block seen in {share} of cases in the middle of the wall has sides of {100 * middle:.1f} cm; "
-        f"the smallest that any detector could see, {100 * least:.1f} cm."
+        f"{name}: at a typical place in the middle of the wall, the fall of a block with sides of {100 * middle:.1f} cm exceeds "
+        f"the level of detection in {share} of cases, a test that needs {points} points in each epoch. The signal-to-noise ratio "
+        f"of a fall is {FINDABLE:g} from sides of {100 * least:.1f} cm on; below, noise elsewhere on the wall looks like a block."
     )
 
 
 def _in_the_middle(plan: Plan, name: str) -> float | None:
-    return next(found for found in plan.maps if found.name == name).summary(plan.middle())["middle"]
+    return next(found for found in plan.maps if found.name == name).summary(plan.in_middle)["middle"]
 
 
 def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any]) -> None:
@@ -117,7 +120,7 @@ def _figures(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _rows(plan: Plan) -> list[_PlanRow]:
-    middle = plan.middle()
+    middle = plan.in_middle
     return [_PlanRow(found.title, found.unit, _values(found, found.summary(middle))) for found in plan.maps]
 
 

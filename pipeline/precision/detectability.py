@@ -136,7 +136,7 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
             points = lines_a * lines_b
             found = _exceeds(hit * depth, points, white, spread, kept, config)
             total += share_a * share_b * np.where(points.min(axis=0) >= config.minimum_points, found, 0.0)
-    return total
+    return np.minimum(total, 1.0)  # a sum of rounded shares
 
 
 def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:

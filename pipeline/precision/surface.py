@@ -30,6 +30,10 @@ class Places:
     normals: FloatArray
     albedo: FloatArray
 
+    def at(self, chosen: BoolArray) -> Places:
+        """Return some of the places: a mask (n,)."""
+        return Places(self.points[chosen], self.normals[chosen], self.albedo[chosen])
+
 
 @dataclass(frozen=True)
 class WallRaster:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
@@ -56,6 +57,10 @@ _GREYS = colormaps["gray"].resampled(64)
 SEQUENTIAL = colormaps["viridis"].resampled(48)
 _MOST_NUMBERED, _MOST_ZOOMED, _ZOOMS_A_ROW = 200, 24, 6
 """Blocks whose numbers stand on a map, and that are shown by themselves."""
+_MOST_STEPS = 12
+"""Whole numbers that can be told apart by their colours."""
+_LETTER_IN = 0.066
+"""Width of a letter of a colour bar's label."""
 _TWO_DECADES = 250.0
 """Span of a logarithmic axis from which on the numbers of 2 and 5 have no room."""
 _CROWDED = 0.15
@@ -176,30 +181,44 @@ def blocks_figure(
 def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str = "") -> bytes:
     """Any quantity (h, w) over the wall, NaN without data, in the unit of `label`; colours span its 1 to 99 % quantiles.
 
-    They grow by equal factors where the wall would be nearly all of one colour otherwise.
+    They grow by equal factors where the wall would be nearly all of one colour otherwise. Whole numbers, such as counts, get a
+    colour each. A quantity that is the same everywhere is told in words instead of a colour bar.
     """
+    known = values[np.isfinite(values)]
+    counts = bool(known.size) and np.array_equal(known, np.round(known))
     pooled = mean_pooled(values, pooling(grid))
+    pooled = np.round(pooled) if counts else pooled
     known = pooled[np.isfinite(pooled)]
-    scale = _scale(known)
+    scale = _count_scale(known) if counts else _scale(known)
     figure, axes = _map_figure(grid, title, size=_PAIRED)
     axes.set_facecolor(NO_DATA)
     image = axes.imshow(pooled, cmap=SEQUENTIAL, norm=scale, extent=raster_extent(grid, pooled.shape), interpolation="nearest")
+    if known.size and np.ptp(known) <= 1e-6 * np.abs(known).max():
+        axes.text(0.0, 1.01, f"{known[0]:.4g} {label} everywhere", transform=axes.transAxes, fontsize=9, va="bottom")
+        _no_data_legend(axes, pooled, NO_DATA)
+        return png_bytes(figure)
     beyond = known.size and (known.min() < scale.vmin or known.max() > scale.vmax)
     bar = _colour_bar(figure, axes, image, label, "both" if beyond else "neither")
     if isinstance(scale, LogNorm):
         plain_numbers(bar.long_axis)
-    elif np.array_equal(known, np.round(known)):
+    elif counts:
         bar.locator = MaxNLocator(integer=True)
+        bar.minorticks_off()
     _no_data_legend(axes, pooled, NO_DATA)
     return png_bytes(figure)
+
+
+def _count_scale(known: NDArray[np.floating]) -> Normalize:
+    """The colour scale of whole numbers (n,): a step for each, of many a continuous one."""
+    low, high = float(known.min()), float(known.max())
+    if high - low > _MOST_STEPS:
+        return _scale(known)
+    return BoundaryNorm(np.arange(low - 0.5, high + 1.0), SEQUENTIAL.N)
 
 
 def _scale(known: NDArray[np.floating]) -> Normalize:
     """The colour scale of a map's values (n,): their 1 to 99 % quantiles, logarithmic where half of them crowd at its low end."""
     low, middle, high = np.quantile(known, [0.01, 0.5, 0.99]).tolist() if known.size else (0.0, 0.5, 1.0)
-    if high - low <= 1e-6 * abs(high):
-        margin = max(1e-3 * abs(low), 1e-12)
-        return Normalize(low - margin, high + margin)
     crowded = low > 0 and middle - low < _CROWDED * (high - low)
     return LogNorm(low, high) if crowded else Normalize(low, high)
 
@@ -367,7 +386,8 @@ def _colour_bar(figure: Figure, axes: Axes, image: AxesImage, label: str, extend
         place, orientation = (box.x1 + 0.15 / width, box.y0, 0.16 / width, box.height), "vertical"
     bar = figure.colorbar(image, cax=figure.add_axes(place), extend=extend, orientation=orientation)
     bar.ax.tick_params(labelsize=8)
-    bar.set_label(label, fontsize=9)
+    length = (box.height * height if orientation == "vertical" else 0.8 * box.width * width) / _LETTER_IN
+    bar.set_label(fill(label, max(int(length), 12)), fontsize=9)
     return bar
 
 

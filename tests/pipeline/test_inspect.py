@@ -12,17 +12,22 @@ import pytest
 from scipy import stats
 from surfaces import plane, step
 
+from pipeline.api.configs import configure
 from pipeline.cli import main as cli
 from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.planning.inspect import write_plans
 from pipeline.planning.maps import plans
+from pipeline.planning.report import answer
 from pipeline.precision.stereo_geometry import stereo_geometry
 from pipeline.precision.surface import Places, seen_from, wall_raster
 from pipeline.precision.tls_geometry import TlsGeometry, tls_geometry
+from pipeline.report import figures
+from pipeline.report.figures import map_figure
 from pipeline.run.site import prepare_site
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
+from scene.geometry.grid import Grid
 from scene.geometry.mesh import TriangleMesh
 from scene.ray_casting.raycast import RayCaster
 from sensors.cameras.camera import Camera, CameraPair
@@ -260,7 +265,7 @@ def test_the_command_says_which_block_is_seen(config: Path, tmp_path: Path, caps
     words = ["inspect", str(config), "--sensor", "tls", "--set", "station.distance_m=100"]
     assert cli.main([*words, "--out", str(tmp_path / "plan")]) == 0
     printed = capsys.readouterr().out
-    assert "the smallest block seen in 95 % of cases in the middle of the wall has sides of" in printed
+    assert "at a typical place in the middle of the wall, the fall of a block with sides of" in printed
     assert "Stereo" not in printed
 
 
@@ -335,3 +340,52 @@ def test_a_folder_in_use_is_left_alone(config: Path, tmp_path: Path, capsys: pyt
 def test_a_missing_config_is_an_input_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["inspect", str(tmp_path / "none.yaml")]) == 2
     assert "cannot be read" in capsys.readouterr().err
+
+
+SET_UPS: dict[str, tuple[str, dict[str, Any]]] = {
+    "pair, near": ("stereo", {"wall__width_m": 8.0, "wall__height_m": 5.0, "cameras__distance_m": 12.0, "cameras__base_m": 3.0}),
+    "pair, far": ("stereo", {"cameras__distance_m": 120.0, "cameras__base_m": 20.0, "depth_map": "low"}),
+    "pair of 46 Mpx": (
+        "stereo",
+        {
+            "wall__width_m": 40.0,
+            "wall__height_m": 25.0,
+            "cameras": {"distance_m": 81.0, "base_m": 20.0, "width": 8256, "height": 5504},
+        },
+    ),
+    "scanner, near": ("tls", {"wall__width_m": 8.0, "wall__height_m": 5.0, "station__distance_m": 15.0}),
+    "scanner, far": ("tls", {"station__distance_m": 300.0}),
+}
+
+
+@pytest.mark.parametrize("name", SET_UPS)
+def test_headline_table_and_curves_say_the_same(name: str) -> None:
+    """The curves at the set-up's own value are the table's middle, and the headline's block is the smallest that is seen."""
+    sensor, keys = SET_UPS[name]
+    size = {"wall__width_m": 20.0, "wall__height_m": 12.0} | keys
+    sides = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+    config = configure(None, sensor, wall__resolution_m=0.1, planning__block_size_m=sides, planning__gsd_m=0.1, **size)
+    (plan,) = plans(config, prepare_site(config, sensor, KeyedRandom(config.seed)))
+    table = {each.name: each.summary(plan.in_middle)["middle"] for each in plan.maps}
+    assert len(plan.curves) == 3
+    for curve in plan.curves:
+        here = int(np.flatnonzero(curve.x == curve.at)[0])
+        for side, probability in curve.probability.items():
+            assert probability[here] == pytest.approx(table[f"probability_{side * 1e3:.0f}mm"], abs=0.01)
+            if table["smallest_block_m"] is not None and side > 1.01 * table["smallest_block_m"]:
+                assert probability[here] >= config.planning.probability
+            if table["smallest_block_m"] is None or side < 0.99 * table["smallest_block_m"]:
+                assert probability[here] < config.planning.probability
+    assert all(np.all(values <= 1.0) for curve in plan.curves for values in curve.probability.values())
+    if table["smallest_block_m"] is not None:
+        assert f"sides of {100 * table['smallest_block_m']:.1f} cm exceeds" in answer(plan)
+
+
+def test_a_map_of_counts_has_whole_steps_and_a_constant_is_told_in_words() -> None:
+    grid = Grid(0.0, 3.0, 0.1, 40, 30)
+    counts = np.ones((30, 40))
+    constant = map_figure(counts, grid, "cameras", "Cameras that see the wall")
+    counts[:, :20] = 2
+    assert len(map_figure(counts, grid, "cameras", "Cameras that see the wall")) != len(constant)
+    scale = figures._count_scale(np.array([0.0, 1.0, 2.0]))
+    np.testing.assert_array_equal(scale.boundaries, [-0.5, 0.5, 1.5, 2.5])

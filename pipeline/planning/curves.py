@@ -1,0 +1,146 @@
+"""Detection probability in the middle of the wall, against range, angular step or cell, and angle of incidence.
+
+The headline of a plan, the column "middle" of its table and the curves all speak of the same places, and of the median over
+them, so that they cannot contradict one another: the median of the smallest blocks is the size from which on the median
+probability suffices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.precision.detectability import PlanningConfig, Sampling, detection_probability
+from pipeline.precision.surface import BoolArray, Places, WallRaster
+from scene.geometry.mesh import FloatArray
+
+_MIDDLE_SHARE = 0.1
+"""The middle of the wall are the places within this share of its smaller side from the middle of its extent."""
+_MOST_PLACES = 201
+_CURVE_POINTS = 80
+_LARGEST_INCIDENCE_RAD = np.radians(85)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Detection probability against one quantity, the median over the places in the middle of the wall, all else as it is there.
+
+    x: (k,) in the label's unit; at: the set-up's own value, one of x; probability: by the block's side, m, (k,).
+    """
+
+    label: str
+    x: FloatArray
+    at: float
+    probability: dict[float, FloatArray]
+
+
+def middle_places(raster: WallRaster, seen: BoolArray) -> BoolArray:
+    """Return which of the n places stand for the middle of the wall: those that are seen there, at most some hundred, evenly
+    chosen."""
+    points = raster.places.points[:, :2]
+    low, high = points.min(axis=0), points.max(axis=0)
+    near = np.hypot(*(points - (low + high) / 2).T) <= _MIDDLE_SHARE * (high - low).min()
+    rows = np.flatnonzero(near & seen)
+    chosen = np.zeros(len(seen), dtype=bool)
+    chosen[rows[:: max(-(-len(rows) // _MOST_PLACES), 1)]] = True
+    return chosen
+
+
+@dataclass(frozen=True)
+class Views:
+    """The places in the middle of the wall as the sensor sees them, to be seen from elsewhere.
+
+    viewpoint: (3,) m; places: k of them; aside: (k, 3) unit vectors across the lines of sight, towards which the normals lean;
+    range_m, incidence_rad: (k,).
+    """
+
+    viewpoint: FloatArray
+    places: Places
+    aside: FloatArray
+    range_m: FloatArray
+    incidence_rad: FloatArray
+
+    @classmethod
+    def of(cls, places: Places, viewpoint: FloatArray, upright: FloatArray) -> Views:
+        """Of some places seen from a viewpoint (3,); upright: (3,) the axis about which a surface turns that is met squarely."""
+        sight = places.points - viewpoint
+        distance = np.linalg.norm(sight, axis=1)
+        back = -sight / distance[:, None]
+        cosine = np.clip(np.einsum("ni,ni->n", back, places.normals), -1.0, 1.0)
+        aside = places.normals - cosine[:, None] * back
+        length = np.linalg.norm(aside, axis=1, keepdims=True)
+        sideways = np.cross(upright, -back)
+        sideways /= np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-12)
+        aside = np.where(length > 1e-9, aside / np.maximum(length, 1e-12), sideways)
+        return cls(viewpoint, places, aside, distance, np.arccos(cosine))
+
+    def seen_at(self, ratio: float = 1.0, turn_rad: float = 0.0) -> Places:
+        """Return the places at `ratio` times their range, with their angles of incidence larger by `turn_rad`."""
+        sight = self.places.points - self.viewpoint
+        if turn_rad == 0:
+            return replace(self.places, points=self.viewpoint + ratio * sight)
+        angle = np.clip(self.incidence_rad + turn_rad, 0.0, _LARGEST_INCIDENCE_RAD)[:, None]
+        normals = np.cos(angle) * -sight / self.range_m[:, None] + np.sin(angle) * self.aside
+        return Places(self.viewpoint + ratio * sight, normals, self.places.albedo)
+
+
+def probability_curves(
+    sampling_of: Callable[[Places], tuple[Sampling, BoolArray]], views: Views, config: PlanningConfig, step: tuple[str, float]
+) -> list[Curve]:
+    """Compute the median detection probability against range, step and angle of incidence.
+
+    Parameters
+    ----------
+    sampling_of : callable
+        Gives the sampling of places and whether the sensor reaches each.
+    views : Views
+        The places in the middle of the wall.
+    config : PlanningConfig
+        Sizes of the blocks and the level of detection.
+    step : (str, float)
+        Label of the step's axis and the set-up's own value there.
+
+    Returns
+    -------
+    list of Curve
+        Three; none where nothing is seen in the middle of the wall.
+    """
+    if not len(views.range_m):
+        return []
+    ratios = _with(np.geomspace(0.2, 5.0, _CURVE_POINTS), 1.0)
+    steps = _with(np.geomspace(0.1, 10.0, _CURVE_POINTS), 1.0)
+    here = float(np.median(views.incidence_rad))
+    turns = _with(np.linspace(0.0, _LARGEST_INCIDENCE_RAD, _CURVE_POINTS) - here, 0.0)
+    own = sampling_of(views.seen_at())
+
+    def stretched(scale: float) -> tuple[Sampling, BoolArray]:
+        sampling, reached = own
+        return replace(sampling, step_a=sampling.step_a * scale, step_b=sampling.step_b * scale), reached
+
+    def curve(label: str, x: FloatArray, at: float, found: list[tuple[Sampling, BoolArray]]) -> Curve:
+        shares = {size: np.array([_median(each, size, config) for each in found]) for size in config.block_size_m}
+        return Curve(label, x, at, shares)
+
+    distance = float(np.median(views.range_m))
+    return [
+        curve("range, m", ratios * distance, distance, [sampling_of(views.seen_at(ratio)) for ratio in ratios]),
+        curve(step[0], steps * step[1], step[1], [stretched(scale) for scale in steps]),
+        curve(
+            "angle of incidence, deg",
+            np.degrees(turns + here),
+            float(np.degrees(here)),
+            [sampling_of(views.seen_at(turn_rad=turn)) for turn in turns],
+        ),
+    ]
+
+
+def _median(found: tuple[Sampling, BoolArray], size: float, config: PlanningConfig) -> float:
+    """Median probability over places; one that the sensor does not reach counts 0."""
+    return float(np.median(np.where(found[1], detection_probability(found[0], size, config), 0.0)))
+
+
+def _with(x: FloatArray, value: float) -> FloatArray:
+    """The sorted values with one more among them."""
+    return np.unique(np.append(x, value))
