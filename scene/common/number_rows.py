@@ -6,6 +6,7 @@ between the rows, missing values, and the message.
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ from scene.common.errors import InputError
 
 COMMENTS = ("#", "//", "%", "!")
 """What a line of text begins with that is no row."""
+_TRAILING = re.compile(r"\s(?:#|//)")
+"""Where a comment begins behind a row."""
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 _COMMA = re.compile(r"[+-]?(\d+,\d*|\d*,\d+)([eEdD][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}([.,'\u2019\u00a0\u202f_ ]\d{3})+([.,]\d*)?")
@@ -32,7 +35,7 @@ class RowForm:
 
     separator: between values, None for white space; decimal_comma: whether numbers have a comma for the decimal mark; columns:
     values of a row; first_line: number, from 1, of the first line in the file; counts: whether a line of one whole number
-    between the rows states how many follow.
+    between the rows states how many follow; words: columns, from 0, that hold words in place of numbers, read as NaN.
     """
 
     separator: str | None = None
@@ -40,6 +43,7 @@ class RowForm:
     columns: int = 0
     first_line: int = 1
     counts: bool = False
+    words: tuple[int, ...] = ()
 
 
 @dataclass
@@ -52,9 +56,20 @@ class RowsFound:
 
 
 def split_row(line: str, separator: str | None) -> list[str]:
-    """The values of a line, without quotation marks; the last one is empty where a separator ends the line."""
+    """The values of a line, without quotation marks and a comment behind them; the last is empty where a separator ends them."""
+    if "#" in line or "//" in line:
+        line = _TRAILING.split(line, maxsplit=1)[0]
+    if separator is not None and '"' in line:
+        return [word.strip() for word in next(csv.reader([line.strip(" \r\n")], delimiter=separator, skipinitialspace=True))]
     words = line.split() if separator is None else [word.strip() for word in line.strip(" \r\n").split(separator)]
     return [word.strip("\"'") if word[:1] in "\"'" else word for word in words]
+
+
+def is_number(word: str) -> bool:
+    """Whether a word stands for a number, a missing or an infinite one too, with a decimal point, a comma or grouped digits."""
+    plain = word.lower()
+    number = _POINT.fullmatch(word) or _COMMA.fullmatch(word) or _GROUPED.fullmatch(word)
+    return bool(number) or plain.removeprefix("-") in _MISSING | _INFINITE or plain in _INFINITE
 
 
 def is_grouped(word: str, *, decimal_comma: bool) -> bool:
@@ -104,7 +119,8 @@ def _values(lines: Iterable[str], form: RowForm, found: RowsFound, where: str) -
             stated, rows, at = found.blocks[-1]
             found.blocks[-1] = (stated, rows + 1, at)
         for column, word in enumerate(words, start=1):
-            yield _value(word, form, found, f"{where}, line {number:,}, column {column}")
+            place = f"{where}, line {number:,}, column {column}"
+            yield float("nan") if column - 1 in form.words else _value(word, form, found, place)
 
 
 def _value(word: str, form: RowForm, found: RowsFound, where: str) -> float:

@@ -57,6 +57,12 @@ def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
         raise InputError(f"is not a whole PLY file ({error})", where=str(path), remedy="export it again") from None
 
 
+def header_remarks(path: Path) -> list[str]:
+    """The comments in a file's header, of a file that `read_elements` has read."""
+    with path.open("rb") as file:
+        return [" ".join(words[1:]) for words in _header_lines(file) if words[:1] in (["comment"], ["obj_info"])]
+
+
 def _last(elements: list[_Element], only: str) -> int:
     return next((index + 1 for index, element in enumerate(elements) if element.name == only), len(elements))
 

@@ -401,6 +401,14 @@ def test_a_ply_file_with_more_points_than_it_states_is_an_error(tmp_path: Path, 
         read_points(tmp_path / "a.ply")
 
 
+def test_a_comment_on_the_place_of_ply_points_is_said(tmp_path: Path) -> None:
+    """PLY has no field for a coordinate system or a shift; what programs write into comments is not applied, and said."""
+    header = "ply\nformat ascii 1.0\ncomment made by hand\ncomment offset 345200 6389400 0\nelement vertex 2\n"
+    axes = "".join(f"property double {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(f"{header}{axes}end_header\n1 2 3\n4 5 7\n")
+    assert read_points(tmp_path / "a.ply").notes == ("its header has 'offset 345200 6389400 0', which is not applied",)
+
+
 # --- every door
 
 

@@ -224,3 +224,43 @@ def test_a_line_that_is_passed_over_is_said(tmp_path: Path) -> None:
 def test_sentences_before_the_points_are_no_names(tmp_path: Path) -> None:
     for line in ("# north face, morning", "# lat 47.1 lon 8.2 of the station", "// x y z are in the local grid of the mine"):
         np.testing.assert_array_equal(read_points(written(tmp_path, line + "\n" + rows())).points, POINTS)
+
+
+def test_a_file_that_ends_within_a_number_is_cut_off(tmp_path: Path) -> None:
+    whole = "".join(f"{x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in POINTS[2] + 0.25 * np.arange(90)[::-1, None])
+    for end, whole_file in ((-1, True), (-2, False), (-4, False)):
+        path = written(tmp_path, whole[:end])
+        if whole_file:
+            assert len(read_points(path).points) == 90
+            continue
+        with pytest.raises(InputError, match=r"ends within a number: '122\.5.*4 decimals.*cut off"):
+            read_points(path)
+
+
+def test_a_column_of_words_is_left_out_by_name(tmp_path: Path) -> None:
+    found = read_points(written(tmp_path, "X,Y,Z,Class,Intensity\n" + rows(",", tail=",hard rock,7"), name="a.csv"))
+    np.testing.assert_array_equal(found.points, POINTS)
+    np.testing.assert_array_equal(found.intensity, [7, 7, 7])
+    assert found.notes == ("column 4 (class) holds words and is left out",)
+    with pytest.raises(InputError, match=r"line 3, column 4: 'rock' is no number"):
+        read_points(written(tmp_path, "X,Y,Z,Class\n" + rows(",", tail=",7").replace(",7", ",rock", 2).replace(",rock", ",7", 1)))
+
+
+def test_a_coordinate_that_is_missing_everywhere_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="column 2, taken for y, is empty in all 3 rows"):
+        read_points(written(tmp_path, rows(",").replace(",6389", ",,6389")))
+
+
+@pytest.mark.parametrize(("start", "problem"), [("ply\n", "is a PLY file"), ("# .PCD v.7 - Point Cloud\n", "is a PCD file")])
+def test_files_of_other_formats_are_told_by_their_first_line(tmp_path: Path, start: str, problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        read_points(written(tmp_path, start + rows()))
+
+
+@pytest.mark.parametrize("row", ['"{0}","{1}","{2}"', "{0} {1} {2} # good", "{0:.9e} {1:.9e} {2:.9e}", "{0:.4f}D+00 {1} {2}"])
+def test_numbers_as_other_programs_write_them(tmp_path: Path, row: str) -> None:
+    """In quotation marks, with a comment behind them, with exponents of C and of Fortran."""
+    text = "\n".join(row.format(*point) for point in POINTS)
+    np.testing.assert_allclose(read_points(written(tmp_path, text, name="a.csv")).points, POINTS, rtol=1e-9)
+    quoted = "\n".join(",".join(f'"{value:.4f}"'.replace(".", ",") for value in point) for point in POINTS)
+    np.testing.assert_allclose(read_points(written(tmp_path, quoted, name="b.csv")).points, POINTS, rtol=1e-9)

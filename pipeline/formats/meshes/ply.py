@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,7 +14,7 @@ from pipeline.formats.files.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
 from scene.common.errors import InputError
 from scene.geometry.mesh import TriangleMesh
-from scene.meshes.ply import Columns, read_elements
+from scene.meshes.ply import Columns, header_remarks, read_elements
 
 _CHUNK = 1_000_000
 """Records in memory at a time while writing."""
@@ -78,7 +79,16 @@ def read_ply_points(path: Path) -> PointCloud:
         raise InputError("holds no vertices", where=str(path))
     names = [name for name in vertex if name not in ("x", "y", "z") and vertex[name].ndim == 1]
     extra = {_channel(name, vertex): _native(vertex[name]) for name in names}
-    return PointCloud(_points(vertex, path), _column(extra, "intensity"), _column(extra, "gps_time", np.float64), _others(extra))
+    lists = [name for name in vertex if vertex[name].ndim != 1]
+    notes = [f"its header has '{remark:.80}', which is not applied" for remark in header_remarks(path) if _PLACE.search(remark)]
+    notes += [f"lists that are not read: {', '.join(lists)}"] if lists else []
+    return PointCloud(
+        _points(vertex, path), _column(extra, "intensity"), _column(extra, "gps_time", np.float64), _others(extra), tuple(notes)
+    )
+
+
+_PLACE = re.compile(r"unit|feet|foot|epsg|crs|projection|offset|shift|scale|translat", re.IGNORECASE)
+"""Words of comments that may say where the points are and in which unit; PLY itself has no place for it."""
 
 
 def _channel(name: str, vertex: Columns) -> str:

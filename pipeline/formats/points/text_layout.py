@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scene.common.errors import InputError
-from scene.common.number_rows import COMMENTS, GROUPED, RowForm, is_grouped, split_row
+from scene.common.number_rows import COMMENTS, GROUPED, RowForm, is_grouped, is_number, split_row
 
-_HEADER_LINES = 100
+_HEADER_LINES = 1000
 _SAMPLE_LINES = 200
 LONGEST_LINE = 65_536
 _BYTE_ORDER_MARKS = (
@@ -30,6 +30,7 @@ _THREE_DIGITS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 """A number that may have three decimals behind a comma, or a comma between thousands."""
 _GRID = ("ncols", "nrows", "xllcorner", "xllcenter")
 """What the header of a grid of heights begins with."""
+_SEVERAL_GROUPS = re.compile(r"[+-]?\d{1,3}(,\d{3}){2}")
 _FEW = 0.05
 """Share of a column's values from which whole numbers beside ones with a comma tell that the comma is no decimal mark."""
 _ROWS = "one point a line, x y z and what else there is, separated by spaces, tabs, commas or semicolons"
@@ -87,16 +88,29 @@ def layout_of(path: Path) -> TextLayout:
     encoding = encoding_of(path)
     with path.open(encoding=encoding, errors="replace") as file:
         lines = list(itertools.islice(file, _HEADER_LINES + _SAMPLE_LINES))
+    _check_kind(lines, str(path))
     first = next((index for index, line in enumerate(lines[:_HEADER_LINES]) if _is_row(line)), None)
     if first is None:
         raise _no_rows(lines, str(path))
-    if any(line.lower().startswith(_GRID) for line in lines[:first]):
-        remedy = "convert it to a GeoTIFF, as gdal_translate does, and give that as an elevation model"
-        raise InputError("is a grid of heights (ESRI ASCII), no list of points", where=str(path), allowed=_ROWS, remedy=remedy)
     sample = list(itertools.takewhile(_is_row, lines[first : first + _SAMPLE_LINES]))
     form = form_of(sample, first + 1, str(path))
     header, stated = _header(lines[:first])
     return TextLayout(encoding, header, form, stated)
+
+
+def _check_kind(lines: Sequence[str], where: str) -> None:
+    """Raise InputError for files of other kinds that also hold rows of numbers."""
+    start = lines[0].strip().lower() if lines else ""
+    problem, remedy = "", ""
+    if start == "ply":
+        problem, remedy = "is a PLY file by its first line", "give it the suffix .ply"
+    elif start.startswith("# .pcd"):
+        problem, remedy = "is a PCD file by its first line", "convert it to PLY or LAS"
+    elif any(line.lower().startswith(_GRID) for line in lines[:_HEADER_LINES]):
+        problem = "is a grid of heights (ESRI ASCII), no list of points"
+        remedy = "convert it to a GeoTIFF, as gdal_translate does, and give that as an elevation model"
+    if problem:
+        raise InputError(problem, where=where, allowed=_ROWS, remedy=remedy)
 
 
 def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
@@ -109,11 +123,12 @@ def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
     columns = len(rows[0])
     if columns > 1 and all(len(row) == columns and not row[-1] for row in rows):  # a separator ends each line
         columns -= 1
-    if separator != ",":
+    if separator != "," or any('"' in line for line in sample):
         commas = sum(bool(_DECIMAL_COMMA.fullmatch(word)) for row in rows for word in row)
         decimal_comma |= commas > sum("." in word and "," not in word for row in rows for word in row)
     _check_grouping(rows, decimal_comma, first_line, where)
-    return RowForm(separator, decimal_comma, columns, first_line, counts=True)
+    words = tuple(index for index in range(columns) if not any(is_number(row[index]) for row in rows if len(row) > index))
+    return RowForm(separator, decimal_comma, columns, first_line, counts=True, words=words)
 
 
 def _separator(sample: Sequence[str]) -> tuple[str | None, bool]:
@@ -125,6 +140,8 @@ def _separator(sample: Sequence[str]) -> tuple[str | None, bool]:
     if not all("," in line for line in sample):
         return None, False
     apart = [split_row(line, None) for line in sample]
+    if all(len(words) >= 3 for words in apart) and any(_SEVERAL_GROUPS.match(word) for words in apart for word in words):
+        return None, False  # which the check of the grouping then names
     if all(len(words) >= 3 and any(map(_DECIMAL_COMMA.fullmatch, words)) for words in apart):
         inside = all("," not in word or re.fullmatch(r"[^,]*\d,\d[^,]*", word) for words in apart for word in words)
         if inside:
@@ -163,13 +180,7 @@ def _is_row(line: str) -> bool:
 
 def _is_number(word: str) -> bool:
     plain = word.strip("\"'")
-    if _DECIMAL_COMMA.fullmatch(plain) or is_grouped(plain, decimal_comma=False):
-        return True
-    try:
-        float(plain)
-    except ValueError:
-        return False
-    return "_" not in plain
+    return bool(plain) and is_number(plain)
 
 
 def _header(lines: Sequence[str]) -> tuple[tuple[HeaderLine, ...], int | None]:

@@ -16,13 +16,15 @@ from pipeline.formats.points.column_names import SKIPPED, Column, named_columns,
 from pipeline.formats.points.text_layout import LONGEST_LINE, TextLayout, layout_of
 from pipeline.formats.units import AxisUnits
 from scene.common.errors import InputError
-from scene.common.number_rows import RowsFound, read_rows
+from scene.common.number_rows import RowsFound, read_rows, split_row
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import FloatArray
 
 _CHUNK = 200_000
 """Points in memory as text at a time while writing."""
 _SAMPLE = 10_000
+_FEWEST_ALIKE = 50
+"""Rows with one number of decimals from which on that is no chance."""
 _COLOURS = ["red", "green", "blue"]
 
 
@@ -73,7 +75,9 @@ def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     _check_counts(len(values), layout, found, where)
-    given, notes = _columns(layout, values, columns, where)
+    _check_end(path, layout)
+    given, notes = _without_words(*_columns(layout, values, columns, where), layout)
+    _check_present(values, given, where)
     if found.missing:
         notes = (*notes, f"{found.missing:,} values are empty or no numbers")
     if layout.form.decimal_comma:
@@ -84,7 +88,7 @@ def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
 def _values(path: Path, layout: TextLayout) -> tuple[FloatArray, RowsFound]:
     """The numbers of a file: by NumPy where it is plain, else line by line, which says where it is wrong."""
     form, before = layout.form, layout.form.first_line - 1
-    if not form.decimal_comma:
+    if not form.decimal_comma and not form.words:
         try:
             options: dict[str, Any] = {"delimiter": form.separator, "skiprows": before, "encoding": layout.encoding}
             values = np.loadtxt(path, ndmin=2, comments=None, **options)
@@ -94,6 +98,25 @@ def _values(path: Path, layout: TextLayout) -> tuple[FloatArray, RowsFound]:
             pass  # its words are about NumPy, not about the file
     with path.open(encoding=layout.encoding, errors="replace") as file:
         return read_rows(itertools.islice(file, before, None), form, str(path))
+
+
+def _check_end(path: Path, layout: TextLayout) -> None:
+    """Raise InputError where the file ends within a number: its last value has fewer decimals than all those above it."""
+    if layout.encoding.startswith(("utf-16", "utf-32")):
+        return
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - LONGEST_LINE, 0))
+        tail = file.read().decode(layout.encoding, errors="replace")
+    if tail.endswith(("\n", "\r")):
+        return
+    mark = "," if layout.form.decimal_comma else "."
+    last = [split_row(line, layout.form.separator)[-1:] for line in tail.splitlines()[1:]]
+    *others, end = (len(word.partition(mark)[2]) for words in last for word in words or [""])
+    if len(others) > _FEWEST_ALIKE and len(set(others)) == 1 and end < others[0]:
+        raise InputError(
+            f"ends within a number: '{last[-1][0]}', where all numbers above have {others[0]} decimals", where=str(path),
+            remedy="the file was cut off: copy or export it again; or end its last line",
+        )  # fmt: skip
 
 
 def _check_counts(rows: int, layout: TextLayout, found: RowsFound, where: str) -> None:
@@ -129,6 +152,26 @@ def _columns(
     guessed = _guessed_names(values)
     note = f"the columns have no names and were taken for {', '.join(guessed)} (else: --columns)"
     return tuple(map(Column, guessed)), (note, *found.notes)
+
+
+def _without_words(
+    columns: tuple[Column, ...], notes: tuple[str, ...], layout: TextLayout
+) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+    """The columns without those that hold words in place of numbers, and notes with them."""
+    found, said = list(columns), list(notes)
+    for index in layout.form.words:
+        if found[index].name != SKIPPED:
+            said.append(f"column {index + 1} ({found[index].name}) holds words and is left out")
+        found[index] = Column(SKIPPED)
+    return tuple(found), tuple(said)
+
+
+def _check_present(values: FloatArray, columns: Sequence[Column], where: str) -> None:
+    """Raise InputError where one coordinate is missing in every row and others are not."""
+    empty = [index for index, column in enumerate(columns) if column.name in "xyz" and np.isnan(values[:, index]).all()]
+    if 0 < len(empty) < 3:
+        problem = f"column {empty[0] + 1}, taken for {columns[empty[0]].name}, is empty in all {len(values):,} rows"
+        raise InputError(problem, where=where, remedy="export it again, or name the columns with --columns as they are")
 
 
 def _cloud(values: FloatArray, columns: Sequence[Column], notes: tuple[str, ...]) -> PointCloud:
