@@ -200,6 +200,26 @@ def test_points_that_las_takes_out_of_use_are_left_out_with_a_word(tmp_path: Pat
     assert set(found.extra["classification"]) == {2}
 
 
+def test_a_flag_that_all_points_have_takes_none_out(tmp_path: Path, points: Any) -> None:
+    """As a program may flag the points of photographs, all of them, as synthetic."""
+
+    def change(data: laspy.LasData) -> None:
+        data.synthetic = np.ones(COUNT, dtype=np.uint8)
+
+    found = read_points(las(tmp_path / "a.laz", points, change))
+    assert len(found.points) == COUNT
+    assert found.notes == ("all points are flagged as synthetic: they are kept",)
+
+
+def test_a_box_in_single_precision_contradicts_nothing(tmp_path: Path, points: Any) -> None:
+    """A northing of 6,389,450 m is rounded to 0.5 m there."""
+    far = points + np.array([0, 6_239_450, 0])
+    path = las(tmp_path / "a.las", far)
+    for at, value in ((195, far[:, 1].max()), (203, far[:, 1].min())):
+        patched(path, at, "<d", float(np.float32(value)))
+    assert len(read_points(path).points) == COUNT
+
+
 def test_a_file_that_is_no_las_says_so(tmp_path: Path) -> None:
     (tmp_path / "a.laz").write_text("1 2 3\n" * 100)
     with pytest.raises(InputError, match=r"no LAS or LAZ file: it begins with b'1 2 '.*suffix of its format"):

@@ -14,7 +14,7 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _OUTSIDE = 0.01
-"""In the file's unit: so far points may lie outside of the header's box, whose numbers programs round."""
+"""So far, in the file's unit, points may lie outside of the header's box, whose numbers programs round; some to single precision."""
 _MUCH_LARGER = 1.5
 """Times the points' extent: a header's box that is larger is told of."""
 _MODEL, _GEOGRAPHIC, _PROJECTED, _LINEAR_UNIT, _VERTICAL, _VERTICAL_UNIT = 1024, 2048, 3072, 3076, 4096, 4099
@@ -106,7 +106,8 @@ def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[
     if not len(points) or not np.isfinite([low, high]).all() or (low > high).any() or not (low.any() or high.any()):
         return ()
     found_low, found_high = points.min(axis=0), points.max(axis=0)
-    reach = np.maximum(_OUTSIDE, 2 * np.array(header.scales))
+    single = np.spacing(np.minimum(np.maximum(np.abs(low), np.abs(high)), 1e30).astype(np.float32)).astype(float)
+    reach = np.maximum(np.maximum(_OUTSIDE, single), 2 * np.array(header.scales))
     said = f"a box from {_place(low)} to {_place(high)} in its header"
     said = f"{said}, and its points lie from {_place(found_low)} to {_place(found_high)}"
     if ((found_low < low - reach) | (found_high > high + reach)).any():
@@ -152,7 +153,9 @@ def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, .
         ("flagged as synthetic", np.asarray(las.synthetic, dtype=bool)),
         ("classified as noise", np.isin(classes, _NOISE)),
     ):
-        if count := int((rows & ~out).sum()):
+        if rows.all():
+            notes.append(f"all points are {what}: they are kept")
+        elif count := int((rows & ~out).sum()):
             notes.append(f"{count:,} points that the file has {what} are left out")
-        out |= rows
+            out |= rows
     return out, tuple(notes)
