@@ -242,8 +242,21 @@ def test_a_column_of_words_is_left_out_by_name(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.points, POINTS)
     np.testing.assert_array_equal(found.intensity, [7, 7, 7])
     assert found.notes == ("column 4 (class) holds words and is left out",)
+    labels = "".join(f"P{number},{row}\n" for number, row in enumerate(rows(",").split()))
+    found = read_points(written(tmp_path, "# Targets, 1, 2, 3\nlabel,X,Y,Z\n" + labels, name="a.csv"))
+    np.testing.assert_array_equal(found.points, POINTS)
+    assert found.notes == ("column 1 (label) holds words and is left out",)
+    np.testing.assert_array_equal(read_points(written(tmp_path, labels, name="a.csv")).points, POINTS)
+    with pytest.raises(InputError, match="column 1, called x, holds words"):
+        read_points(written(tmp_path, "X,Y,Z,W\n" + labels, name="a.csv"))
     with pytest.raises(InputError, match=r"line 3, column 4: 'rock' is no number"):
         read_points(written(tmp_path, "X,Y,Z,Class\n" + rows(",", tail=",7").replace(",7", ",rock", 2).replace(",rock", ",7", 1)))
+
+
+def test_a_name_that_is_a_part_of_xyz_is_a_channel(tmp_path: Path) -> None:
+    found = read_points(written(tmp_path, "X,Y,Z,xy,yz [mm]\n" + rows(",", tail=",5,7"), name="a.csv"))
+    assert list(found.extra) == ["xy", "yz_m"]
+    np.testing.assert_allclose(found.extra["yz_m"], 0.007)
 
 
 def test_a_coordinate_that_is_missing_everywhere_is_an_error(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _OUTSIDE = 0.01
-"""So far, in the file's unit, points may lie outside of the header's box, whose numbers programs round; some to single precision."""
+"""So far, in the file's unit, points may lie outside of the header's box, whose numbers programs round."""
 _MUCH_LARGER = 1.5
 """Times the points' extent: a header's box that is larger is told of."""
 _MODEL, _GEOGRAPHIC, _PROJECTED, _LINEAR_UNIT, _VERTICAL, _VERTICAL_UNIT = 1024, 2048, 3072, 3076, 4096, 4099

@@ -171,11 +171,14 @@ def _grouped(word: str, number: int, where: str) -> InputError:
 
 
 def _is_row(line: str) -> bool:
-    """Whether a line begins with three numbers, whatever separates them and their digits."""
+    """Whether a line begins with three numbers, whatever separates them and their digits; behind a name, if no space does."""
     text = line.strip(" \t\r\n,;|")
-    mark = next((each for each in _SEPARATORS if each in text), None)
-    words = re.split(r"[ \t,]+", text) if mark is None else split_row(text, mark)
-    return len(words) >= 3 and all(map(_is_number, words[:3]))
+    if text.startswith(COMMENTS):
+        return False
+    mark = next((each for each in (*_SEPARATORS, ",") if each in text), None)
+    words = re.split(r"[ \t,]+", text) if mark in (None, ",") else split_row(text, mark)
+    starts = (0,) if mark is None else (0, 1)
+    return any(len(words) >= start + 3 and all(map(_is_number, words[start : start + 3])) for start in starts)
 
 
 def _is_number(word: str) -> bool:

@@ -25,6 +25,7 @@ _CHUNK = 200_000
 _SAMPLE = 10_000
 _FEWEST_ALIKE = 50
 """Rows with one number of decimals from which on that is no chance."""
+_AXES = ("x", "y", "z")
 _COLOURS = ["red", "green", "blue"]
 
 
@@ -76,7 +77,7 @@ def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
         raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     _check_counts(len(values), layout, found, where)
     _check_end(path, layout)
-    given, notes = _without_words(*_columns(layout, values, columns, where), layout)
+    given, notes = _without_words(*_columns(layout, values, columns, where), layout, where)
     _check_present(values, given, where)
     if found.missing:
         notes = (*notes, f"{found.missing:,} values are empty or no numbers")
@@ -149,17 +150,27 @@ def _columns(
     found = named_columns(layout, where)
     if found.columns:
         return found.columns, found.notes
-    guessed = _guessed_names(values)
+    guessed = _guessed_names(np.delete(values, layout.form.words, axis=1))
+    for index in layout.form.words:
+        guessed.insert(index, f"column_{index + 1}")
     note = f"the columns have no names and were taken for {', '.join(guessed)} (else: --columns)"
     return tuple(map(Column, guessed)), (note, *found.notes)
 
 
 def _without_words(
-    columns: tuple[Column, ...], notes: tuple[str, ...], layout: TextLayout
+    columns: tuple[Column, ...], notes: tuple[str, ...], layout: TextLayout, where: str
 ) -> tuple[tuple[Column, ...], tuple[str, ...]]:
-    """The columns without those that hold words in place of numbers, and notes with them."""
+    """The columns without those that hold words in place of numbers, and notes with them.
+
+    Raises InputError where one of them is called x, y or z.
+    """
     found, said = list(columns), list(notes)
     for index in layout.form.words:
+        if found[index].name in _AXES:
+            problem, allowed = f"column {index + 1}, called {found[index].name}, holds words", "numbers"
+            raise InputError(
+                problem, where=where, allowed=allowed, remedy="name the columns as they are, in the file or with --columns"
+            )
         if found[index].name != SKIPPED:
             said.append(f"column {index + 1} ({found[index].name}) holds words and is left out")
         found[index] = Column(SKIPPED)
@@ -168,7 +179,7 @@ def _without_words(
 
 def _check_present(values: FloatArray, columns: Sequence[Column], where: str) -> None:
     """Raise InputError where one coordinate is missing in every row and others are not."""
-    empty = [index for index, column in enumerate(columns) if column.name in "xyz" and np.isnan(values[:, index]).all()]
+    empty = [index for index, column in enumerate(columns) if column.name in _AXES and np.isnan(values[:, index]).all()]
     if 0 < len(empty) < 3:
         problem = f"column {empty[0] + 1}, taken for {columns[empty[0]].name}, is empty in all {len(values):,} rows"
         raise InputError(problem, where=where, remedy="export it again, or name the columns with --columns as they are")
@@ -178,7 +189,7 @@ def _cloud(values: FloatArray, columns: Sequence[Column], notes: tuple[str, ...]
     """The cloud of a table: coordinates in the file's unit, other channels in the SI unit that the names state."""
     channels = {column.name: _in_si(values[:, index], column) for index, column in enumerate(columns) if column.name != SKIPPED}
     points = np.stack([channels.pop(name) for name in "xyz"], axis=1)
-    converted = [column for column in columns if column.name not in "xyz" and (column.factor != 1 or column.decibels)]
+    converted = [column for column in columns if column.name not in _AXES and (column.factor != 1 or column.decibels)]
     said = tuple(f"{column.name} was converted from {column.unit}" for column in converted)
     return PointCloud(
         points, channels.pop("intensity", None), channels.pop("gps_time", None), channels, (*notes, *said), _units(columns)
@@ -186,8 +197,8 @@ def _cloud(values: FloatArray, columns: Sequence[Column], notes: tuple[str, ...]
 
 
 def _in_si(values: FloatArray, column: Column) -> FloatArray:
-    if column.name in "xyz":
-        return values  # in metres with the pose and the user's word, by `read_scans_of`
+    if column.name in _AXES:
+        return values  # in metres with the pose and the user's word, by `read_placed_scans`
     if column.decibels:
         return np.asarray(10 ** (values / 10))
     return np.ascontiguousarray(values) if column.factor == 1 else values * column.factor
@@ -195,7 +206,7 @@ def _in_si(values: FloatArray, column: Column) -> FloatArray:
 
 def _units(columns: Sequence[Column]) -> AxisUnits | None:
     """The unit that the names of x, y and z state, None where none does; an axis without one has that of the first with one."""
-    axes = {column.name: column for column in columns if column.name in "xyz"}
+    axes = {column.name: column for column in columns if column.name in _AXES}
     stated = [axes[name] for name in "xyz" if axes[name].unit]
     if not stated:
         return None
@@ -233,6 +244,6 @@ def _guessed_names(values: FloatArray) -> list[str]:
 
 
 def _form(name: str, column: NDArray[Any], decimals: int) -> str:
-    if name in ("x", "y", "z"):
+    if name in _AXES:
         return f"%.{decimals}f"
     return "%d" if column.dtype.kind in "iub" else "%.9g" if column.dtype == np.float32 else "%.17g"
