@@ -67,7 +67,7 @@ def main(sensor: SensorName) -> None:
     reference = observe_reference(config, site, random, progress)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        write_reference(out, config, site, reference)
+        write_reference(out, config, site, reference, reference.seen)
         reference = replace(reference, seen=None)
         progress.timings.clear()
         start = time.perf_counter()

@@ -60,7 +60,9 @@ class Case:
         index = dr.arange(mi.UInt32, rows * columns)
         u, v = ((mi.Float64(place) + 0.5) * self.reduction for place in (index % columns, index // columns))
         none, size = mi.Float64(0), (columns * self.reduction, rows * self.reduction, self.reduction)
-        ideal = Matches(index, u, v, none, mi.Bool(True), mi.Int32(0), none, None, *size).with_raster(self.true * self.reduction)
+        frontal = none, 0.0  # rows along the rectified axis, disparity 0 at infinity: the matching's effects use neither
+        ideal = Matches(index, u, v, none, mi.Bool(True), mi.Int32(0), none, None, *size, *frontal)
+        ideal = ideal.with_raster(self.true * self.reduction)
         return apply_stage(model.chain(random), Stage.MATCH, ideal, random).raster() / self.reduction
 
 

@@ -21,10 +21,14 @@ def seconds(*words: str) -> float:
     return statistics.median(times)
 
 
-bare = seconds("-c", "pass")
-for command in ("--help", "simulate --help", "view --help"):
-    program = f"import sys; from pipeline.cli.main import main; sys.exit(main({command.split()}))"
-    taken = seconds("-c", program)
-    print(
-        f"scarpsim {command}: {taken:.2f} s, {taken / bare:.1f} x a bare interpreter's start; {taken / _LIMIT_S:.2f} of the limit"
-    )
+def main() -> None:
+    bare = seconds("-c", "pass")
+    for command in ("--help", "simulate --help", "view --help"):
+        program = f"import sys; from pipeline.cli.main import main; sys.exit(main({command.split()}))"
+        taken = seconds("-c", program)
+        times, share = taken / bare, taken / _LIMIT_S
+        print(f"scarpsim {command}: {taken:.2f} s, {times:.1f} x a bare interpreter's start; {share:.2f} of the limit")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""Every benchmark runs at a tiny size, so that a changed signature cannot leave one behind. Its figures mean nothing at such
+a size.
+
+A script's constants and the configs that it makes are replaced by smaller ones before its `main` is called, in this process,
+so that imports and kernels are shared.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from tiny_dataset import tiny as tiny_config
+from tiny_dataset import tiny_set
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "benchmarks"
+LIBRARIES = {"measure", "documents", "matcher_cases", "varied", "workshop"}
+"""Modules that benchmarks import; they run with them."""
+ELSEWHERE = {
+    "fuzz": "tests/test_fuzz.py, test_fuzz_commands.py and test_fuzz_records.py run what it runs",
+    "bad_inputs/run": "tests/test_bad_inputs.py",
+    "bad_inputs/preloaded": "benchmarks/bad_inputs/run.py runs it as a process of its own",
+    "gap_challenge/run": "tests/test_gap_challenge.py",
+    "gap_injections/run": "tests/test_gap_injections.py",
+    "gap_judge/run": "tests/test_gap_judge.py",
+    "gap_thresholds": "tests/test_varied.py",
+}
+"""Scripts that other tests run."""
+NOT_YET = {
+    "detector": "builds the network of a whole config, which takes minutes",
+    "detector_ablation": "trains",
+    "detector_curve": "needs the test sets of configs/datasets/detector_test.yaml",
+    "detector_drawn": "needs tiles of the detector's own size",
+    "detector_mirrored": "takes a minute of a trained network",
+    "detector_table": "needs the test sets of configs/datasets/detector_test.yaml",
+}
+"""Scripts that no test runs, as they need a trained network or hours of data; their functions are imported by the others."""
+
+
+@dataclass(frozen=True)
+class Tiny:
+    """How a script is made small. words: on its command line; arguments: of its `main`; values: new values of its globals;
+    keys: what is set beside the keywords of a config that the script makes, by the config's name; overrides: of the configs
+    that it loads."""
+
+    words: tuple[str, ...] = ()
+    arguments: tuple[Any, ...] = ()
+    values: dict[str, Any] = field(default_factory=dict)
+    keys: dict[str, dict[str, Any]] = field(default_factory=dict)
+    overrides: tuple[str, ...] = ()
+
+
+COARSE_WALL = {"ProceduralWall": {"width_m": 12.0, "height_m": 8.0, "resolution_m": 0.2}}
+SMALL_FRAME = {"RigConfig": {"width": 368, "height": 246, "distance_m": 25.0}}
+SMALL_SITE = (
+    "wall.width_m=10",
+    "wall.height_m=6",
+    "wall.resolution_m=0.2",
+    "rockfall.count=3",
+    "cameras.width=368",
+    "cameras.height=246",
+    "cameras.distance_m=20",
+    "scanner.azimuth_step_rad=0.004",
+    "scanner.zenith_step_rad=0.004",
+    "station.distance_m=20",
+    "difference.gsd_m=0.1",
+    "depth_map=high",
+)
+SCRIPTS: dict[str, Tiny] = {
+    "calibrate_recovery": Tiny(("--trials", "1", "--out", "recovery")),
+    "calibrate_speed": Tiny(
+        overrides=(*SMALL_SITE, "difference.gsd_m=0.02", "calibration.window_px=16", "calibration.windows=6")
+    ),
+    "carve": Tiny(values={"CELLS_M": {False: 1.0, True: 1.0}}, keys={"RockfallConfig": {"count": 4}}),
+    "dataset": Tiny(("workers", "--rounds", "1")),
+    "dataset_noise": Tiny(("small", "--maps", "1")),
+    "detectability": Tiny(values={"ROUNDS": 1, "BLOCKS": 4, "STEP_RAD": 2e-3}),
+    "detector_whole": Tiny(("--sets", "tiny", "tiny", "--model", "baseline")),
+    "difference": Tiny(values={"PIXELS": (70, 30), "SAMPLES": (18, 30)}),
+    "epoch": Tiny(arguments=("stereo",), overrides=SMALL_SITE),
+    "gap": Tiny(("tls", "--points", "3000")),
+    "gap_reference_points": Tiny(("--out", "points")),
+    "icp": Tiny(values={"COLUMNS": 40, "ROWS": 30, "REPEATS": 1}),
+    "labels": Tiny(
+        ("--width", "6", "--height", "4"),
+        values={"SIZES": {"large": ("{kind: uniform, low: 0.5, high: 1.0}", 0.1)}, "MODELS": {"none": None}},
+    ),
+    "laz": Tiny(values={"LINES": 20, "PULSES": 15, "ROUNDS": 1}),
+    "m3c2_agreement": Tiny(("--set", *" --set ".join(SMALL_SITE).split())),
+    "matcher_noise": Tiny(
+        ("--generations", "1", "--motorcycle", "none"),
+        values={"FITTED_ON": (("glendale", 7),), "VALIDATED_ON": (("bismantova", 3),), "POLISHING": 1},
+    ),
+    "niche_depth": Tiny(
+        ("--width", "6", "--height", "4", "--maps", "1"), values={"FINE_M": 0.05, "CASES": (("relief", 0.1, 0.1),)}
+    ),
+    "niche_texture": Tiny(("--set", "tiny")),
+    "noise_table": Tiny(("--maps", "2", "--levels", "high", "--out", "noise"), overrides=SMALL_SITE),
+    "reconstruction": Tiny(keys=COARSE_WALL | {"RigConfig": {"width": 1472, "height": 984, "distance_m": 25.0}}),
+    "sgbm": Tiny(keys=COARSE_WALL | SMALL_FRAME),
+    "soak": Tiny(arguments=("tls", 3), overrides=SMALL_SITE),
+    "startup": Tiny(values={"_REPEATS": 1}),
+    "stereo": Tiny(keys=COARSE_WALL | SMALL_FRAME),
+    "tls": Tiny(values={"PULSES": 2000}, keys=COARSE_WALL),
+    "tls_beam": Tiny(values={"PULSES": 500}, keys=COARSE_WALL),
+    "tls_process": Tiny(values={"PULSES": 2000, "SUB_RAYS": {"one ray": 1}}),
+    "upper_bound": Tiny(("--width", "6", "--height", "4"), values={"WAYS": (("vertices", "low", "relief"),)}),
+}
+
+
+def scripts() -> list[str]:
+    """All that can be run, by their path below benchmarks/ without the ending."""
+    found = (path.relative_to(FOLDER).with_suffix("") for path in FOLDER.rglob("*.py"))
+    runnable = (path for path in found if "__main__" in (FOLDER / path).with_suffix(".py").read_text())
+    return sorted(str(path) for path in runnable if str(path) not in LIBRARIES)
+
+
+def test_no_script_is_left_out() -> None:
+    assert set(scripts()) == set(SCRIPTS) | set(ELSEWHERE) | set(NOT_YET)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_benchmark_runs_at_a_tiny_size(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if "tiny" in SCRIPTS[name].words:
+        tiny_set(tmp_path / "tiny")
+    monkeypatch.syspath_prepend(str(FOLDER))
+    script, tiny = _loaded(name, monkeypatch), SCRIPTS[name]
+    _make_small(script, tiny, monkeypatch)
+    monkeypatch.setattr(sys, "argv", [str(FOLDER / f"{name}.py"), *tiny.words])
+    if name in ("dataset", "dataset_noise"):
+        monkeypatch.setattr(script, "load_dataset_config", lambda _: tiny_config())
+    if name == "tls_process":
+        wall = importlib.import_module("scene.walls.procedural")
+        monkeypatch.setattr(wall, "ProceduralWall", _with_keys(wall.ProceduralWall, COARSE_WALL["ProceduralWall"]))
+    if name == "matcher_noise":
+        cases = sys.modules["matcher_cases"]
+        monkeypatch.setattr(cases, "ProceduralWall", _with_keys(cases.ProceduralWall, COARSE_WALL["ProceduralWall"]))
+        frame = {"width": 460, "height": 307, "distance_m": 25.0, "base_m": 4.0}
+        monkeypatch.setattr(cases, "RigConfig", _with_keys(cases.RigConfig, frame))
+    if name == "gap":
+        monkeypatch.setattr(script, "empty_kernel_cache", lambda: nullcontext(dict(os.environ)))
+    if name == "tls":  # starts itself anew with an empty kernel cache, where it would not be small
+        monkeypatch.setattr(script.subprocess, "run", lambda *_, **__: script.cold())
+    script.main(*tiny.arguments)
+    assert capsys.readouterr().out.strip()
+
+
+def _loaded(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", FOLDER / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, script)
+    spec.loader.exec_module(script)
+    return script
+
+
+def _make_small(script: ModuleType, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    for constant, value in tiny.values.items():
+        assert hasattr(script, constant), constant
+        monkeypatch.setattr(script, constant, value)
+    for config, keys in tiny.keys.items():
+        monkeypatch.setattr(script, config, _with_keys(getattr(script, config), keys))
+    if tiny.overrides:
+        load = script.load_config
+        small = lambda path, overrides, sensor, seed: load(path, [*overrides, *tiny.overrides], sensor, seed)  # noqa: E731
+        monkeypatch.setattr(script, "load_config", small)
+    if hasattr(script, "medians"):
+        timed = script.medians
+        monkeypatch.setattr(script, "medians", lambda *works, rounds=1: timed(*works, rounds=1))
+
+
+def _with_keys(config: Callable[..., Any], keys: dict[str, Any]) -> Callable[..., Any]:
+    """The config's class, which sets these keys whatever it is called with."""
+
+    @functools.wraps(config, updated=())
+    def small(*given: Any, **named: Any) -> Any:
+        return config(*given, **{**named, **keys})
+
+    return small
