@@ -79,7 +79,7 @@ SMALL_SITE = (
 SCRIPTS: dict[str, Tiny] = {
     "calibrate_recovery": Tiny(("--trials", "1", "--out", "recovery")),
     "calibrate_speed": Tiny(
-        overrides=(*SMALL_SITE, "difference.gsd_m=0.02", "calibration.window_px=16", "calibration.windows=6")
+        overrides=(*SMALL_SITE, "cameras.base_m=1", "difference.gsd_m=0.02", "calibration.window_px=16", "calibration.windows=6")
     ),
     "carve": Tiny(values={"CELLS_M": {False: 1.0, True: 1.0}}, keys={"RockfallConfig": {"count": 4}}),
     "dataset": Tiny(("workers", "--rounds", "1")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -205,6 +206,15 @@ def test_a_model_in_feet_becomes_metres(tmp_path: Path, crs: str, metres: float)
     assert any("which were converted to metres" in words for words in reference.words)
     with pytest.raises(InputError, match=r"states its unit, .*ft.*, and --unit says mm"):
         from_dem(tmp_path / "a.tif", "mm")
+
+
+def test_a_unit_that_only_the_code_of_the_coordinate_system_has_is_read(tmp_path: Path) -> None:
+    path = _gdal(tmp_path / "a.tif", crs="EPSG:2225")
+    content = path.read_bytes()
+    row = struct.pack("<4H", 3076, 0, 1, 9003)
+    assert row in content
+    path.write_bytes(content.replace(row, struct.pack("<4H", 3077, 0, 1, 9003)))  # a key that nobody reads
+    assert read_raster(path).place.linear_m == pytest.approx(1200 / 3937, rel=1e-12)
 
 
 def test_degrees_are_refused(tmp_path: Path) -> None:

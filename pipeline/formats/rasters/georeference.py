@@ -5,7 +5,6 @@ The tie point of GeoTIFF belongs to the outer corner of a pixel, or to its centr
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,14 @@ from typing import Any
 import numpy as np
 
 from pipeline.formats.files.xml_file import parsed
+from pipeline.formats.units import metres_of_epsg_unit, understood_crs, units_of_crs
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 
 PIXEL_SCALE, TIEPOINT, TRANSFORMATION, GEO_KEYS, GDAL_METADATA = 33550, 33922, 34264, 34735, 42112
 MODEL_TYPE, RASTER_TYPE, LINEAR_UNITS, VERTICAL_UNITS = 1024, 1025, 3076, 4099
+_PROJECTED, _USER_DEFINED = 3072, 32767
 _GEOGRAPHIC, _PIXEL_IS_POINT = 2, 2
-_METRES_OF_UNIT = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937, 9036: 1000.0}
-"""EPSG codes of linear units: metre, international foot, US survey foot, kilometre."""
-_UNIT_NAMES = {9001: "m", 9002: "ft", 9003: "US survey ft", 9036: "km"}
 _SIDES_M, _FARTHEST_M = (1e-6, 1e6), 1e8
 """Sides of a pixel, and how far from its origin any coordinate system of a survey reaches."""
 _SQUARE = 1e-9
@@ -67,6 +65,7 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
     """
     keys = _geo_keys(tags, path)
     linear, vertical = (_unit(keys, key, path) for key in (LINEAR_UNITS, VERTICAL_UNITS))
+    linear = _unit_of_code(keys, path) if linear is None else linear
     scale, offset = _scale_and_offset(tags, path)
     corner = _affine(tags, path)
     if corner is None:
@@ -84,12 +83,6 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
     flipped = step_y > 0
     y_max = y + shape[0] * step_y if flipped else y
     return Georeference(Grid(x, y_max, gsd, shape[1], shape[0]), flipped, linear, vertical, scale, offset)
-
-
-def unit_name(metres: float) -> str:
-    """Return what a unit of so many metres is called."""
-    codes = (code for code, size in _METRES_OF_UNIT.items() if math.isclose(size, metres, rel_tol=1e-9))
-    return next((_UNIT_NAMES[code] for code in codes), f"{metres:g} m")
 
 
 def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, float] | None:
@@ -125,13 +118,23 @@ def _geo_keys(tags: dict[int, Any], path: Path) -> dict[int, int]:
 
 
 def _unit(keys: dict[int, int], key: int, path: Path) -> float | None:
+    """Metres of the unit that a key states; None where the file has no such key, or a unit of the user's own."""
     code = keys.get(key)
-    if code is None:
+    if code is None or code == _USER_DEFINED:
         return None
-    if code not in _METRES_OF_UNIT:
-        allowed = ", ".join(f"{name} (EPSG {number})" for number, name in _UNIT_NAMES.items())
-        raise InputError(f"states the unit EPSG {code}", where=str(path), allowed=allowed, remedy="export it in metres")
-    return _METRES_OF_UNIT[code]
+    metres = metres_of_epsg_unit(code)
+    if metres is None:
+        problem = f"states the unit EPSG {code}, which is no length"
+        raise InputError(problem, where=str(path), allowed="a unit of length", remedy="export it in metres")
+    return metres
+
+
+def _unit_of_code(keys: dict[int, int], path: Path) -> float | None:
+    """Metres of the unit of the projected coordinate system that the file names by its EPSG code; None without one."""
+    code = keys.get(_PROJECTED)
+    crs = None if code in (None, _USER_DEFINED) else understood_crs(f"EPSG:{code}")
+    units = None if crs is None else units_of_crs(crs, str(path))
+    return None if units is None else units.metres[0]
 
 
 def _scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
