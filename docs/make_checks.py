@@ -1,0 +1,358 @@
+"""Try a bad input of each kind at each door and write docs/formats/checks.md: `python docs/make_checks.py`.
+
+A door is a command, an option or a function that reads files of some kind. tests/test_checks.py tries them too, against the page.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tifffile
+
+from pipeline import open_wall
+from pipeline.cli import main as cli
+from pipeline.formats.cameras.metashape import write_metashape
+from pipeline.formats.meshes.ply import write_ply, write_ply_points
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.rasters.geotiff import write_geotiff
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import TriangleMesh
+from sensors.cameras.camera import Camera
+
+PAGE = Path(__file__).parent / "formats" / "checks.md"
+EYE = ("3", "-20", "2")
+SCAN = ("--position", ",".join(EYE), "--scanner", "riegl_vz400i")
+"""Where the scanner stands, and which it is."""
+UTM = np.array([345_200.0, 6_389_450.0, 120.0])
+REFUSED, TAKEN = "refused", "taken"
+NO_FAULT = "none of these"
+Make = Callable[[Path], None]
+_HEAD = """# Checks of input files
+
+This page says which faults of a file are found, and by which command, option or function. It is for those who wonder whether
+a fault of their data could go unnoticed. Each cell was tried: *refused* means that the door answers with one message that
+names the file, what is wrong, what is allowed and how to mend it, and that it writes nothing. Commands end with exit status
+2, functions raise `InputError`.
+"""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Files of one kind. suffix: of their names; doors: words of a command, or a function, by their name, FILE for the file;
+    faults: how a file with a fault is made."""
+
+    title: str
+    suffix: str
+    doors: dict[str, tuple[str, ...] | Callable[[Path], object]]
+    faults: dict[str, Make]
+    good: Make | None = None
+    refusing: tuple[str, ...] = ()
+    long: tuple[str, ...] = ()
+
+
+def _grid_points(step: float = 0.1) -> np.ndarray:
+    x, z = (each.ravel() for each in np.meshgrid(np.arange(0.0, 6.0, step), np.arange(0.0, 4.0, step)))
+    return np.column_stack([x, 0.2 * np.sin(1.7 * x) * np.cos(1.3 * z), z])
+
+
+def _sheet() -> TriangleMesh:
+    points = _grid_points(0.2)
+    columns, rows = 30, 20
+    corner = np.arange(columns * rows).reshape(rows, columns)
+    a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, 1:].ravel(), corner[1:, :-1].ravel()
+    return TriangleMesh(points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32))
+
+
+def _cloud(points: np.ndarray) -> Make:
+    return lambda path: write_ply_points(path, PointCloud(np.asarray(points, dtype=np.float64)))
+
+
+def _mesh(change: Callable[[np.ndarray], np.ndarray]) -> Make:
+    mesh = _sheet()
+    return lambda path: write_ply(path, mesh.with_vertices(change(mesh.vertices.copy())))
+
+
+def _cut(make: Make) -> Make:
+    def cut(path: Path) -> None:
+        make(path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+    return cut
+
+
+def _with(row: int, value: float, points: np.ndarray) -> np.ndarray:
+    points[row] = value
+    return points
+
+
+def _raster(path: Path) -> None:
+    heights = 10.0 + np.sin(np.arange(40)[:, None] / 5.0) + np.zeros((40, 50))
+    write_geotiff(path, heights, Grid(0.0, 20.0, 0.5, 50, 40))
+
+
+def _changed_tiff(**options: object) -> Make:
+    return lambda path: tifffile.imwrite(path, np.ones((40, 50), np.float32), **options)
+
+
+GEO_DEGREES = (34735, 3, 8, (1, 1, 0, 1, 1024, 0, 1, 2), False)
+PLACE = [(33550, 12, 3, (0.5, 0.5, 0.0), False), (33922, 12, 6, (0.0, 0.0, 0.0, 0.0, 20.0, 0.0), False)]
+TURNED = [(34264, 12, 16, (0.5, 0.1, 0, 0, 0.1, -0.5, 0, 20, 0, 0, 0, 0, 0, 0, 0, 1), False)]
+BOX = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 1, 4, 4], "score": 0.9, "segmentation": [[1, 1, 5, 1, 5, 5]]}
+COCO = {"images": [{"id": 1, "file_name": "a.tif", "width": 20, "height": 20}], "categories": [{"id": 1, "name": "block"}]}
+
+
+def _annotated(**changes: object) -> Make:
+    return lambda path: path.write_text(json.dumps({**COCO, "annotations": [{**BOX, **changes}]}))
+
+
+def _other_records(path: Path) -> None:
+    path.mkdir()
+    for name in ("run.json", "measurement.yaml"):
+        (path / name).write_bytes(bytes(range(256)))
+
+
+def _camera(x: float) -> Camera:
+    """One of a pair that looks at the sheet from 20 m away."""
+    lens = {"f_px": 1000.0, **dict.fromkeys(("cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0)}
+    towards = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # camera x right, y down, z to the wall
+    return Camera(640, 480, **lens, position=np.array([3.0 + x, -20.0, 2.0]), rotation=towards)
+
+
+SITE = """wall: {mesh: wall.ply}
+station: {position_m: [3, -20, 2]}
+rockfall: {count: 1, size_m: 0.4, safe_zone_offset_m: 0.2}
+scanner: {azimuth_step_rad: 0.004, zenith_step_rad: 0.004}
+cameras: {distance_m: 20, base_m: 5, width: 640, height: 480}
+depth_map: high
+difference: {gsd_m: 0.1}
+"""
+ANY: dict[str, Make] = {
+    "does not exist": lambda path: None,
+    "is a folder": lambda path: path.mkdir(),
+    "is a pipe": lambda path: os.mkfifo(path),
+    "is empty": lambda path: path.write_bytes(b""),
+    "holds other bytes": lambda path: path.write_bytes(bytes(range(256)) * 40),
+}
+GOOD_POINTS = _cloud(_grid_points())
+KINDS = (
+    Kind(
+        "Points",
+        ".ply",
+        {
+            "`measurement SCAN`": ("measurement", "FILE", "--reference", "wall.ply", *SCAN, "--out", "out"),
+            "`measurement --reference`": (
+                "measurement",
+                "scan.ply",
+                "--reference",
+                "FILE",
+                *SCAN,
+                "--out",
+                "out",
+            ),
+            "`gap SCAN`": ("gap", "FILE", "--reference", "wall.ply", *SCAN, "--out", "out"),
+            "`surface`": ("surface", "FILE", "--seen-from", *EYE, "--out", "out.ply"),
+        },
+        {
+            **ANY,
+            "is cut off": _cut(GOOD_POINTS),
+            "only NaN": _cloud(_grid_points() * np.nan),
+            "one place": _cloud(np.ones((500, 3))),
+            "one line": _cloud(np.outer(np.arange(500.0), [1.0, 1.0, 0.5])),
+            "single precision far off": _cloud((_grid_points() + UTM).astype(np.float32)),
+            "1e9 m away": _cloud(_grid_points() + 1e9),
+            "another place than the sensor's": _cloud(_grid_points() + UTM),
+        },
+        GOOD_POINTS,
+        long=("`gap SCAN`",),
+    ),
+    Kind(
+        "Meshes",
+        ".ply",
+        {
+            "`simulate`": ("simulate", "--sensor", "tls", "--config", "site.yaml", "--set", "wall={mesh: FILE}", "--out", "out"),
+            "`inspect`": ("inspect", "site.yaml", "--sensor", "tls", "--set", "wall={mesh: FILE}", "--out", "out"),
+            "`measurement --reference`": (
+                "measurement",
+                "scan.ply",
+                "--reference",
+                "FILE",
+                *SCAN,
+                "--out",
+                "out",
+            ),
+            "`open_wall`": open_wall,
+        },
+        {
+            **ANY,
+            "is cut off": _cut(_mesh(lambda points: points)),
+            "a vertex is NaN": _mesh(lambda points: _with(5, np.nan, points)),
+            "a vertex at 1e300 m": _mesh(lambda points: _with(5, 1e300, points)),
+            "single precision far off": _mesh(lambda points: (points + UTM).astype(np.float32).astype(np.float64)),
+            "no size": _mesh(lambda points: points * 1e-9),
+        },
+        _mesh(lambda points: points),
+        long=("`inspect`",),
+    ),
+    Kind(
+        "Rasters",
+        ".tif",
+        {
+            "`measurement --reference`": (
+                "measurement",
+                "scan.ply",
+                "--reference",
+                "FILE",
+                *SCAN,
+                "--out",
+                "out",
+            ),
+            "`detect`": ("detect", "baseline", "FILE", "--out", "out"),
+        },
+        {
+            **ANY,
+            "is cut off": _cut(_raster),
+            "no place": _changed_tiff(),
+            "degrees": _changed_tiff(extratags=[*PLACE, GEO_DEGREES]),
+            "turned": _changed_tiff(extratags=TURNED),
+            "three bands": lambda path: tifffile.imwrite(path, np.ones((40, 50, 3), np.float32), extratags=PLACE),
+            "infinite values": lambda path: tifffile.imwrite(path, np.full((40, 50), np.inf, np.float32), extratags=PLACE),
+        },
+        _raster,
+        ("`measurement --reference`",),  # another surface than the scan's
+    ),
+    Kind(
+        "Cameras",
+        ".xml",
+        {"`simulate`": ("simulate", "--sensor", "stereo", "--config", "site.yaml", "--set", "cameras=FILE", "--out", "out")},
+        {**ANY, "no cameras": lambda path: path.write_text("<document><chunk/></document>")},
+        lambda path: write_metashape(path, {"left": _camera(-2.5), "right": _camera(2.5)}),
+    ),
+    Kind(
+        "Annotations",
+        ".json",
+        {
+            "`evaluate` truth": ("evaluate", "FILE", "found.json"),
+            "`evaluate` detections": ("evaluate", "truth.json", "FILE"),
+        },
+        {
+            **ANY,
+            "a box outside": _annotated(bbox=[15, 15, 40, 4], segmentation=None),
+            "a polygon of two corners": _annotated(segmentation=[[1, 1, 2, 2]]),
+            "a box that is no number": _annotated(bbox=["a", 1, 1, 1]),
+            "an image that is not there": _annotated(image_id=9),
+            "a category that is not there": _annotated(category_id=9),
+        },
+        _annotated(iscrowd=0),
+    ),
+    Kind(
+        "Configs",
+        ".yaml",
+        {
+            "`simulate --config`": ("simulate", "--sensor", "tls", "--config", "FILE", "--out", "out"),
+            "`inspect`": ("inspect", "FILE", "--sensor", "tls", "--out", "out"),
+            "`dataset`": ("dataset", "FILE", "--out", "out"),
+        },
+        {
+            **ANY,
+            "an unknown key": lambda path: path.write_text("sede: 1\n"),
+            "a key twice": lambda path: path.write_text("seed: 1\nseed: 2\n"),
+            "a list": lambda path: path.write_text("- 1\n"),
+        },
+        lambda path: path.write_text(SITE),
+        ("`dataset`",),
+        ("`inspect`",),
+    ),
+    Kind(
+        "Folders of runs and measurements",
+        "",
+        {
+            "`export`": ("export", "FILE", "picture", "--out", "out.png"),
+            "`icp-study`": ("icp-study", "FILE", "--out", "out"),
+            "`calibrate`": ("calibrate", "FILE", "--out", "out"),
+            "`gap`": ("gap", "FILE", "--out", "out"),
+            "`compare --measured`": ("compare", "site.yaml", "--measured", "FILE", "--out", "out"),
+        },
+        {
+            "does not exist": lambda path: None,
+            "is empty": lambda path: path.mkdir(),
+            "is a file": lambda path: path.write_bytes(bytes(range(256))),
+            "its records hold other bytes": _other_records,
+        },
+    ),
+)
+
+
+def prepare(folder: Path) -> None:
+    """Write the good files that the doors need beside the bad one."""
+    write_ply(folder / "wall.ply", _sheet())
+    GOOD_POINTS(folder / "scan.ply")
+    (folder / "site.yaml").write_text(SITE)
+    (folder / "truth.json").write_text(json.dumps({**COCO, "annotations": [{**BOX, "iscrowd": 0}]}))
+    (folder / "found.json").write_text(json.dumps([BOX]))
+
+
+def outcome(kind: Kind, door: str, fault: str) -> str:
+    """What a door does with a file that has a fault, in a prepared working folder: "refused", or what it does instead."""
+    file = Path(f"bad{kind.suffix}")
+    make = kind.good if fault == NO_FAULT else kind.faults[fault]
+    if make is not None:
+        make(file)
+    through = kind.doors[door]
+    if callable(through):
+        try:
+            through(file)
+        except InputError:
+            return REFUSED
+        return TAKEN
+    words = [word.replace("FILE", str(file)) for word in through]
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(action="ignore"):
+        code = cli.main(words)
+    if code == 0:
+        return TAKEN
+    lines = [line for line in told.getvalue().splitlines() if line.startswith("error: ")]
+    clean = code == 2 and len(lines) == 1 and "Traceback" not in told.getvalue()
+    return REFUSED if clean and not Path("out").exists() else f"exit {code}"
+
+
+def table(kind: Kind, found: dict[tuple[str, str], str]) -> str:
+    """The table of one kind of files: a row for each fault, a column for each door."""
+    lines = [f"| fault | {' | '.join(kind.doors)} |", "|---" * (len(kind.doors) + 1) + "|"]
+    lines += [f"| {fault} | {' | '.join(found[door, fault] for door in kind.doors)} |" for fault in kind.faults]
+    return "\n".join(lines)
+
+
+def tried(kind: Kind) -> dict[tuple[str, str], str]:
+    """What each door does with each fault, every time in a folder of its own."""
+    found, here = {}, Path.cwd()
+    for door in kind.doors:
+        for fault in kind.faults:
+            with tempfile.TemporaryDirectory() as folder:
+                os.chdir(folder)
+                try:
+                    prepare(Path())
+                    found[door, fault] = outcome(kind, door, fault)
+                finally:
+                    os.chdir(here)
+    return found
+
+
+def main() -> None:
+    parts = [_HEAD, *(f"## {kind.title}\n\n{table(kind, tried(kind))}\n" for kind in KINDS)]
+    PAGE.write_text(
+        "\n".join(parts) + "\nThis page is written by `python docs/make_checks.py`; a test holds it to what the commands do.\n"
+    )
+
+
+if __name__ == "__main__":
+    main()
