@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from pipeline.formats.files.atomic import write_text
@@ -43,7 +44,7 @@ class _PlanRow:
 
 @dataclass(frozen=True)
 class _Picture:
-    """grey: what the places without a value are."""
+    """grey: what the places without a value are; "" where all have one."""
 
     title: str
     png: bytes
@@ -136,7 +137,9 @@ def map_picture(plan: Plan, found: PlanMap) -> bytes:
 def _picture(plan: Plan, found: PlanMap) -> _Picture:
     png = map_picture(plan, found)
     none = found.name in ("smallest_block_m", "smallest_findable_m")
-    return _Picture(found.title, png, "not seen, or no block is, however large" if none else "not seen")
+    grey = "not seen, or no block is, however large" if none else "not seen"
+    shown = np.isnan(plan.raster.image(found.values)).any()
+    return _Picture(found.title, png, grey if shown else "")
 
 
 def _curves(plan: Plan) -> bytes | None:

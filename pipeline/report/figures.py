@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
+from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
@@ -57,6 +57,10 @@ _GREYS = colormaps["gray"].resampled(64)
 SEQUENTIAL = colormaps["viridis"].resampled(48)
 _MOST_NUMBERED, _MOST_ZOOMED, _ZOOMS_A_ROW = 200, 24, 6
 """Blocks whose numbers stand on a map, and that are shown by themselves."""
+_ONE_DECADE = 10.0
+"""Span of a logarithmic colour bar below which powers of ten, their doubles and fives are too few marks."""
+_CONSTANT = ListedColormap(["#dbe6ee"])
+"""Of a map that has one value everywhere."""
 _MOST_STEPS = 12
 """Whole numbers that can be told apart by their colours."""
 _LETTER_IN = 0.066
@@ -194,12 +198,19 @@ def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str 
     axes.set_facecolor(NO_DATA)
     image = axes.imshow(pooled, cmap=SEQUENTIAL, norm=scale, extent=raster_extent(grid, pooled.shape), interpolation="nearest")
     if known.size and np.ptp(known) <= 1e-6 * np.abs(known).max():
-        axes.text(0.0, 1.01, f"{known[0]:.4g} {label} everywhere", transform=axes.transAxes, fontsize=9, va="bottom")
+        image.set(cmap=_CONSTANT, norm=Normalize(known[0] - 1, known[0] + 1))
+        words = {"transform": axes.transAxes, "ha": "center", "va": "center", "fontsize": 12}
+        axes.text(0.5, 0.5, f"{known[0]:.4g} {label} everywhere", **words)
         _no_data_legend(axes, pooled, NO_DATA)
         return png_bytes(figure)
     beyond = known.size and (known.min() < scale.vmin or known.max() > scale.vmax)
     bar = _colour_bar(figure, axes, image, label, "both" if beyond else "neither")
-    if isinstance(scale, LogNorm):
+    if isinstance(scale, LogNorm) and scale.vmax < _ONE_DECADE * scale.vmin:
+        ticks = MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(scale.vmin, scale.vmax)
+        inside = ticks[(ticks >= scale.vmin) & (ticks <= scale.vmax)]
+        bar.set_ticks(inside, labels=[f"{tick:g}" for tick in inside])
+        bar.minorticks_off()
+    elif isinstance(scale, LogNorm):
         plain_numbers(bar.long_axis)
     elif counts:
         bar.locator = MaxNLocator(integer=True)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.change.annotate import BLOCK_CATEGORY
 from pipeline.detection.evaluation.evaluate import evaluate
 from pipeline.detection.inference import inference, weights
 from pipeline.detection.network.data import CocoFolder
@@ -47,7 +48,8 @@ def _set_on(model: Any, validation: CocoFolder, prefix: str) -> dict[str, float]
     """The shifts of `head` with which CONFIDENCE is best for the model, 0 where nothing is found. prefix: of their keys."""
     before = model.config.head.shifts
     found = _found(model, validation, min(_TRIED))
-    best = best_shifts({"images": validation.images, "annotations": validation.annotations}, found)
+    blocks = [{**each, "category_id": BLOCK_CATEGORY["id"]} for each in validation.annotations]  # whatever a set calls them
+    best = best_shifts({"images": validation.images, "annotations": blocks}, found)
     shift, slope = (before[0] + best[0], before[1] + best[1]) if best else (0.0, 0.0)
     return {f"{prefix}score_shift": round(shift, 3), f"{prefix}score_per_doubling": slope}
 
