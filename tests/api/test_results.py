@@ -227,7 +227,7 @@ def test_a_plan_says_where_which_block_is_seen(monkeypatch: pytest.MonkeyPatch) 
     assert maps.incidence_rad.attrs["units"] == "rad"
     assert 0 < found.table.loc["smallest_block_m", "middle"] < 0.5
     assert found.table.loc["range_m", "median"] == pytest.approx(20, abs=2)
-    assert "smallest block" in found._repr_html_()
+    assert "the fall of a block with sides of" in found._repr_html_()
 
 
 def test_configs_by_object_mapping_file_and_keyword_are_one(run: Run, tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def test_maps_that_are_no_measurement_are_one_line(tmp_path: Path, capsys: pytes
     for words, message in (
         ([zero], "zero: shows the same difference, 0 m, everywhere"),
         ([once, once], "is the same map as once"),
-        ([flat], "a pixel of 0 m"),
+        ([flat], "its pixels are 0 x 0 units"),
     ):
         assert main(["calibrate", *map(str, words), "--sensor", "tls", "--out", str(out), "--quiet"]) == 2
         said = capsys.readouterr().err

@@ -21,4 +21,4 @@ def test_the_set_up_knows_the_extras_and_refuses_other_words() -> None:
         ["sh", "tools/setup.sh", "detect", "detekt"], cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False
     )
     assert told.returncode == 1
-    assert "got 'detekt'; allowed: nothing, all, or some of colmap crs dataset detect" in told.stderr
+    assert "got 'detekt'; allowed: nothing, all, or some of colmap dataset detect" in told.stderr

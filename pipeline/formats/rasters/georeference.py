@@ -99,7 +99,7 @@ def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, floa
     else:
         return None
     if turned or not step_x > 0 or not np.isclose(step_x, abs(step_y), rtol=_SQUARE, atol=0):
-        problem = "its pixels are turned against the axes" if turned else f"its pixels are {step_x:g} x {step_y:g} units"
+        problem = "its pixels are turned against the axes" if turned else f"its pixels are {step_x:g} x {abs(step_y):g} units"
         remedy = "resample it to square pixels along the axes (gdalwarp)"
         raise InputError(problem, where=str(path), allowed="square pixels, columns towards larger x", remedy=remedy)
     return step_x, step_y, x, y
