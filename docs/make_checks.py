@@ -258,7 +258,7 @@ KINDS = (
         "Configs",
         ".yaml",
         {
-            "`simulate --config`": ("simulate", "--sensor", "tls", "--config", "FILE", "--out", "out"),
+            "`simulate`, its config": ("simulate", "--sensor", "tls", "--config", "FILE", "--out", "out"),
             "`inspect`": ("inspect", "FILE", "--sensor", "tls", "--out", "out"),
             "`dataset`": ("dataset", "FILE", "--out", "out"),
         },
