@@ -5,7 +5,7 @@
 Each trial has a wall and a seed of its own and draws its true noise at random; its maps are made by the whole simulation
 (`noise_map`: every cell, meshing, ICP of one noisy epoch to the other, rasters), not by the one that the calibration searches
 with. Finished trials are kept under --out, so an interrupted benchmark goes on where it was. The table goes into
-docs/calibrate.md.
+docs/explanation/calibration.md.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from scene.common.backend import dr
 from scene.common.keyed_random import KeyedRandom
 from scene.ray_casting.raycast import RayCaster
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "calibrate.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "explanation" / "calibration.md"
 EPOCHS = 2
 SETTINGS = [
     "wall.width_m=9",

@@ -2,7 +2,7 @@
 
     python benchmarks/dataset_noise.py [CONFIG] [--maps 4] [--sensor stereo|tls] [--unit]
 
-Maps without blocks at half the walls' resolution and a GSD of 10 cm, as in noise_table.py (docs/noise.md says what that changes);
+Maps without blocks at half the walls' resolution and a GSD of 10 cm, as in noise_table.py (docs/explanation/noise.md);
 mean of the StD, mm, by wall and level, with the largest and smallest. --unit: at scale 1 in place of the config's.
 """
 

@@ -5,7 +5,7 @@
 Of the blocks found (masks overlap by 0.25, score 0.95), the share with a mask that overlaps by 0.75: masks as they are, drawn in
 other boxes, with another margin or from another probability on, and the true masks cut or sampled as the masks found are. Each
 block counts that the network finds as it is, whatever is drawn then. Tiles of the detector's own size. --write puts the table
-into docs/detector.md.
+into docs/validation/detector.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.network.normalisation import normalised
 from pipeline.detection.products.run import detector_folder
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "detector.md"
 MARKS = "<!-- drawn -->", "<!-- end of drawn -->"
 CONFIDENCE, FOUND, DRAWN = 0.95, 0.25, 0.75
 SIZES = ("small", "medium", "large")
@@ -209,7 +209,7 @@ def main() -> None:
     parser.add_argument("--split", default="val", help="its folder with the tiles")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
     parser.add_argument("--unmirrored", action="store_true", help="look at maps as they are, not at their mirror images too")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
     arguments = parser.parse_args()
     model = weights.load(detector_folder(arguments.model), unmirrored=arguments.unmirrored)
     text = "\n".join(rows(list(blocks(model, CocoFolder(arguments.folder / arguments.split)))))

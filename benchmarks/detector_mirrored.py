@@ -5,7 +5,7 @@
 The views are those of pipeline/detection/inference/mirrored.py. F1 of masks by size at a score of 0.95, once the scores of each
 way of looking are set on the same tiles (`operating_point.best_shifts`), so the
 gain is rather too large than too small. Tiles of the
-detector's own size. --write puts the table into docs/detector.md.
+detector's own size. --write puts the table into docs/validation/detector.md.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.network.model import MaskRCNN
 from pipeline.detection.products.run import detector_folder
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "detector.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "detector.md"
 MARKS = "<!-- mirrored -->", "<!-- end of mirrored -->"
 CONFIDENCE, LOWEST, OVERLAPS = 0.95, 0.02, (0.25, 0.75)
 SIZES = ("small", "medium", "large")
@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("--split", default="val", help="its folder with the tiles")
     parser.add_argument("--every", type=int, default=1, help="take every so many of them alone")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
     arguments = parser.parse_args()
     tiles = CocoFolder(arguments.folder / arguments.split)
     tiles.images = tiles.images[:: arguments.every]

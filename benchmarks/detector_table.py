@@ -7,8 +7,8 @@ Each set, named by where its blocks lie (`rockfall.placement`), gets tables of t
 scanner's. Detections are kept in a folder beside the set's (--out) and not made again. Confidence 0.95, and an IoU of 0.25 (was
 the block found?) and of 0.75 (how well is it drawn?) of masks and of boxes; of boxes at 0.75 the thesis has tables 5-9 to 5-12.
 To reach: more than the baseline wherever the baseline has less than 95 %. The baseline gets the lowest score to count, of a
-few, that is best for it over the cells of a table. --write puts the tables into docs/detector_tables.md, their means over the
-walls into docs/detector.md.
+few, that is best for it over the cells of a table. --write puts the tables into
+docs/validation/detector_tables.md, their means over the walls into docs/validation/detector.md.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from documents import write_between
 from pipeline.detection.evaluation.evaluate import Overlap, Score, evaluate
 from pipeline.detection.products.run import BASELINE, LOWEST_SCORE, detect
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[1] / "docs" / "validation"
 MARKS = "<!-- table -->", "<!-- end of table -->"
 CONFIDENCE, FOUND, DRAWN = 0.95, 0.25, 0.75
 BASELINE_SCORES = (LOWEST_SCORE, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -227,7 +227,7 @@ def main() -> None:
     parser.add_argument("--set", type=Path, required=True, action="append", dest="folders", help="what detector_test.yaml makes")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
     parser.add_argument("--out", default="found", help="name of the folder, beside each set's, for the detections")
-    parser.add_argument("--write", action="store_true", help="put the tables into docs/")
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/validation")
     arguments = parser.parse_args()
     tests = [Tested.of(each, arguments.model, each.with_name(f"{each.name}_{arguments.out}")) for each in arguments.folders]
     every = [tested.on(sensor) for tested in tests for sensor in SENSORS]

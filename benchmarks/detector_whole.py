@@ -6,7 +6,7 @@
 
 The same epochs as configs/datasets/detector_test.yaml has, in tiles larger than a map. Cells that both sets have: wall, noise and
 size of one sensor. A cut block counts once for each tile that shows a part of it, a whole one once; `detect` lays its own windows
-over whole maps by a half. Everything else is as in detector_table.py. --write puts the table into docs/detector.md.
+over whole maps by a half. Everything else is as in detector_table.py. --write puts the table into docs/validation/detector.md.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--sets", type=Path, nargs=2, required=True, action="append", help="tiles; whole maps of the same epochs")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
     parser.add_argument("--out", default="found", help="name of the folder, beside each set's, for the detections")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
     arguments = parser.parse_args()
     heads = [f"masks, {bar.iou:g}: {kind}" for bar in BARS if bar.kind == "segm" for kind in ("tiles", "whole maps")]
     lines = [f"| placement | sensor | cell | blocks: tiles, whole | {' | '.join(heads)} |", "|---|---|---|---|---|---|---|---|"]

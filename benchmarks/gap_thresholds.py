@@ -1,6 +1,6 @@
 """What each threshold of the diagnosis does when it is 0.7 and 1.4 times as large, on development cases.
 
-    python benchmarks/gap_thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/gap/thresholds.md
+    python benchmarks/gap_thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/validation/gap_thresholds.md
 
 The first diagnosis of a case carries each threshold's other values along and notes which of them would have decided
 otherwise; only with those it is diagnosed again. Interrupted, it goes on where it was; `--minutes` ends it with the table of

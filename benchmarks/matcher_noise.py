@@ -1,4 +1,5 @@
-"""The simulated matching noise fitted to the errors of semi-global matching, and both in one table (docs/matching.md).
+"""The simulated matching noise fitted to the errors of semi-global matching,
+and both in one table (docs/explanation/matching.md).
 
 Fitted by differential evolution and a simplex search on two rendered walls, once for SGBM and once for SGBM with refinement;
 validated on walls and on real pictures (the Middlebury motorcycle) that the fit has not seen. Pixels are those of the matched

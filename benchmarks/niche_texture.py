@@ -5,7 +5,8 @@
 A pixel's fine deviation is that from the mean of the 3 x 3 px around it. Inside: the median of its magnitude over those of a
 niche's pixels that are EROSION_PX or more from the outline, so that the rim has no part; around: over those of a ring that is
 as far from every outline. Niches of which fewer than FEWEST pixels are left are not counted. A detector that learns from maps
-on which the two differ learns a texture that measured clouds do not have. --write puts the table into docs/detector.md.
+on which the two differ learns a texture that measured clouds do not have.
+--write puts the table into docs/validation/detector.md.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def rows(sets: Sequence[Path]) -> Iterator[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--set", type=Path, required=True, action="append", dest="folders", help="a data set with a test part")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
     arguments = parser.parse_args()
     table = printed(rows(arguments.folders))
     if arguments.write:

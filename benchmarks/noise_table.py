@@ -5,7 +5,7 @@
 Each map differs two observations of one wall with noise drawn anew in both. Finished maps are kept under --out, so an interrupted
 run goes on where it was. --parameters: the noise of each parameter alone instead; --readings: the printed noise drawn in
 other ways; --faithful: glendale_high, medium and low by vertices against a reference without noise, as the data sets have them.
-Tables are printed and put into docs/noise.md.
+Tables are printed and put into docs/explanation/noise.md.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from scene.common.keyed_random import KeyedRandom
 from scene.ray_casting.raycast import RayCaster
 from sensors.models.sensor_model import StereoModel, StereoNoise
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "noise.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "explanation" / "noise.md"
 LEVELS = ("high", "medium", "low")
 THESIS_MM = {"high": (23.8, 24.4), "medium": (14.0, 14.6), "low": (7.8, 8.5)}
 """Mean StD and mean RMSE over 45 maps."""
@@ -164,7 +164,7 @@ def single_parameters(model: StereoModel) -> dict[str, StereoModel]:
 
 
 def into_document(name: str, rows: list[str]) -> None:
-    """Put a table between its two marks in docs/noise.md."""
+    """Put a table between its two marks in docs/explanation/noise.md."""
     text = DOCUMENT.read_text(encoding="utf-8")
     table = "\n".join(rows)
     marked = re.sub(rf"(<!-- {name} -->\n).*?(<!-- end -->)", lambda found: f"{found[1]}{table}\n{found[2]}", text, flags=re.S)

@@ -1,4 +1,4 @@
-"""Try a bad input of each kind at each door and write docs/formats/checks.md: `python docs/make_checks.py`.
+"""Try a bad input of each kind at each door and write docs/reference/formats/checks.md: `python docs/make_checks.py`.
 
 A door is a command, an option or a function that reads files of some kind. tests/test_checks.py tries them too, against the page.
 """
@@ -29,7 +29,7 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import TriangleMesh
 from sensors.cameras.camera import Camera
 
-PAGE = Path(__file__).parent / "formats" / "checks.md"
+PAGE = Path(__file__).parent / "reference" / "formats" / "checks.md"
 EYE = ("3", "-20", "2")
 SCAN = ("--position", ",".join(EYE), "--scanner", "riegl_vz400i")
 """Where the scanner stands, and which it is."""

@@ -1,4 +1,4 @@
-"""The gallery: for each effect of both registries a page and a difference map, docs/effects/<sensor>.<name>.md and .png.
+"""The gallery: for each effect of both registries a page and a difference map.
 
     python docs/make_gallery.py [SENSOR.NAME ...]
 
@@ -41,7 +41,7 @@ from sensors.models.sensor_model import StereoModel, TlsModel, TlsNoise
 from sensors.signal_chain.observation import Observation
 from sensors.stereo.stereo_pair import StereoPair
 
-FOLDER = Path(__file__).parent / "effects"
+FOLDER = Path(__file__).parent / "reference" / "effects"
 GSD_M = 0.25
 SEED = 1
 STEREO_QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}

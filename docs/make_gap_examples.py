@@ -3,8 +3,8 @@
     python docs/make_gap_examples.py motorcycle|sgbm [--out runs/gap_examples] [--data ../shared/data]
 
 motorcycle: real photographs, Middlebury 2014's motorcycle at 741 x 500 with its measured disparities as the reference, matched by
-OpenCV's semi-global matching (docs/gap/real_pair.md). sgbm: rendered photographs of a wall in Glendale's style, matched by the
-same, against the simulated matcher (docs/gap/sgbm.md).
+OpenCV's semi-global matching. sgbm: rendered photographs of a wall in Glendale's style, matched by the
+same, against the simulated matcher.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
-from make_gap_pages import FOLDER, small_png
+from make_gap_pages import small_png
 
 from pipeline.formats.cameras.cameras import write_cameras_yaml
 from pipeline.formats.measurements.measurement import read_measurement
@@ -46,6 +46,7 @@ from sensors.stereo.refinement import refine
 from sensors.stereo.stereo_matched import MatchedStereoPair
 from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
+FOLDER = Path(__file__).parent / "validation"
 F_PX, BASE_M, CX, CY, OFFSET_PX = 994.978, 0.193001, 311.193, 254.877, 31.086
 """Middlebury's calibration of the motorcycle at this size, principal point from the centre of the top-left pixel."""
 _JUMP_PX = 1.0
@@ -183,8 +184,8 @@ def _entry(entry: dict[str, Any]) -> str:
 
 
 def page(name: str, title: str, before: str, found: list[tuple[str, GapDiagnosis]]) -> None:
-    """docs/gap/<name>.md up to the line that marks hand-written text, which is kept."""
-    path, mark = FOLDER / f"{name}.md", "## What it could and could not say"
+    """docs/validation/gap_<...>.md up to the line that marks hand-written text, which is kept."""
+    path, mark = FOLDER / f"{_FILES[name]}.md", "## What it could and could not say"
     kept = path.read_text().partition(mark)[2] if path.exists() else "\n"
     parts = [f"# {title}", before, table(found)]
     for matcher, each in found:
@@ -219,6 +220,7 @@ def main() -> None:
     page(name, title, _INTRODUCTIONS[name], found)
 
 
+_FILES = {"real_pair": "gap_real_photographs", "sgbm": "gap_rendered_photographs"}
 _INTRODUCTIONS = {
     "real_pair": "Middlebury 2014's motorcycle (741 x 500 px, disparities measured with structured light) is matched by OpenCV's"
     " semi-global matching; the reference is the surface of the measured disparities, cut where they jump by more than 1 px,"
@@ -230,8 +232,8 @@ _INTRODUCTIONS = {
     " perfect matcher (0.05 px of the frame of white noise, no effects; a pixel of the matched pictures is 4 px of the frame)."
     " Made by\n\n"
     "    python docs/make_gap_examples.py sgbm\n\n"
-    "which leaves the measurement folders and the whole reports in runs/gap_examples/sgbm. [docs/matching.md](../matching.md)"
-    " has the matchers' errors in figures.",
+    "which leaves the measurement folders and the whole reports in runs/gap_examples/sgbm."
+    " [How matching works](../explanation/matching.md) has the matchers' errors in figures.",
 }
 
 

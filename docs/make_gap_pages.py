@@ -1,4 +1,4 @@
-"""The pages in docs/gap: one for each verdict of `scarpsim gap` with an example, and the table from symptoms to causes.
+"""The pages in docs/reference/gap: one for each verdict of `scarpsim gap` with an example, and the table from symptoms to causes.
 
     PYTHONPATH=tests python docs/make_gap_pages.py [symptoms] [VERDICT ...]
 
@@ -46,7 +46,7 @@ from sensors.models.placement import RigConfig, StationConfig, Target
 from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.stereo.stereo_pair import REDUCTION
 
-FOLDER = Path(__file__).parent / "gap"
+FOLDER = Path(__file__).parent / "reference" / "gap"
 _BINS = 24
 _DEPENDS = 0.25
 """Share of the variance along a covariate from which the mean counts as depending on it."""
@@ -252,7 +252,7 @@ def _alike(name: str, table: Identifiability) -> str:
 
 
 def make_symptoms() -> None:
-    """Write docs/gap/symptoms.md and its pictures."""
+    """Write docs/reference/gap/symptoms.md and its pictures."""
     wall = ProceduralWall(style="glendale", resolution_m=0.1)
     stage, config = Stage(wall.mesh(KeyedRandom(SEED))), SimulationConfig(wall=wall, seed=SEED)
     (FOLDER / "images").mkdir(parents=True, exist_ok=True)
@@ -368,7 +368,7 @@ def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
 
 
 def make_verdicts(wanted: list[str]) -> None:
-    """Write docs/gap/<verdict>.md and pictures; says where an example gets another verdict than its page's."""
+    """Write docs/reference/gap/<verdict>.md and pictures; says where an example gets another verdict than its page's."""
     (FOLDER / "images").mkdir(parents=True, exist_ok=True)
     for name, verdict in verdicts().items():
         if wanted and name not in wanted:

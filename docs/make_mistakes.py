@@ -1,4 +1,4 @@
-"""Likely mistakes and what scarpsim answers: `python docs/make_mistakes.py` tries each and writes docs/mistakes.md.
+"""Likely mistakes and what scarpsim answers: `python docs/make_mistakes.py` tries each and writes docs/reference/mistakes.md.
 
 tests/test_mistakes.py tries them too, against the page.
 """
@@ -20,7 +20,7 @@ import trimesh
 
 from pipeline.cli import main as cli
 
-PAGE = Path(__file__).parent / "mistakes.md"
+PAGE = Path(__file__).parent / "reference" / "mistakes.md"
 SITE = """seed: 1
 wall: {style: glendale, width_m: 6, height_m: 4, resolution_m: 0.1, seed: 1}
 rockfall: {count: 3, size_m: 0.4}
@@ -145,7 +145,7 @@ def answer(mistake: Mistake) -> tuple[int, str, str]:
 
 
 def page(answers: dict[Mistake, str]) -> str:
-    """docs/mistakes.md."""
+    """docs/reference/mistakes.md."""
     head = """# Likely mistakes and the answers
 
 Each of these ends with exit status 2, one message and no traceback, and leaves no half-written results. `...` stands for

@@ -4,7 +4,7 @@
     run = simulate("glendale", "tls", rockfall__count=20)
     run[1].difference                                     # xarray.DataArray, m
 
-Every name is loaded when it is asked for; docs/python.md lists what is public.
+Every name is loaded when it is asked for; docs/reference/python.md lists what is public.
 """
 
 from __future__ import annotations

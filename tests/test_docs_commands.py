@@ -1,7 +1,7 @@
 """Every command of README.md and docs/ does what its page says: it is run on a small scene, or resolved as if it were.
 
 A command that stands in none of the lists here fails `test_every_command_is_in_a_list`. The how-tos' commands are carried out by
-test_docs.py, those of docs/mistakes.md by test_mistakes.py.
+test_docs.py, those of docs/reference/mistakes.md by test_mistakes.py.
 """
 
 from __future__ import annotations
@@ -301,7 +301,7 @@ def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         for name, model in MODELS.items():
             Path(name).parent.mkdir()
             Path(name).write_text(yaml.safe_dump(model))
-        (text,) = re.findall(r"```yaml\n(name: My scanner.*?)```", (ROOT / "docs/extend/sensor.md").read_text(), re.DOTALL)
+        (text,) = re.findall(r"```yaml\n(name: My scanner.*?)```", (ROOT / "docs/howto/add_sensor.md").read_text(), re.DOTALL)
         Path("my_scanner.yaml").write_text(text)
         yield folder
     finally:
@@ -393,7 +393,7 @@ def test_the_plan_says_what_the_readme_promises() -> None:
 
 
 def test_a_script_finds_the_value_that_the_page_asks_jq_for() -> None:
-    (path,) = re.findall(r"\| jq '\.([^']+)'", (ROOT / "docs/command_line.md").read_text())
+    (path,) = re.findall(r"\| jq '\.([^']+)'", (ROOT / "docs/reference/command_line.md").read_text())
     value = json.loads(carry_out(SCRIPT, *TINY, *TINY_WALL, "--out", "runs/script"))
     for key, index in re.findall(r"(\w+)(?:\[(\d+)\])?", path):
         value = value[key] if not index else value[key][int(index)]

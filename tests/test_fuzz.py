@@ -1,6 +1,6 @@
 """Configs and input files with random damage: they load, or one InputError says what is wrong; nothing else comes out.
 
-Hypothesis draws the damage, the same at each run (derandomised); docs/robustness.md lists the faults that have own tests.
+Hypothesis draws the damage, the same at each run (derandomised); docs/validation lists the faults that have own tests.
 """
 
 from __future__ import annotations

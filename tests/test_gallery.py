@@ -1,4 +1,4 @@
-"""The gallery in docs/effects is complete; `python docs/make_gallery.py` writes it."""
+"""The gallery in docs/reference/effects is complete; `python docs/make_gallery.py` writes it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS
 
 EFFECTS = (*TLS_EFFECTS, *STEREO_EFFECTS, *FURTHER_EFFECTS)
-FOLDER = Path(__file__).parents[1] / "docs" / "effects"
+FOLDER = Path(__file__).parents[1] / "docs" / "reference" / "effects"
 
 
 def test_every_effect_has_a_page_and_a_small_picture_and_nothing_else_does() -> None:

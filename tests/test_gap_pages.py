@@ -1,4 +1,4 @@
-"""The pages in docs/gap are complete; `python docs/make_gap_pages.py` writes them from the effects and the verdicts."""
+"""The pages in docs/reference/gap are complete; `python docs/make_gap_pages.py` writes them from the effects and the verdicts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from pipeline.gap.naming.verdict import VERDICTS
 from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
 
-FOLDER = Path(__file__).parents[1] / "docs" / "gap"
+FOLDER = Path(__file__).parents[1] / "docs" / "reference" / "gap"
 NAMES = {f"{effect.sensor}.{effect.model_fields['name'].default}" for effect in (*TLS_EFFECTS, *STEREO_EFFECTS)}
 
 

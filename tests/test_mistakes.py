@@ -1,4 +1,4 @@
-"""Every mistake of docs/mistakes.md is answered by one message, exit status 2 and nothing left behind, and as the page says."""
+"""Every mistake of docs/reference/mistakes.md gets one message, that of the page, exit status 2, and leaves nothing behind."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ assert spec.loader is not None
 make = importlib.util.module_from_spec(spec)
 sys.modules["make_mistakes"] = make
 spec.loader.exec_module(make)
-PAGE = (DOCS / "mistakes.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "reference" / "mistakes.md").read_text(encoding="utf-8")
 CHANGING = re.compile(r"[\d.,e+]+ (?:GB|MB)|allowed: [\d.]+ to")
 """Depends on the machine's free memory."""
 

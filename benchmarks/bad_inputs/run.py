@@ -1,6 +1,7 @@
 """Bad inputs, each to its command: how many are answered well.
 
-    python benchmarks/bad_inputs/run.py [--listed] [--only WORD ...] [--jobs 2] [--state FOLDER] [--table docs/robustness.md]
+    python benchmarks/bad_inputs/run.py [--listed] [--only WORD ...] [--jobs 2] [--state FOLDER]
+        [--table docs/validation/robustness.md]
 
 Each runs as a process of its own, some seconds long, on copies of small good inputs that are made first, those of listed.txt
 before the others. Prints those that are answered badly (see case.py for what that is), and counts by command; exit status 1 where

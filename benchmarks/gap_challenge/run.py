@@ -219,7 +219,9 @@ def main() -> None:
     parser.add_argument("--keep", action="store_true", help="keep the measurements and everything the command wrote")
     parser.add_argument("--stratum", choices=STRATA, help="cases of this kind alone, such as none: without any effect")
     parser.add_argument("--sensor", choices=SENSORS, help="cases of this sensor alone")
-    parser.add_argument("--table", type=Path, help="write the table there too (docs/gap_challenge.md), and its figures beside it")
+    parser.add_argument(
+        "--table", type=Path, help="write the table there too (docs/validation/gap_challenge.md), and its figures beside it"
+    )
     arguments = parser.parse_args()
     found = run(
         arguments.cases,

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 Json = dict[str, Any]
+_PAGE = "docs/validation/gap_challenge.md"
 _ANSWERS = (
     "right, alone",
     "right, in a class",
@@ -28,7 +29,7 @@ _UNDECIDED = "undecided: the 95 % interval holds values that reach the goal and 
 
 
 def markdown(found: Json) -> str:
-    """docs/gap_challenge.md, from results.json."""
+    """docs/validation/gap_challenge.md, from results.json."""
     parts = [
         "# The challenge of the missing effect",
         f"{len(found['rows'])} measurements with hidden truth, made by `benchmarks/gap_challenge`, which shares no code with the "
@@ -53,7 +54,7 @@ def markdown(found: Json) -> str:
 def _command(settings: Json) -> str:
     words = f"python benchmarks/gap_challenge/run.py --cases {settings['cases']} --seed {settings['seed']}"
     chosen = "".join(f" --{key} {settings[key]}" for key in ("stratum", "sensor") if key in settings)
-    return f"From `{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table docs/gap_challenge.md`."
+    return f"From `{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table {_PAGE}`."
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:

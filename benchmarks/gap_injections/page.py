@@ -16,12 +16,12 @@ _HEAD = """# Known effects put into real scans
 
 Made by
 
-    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections --page docs/gap/injections.md
+    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections --page docs/validation/gap_injections.md
 
 (by this command, not by hand). Each row is a real measurement of ../shared/data into whose ranges, angles or disparities a known
 effect was put by a closed form (`benchmarks/gap_injections/formulas.py`, NumPy and SciPy alone), diagnosed as `scarpsim gap` does
 it. The measurements have disagreements of their own, which no generator makes: edges, twigs, relief between points, rounding. The
-table beside it, of [the challenge](../gap_challenge.md), has measurements that a generator made.
+table beside it, of [the challenge](gap_challenge.md), has measurements that a generator made.
 
 - **right**: the effect is named, within 3 standard errors or 15 % of what was put in (a period within 5 %), and no other effect
   is blamed. Of an effect of no catalogue (`off_...`): the answer is `unknown`, and no effect of the catalogue is blamed.
@@ -98,7 +98,7 @@ Not mended:
 
 
 def page(rows: list[Json], bases: dict[str, Json]) -> str:
-    """docs/gap/injections.md."""
+    """docs/validation/gap_injections.md."""
     parts = [
         _HEAD,
         "## The measurements as they are\n\n" + _bases(bases),

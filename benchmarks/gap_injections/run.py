@@ -1,6 +1,6 @@
 """Known effects put into real measurements, each diagnosed as `scarpsim gap` does it, and judged.
 
-    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections [--page docs/gap/injections.md]
+    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections [--page docs/validation/gap_injections.md]
 
 Interrupted, it goes on where it was. Under --out: bases/ (the measurements as they are), cases/ (with an effect put into them;
 each is a folder that `scarpsim gap` takes), answers/ and results.json. The data lie in ../shared/data.

@@ -1,6 +1,7 @@
 """Makes cases, asks `scarpsim gap` about each, judges the answers.
 
-    python benchmarks/gap_judge/run.py --cases 40 --seed 77 --out /tmp/judge [--sensor tls|stereo] [--table docs/gap_judge.md]
+    python benchmarks/gap_judge/run.py --cases 40 --seed 77 --out /tmp/judge [--sensor tls|stereo]
+        [--table docs/validation/gap_second_generator.md]
 
 In DIR: `cases/0007` the measurement folder, `truth/0007.json` what is in it, `answers/0007` what the command wrote. Cases that
 were built or answered are not built or answered again.

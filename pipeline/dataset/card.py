@@ -46,7 +46,7 @@ pixel scale give its place on the wall in the wall frame (x along the wall, y up
 
 An annotation has beside COCO's keys: `size_m` (the block's three axes), `volume_m3` (rock removed), `measured_volume_m3` and
 `depth_m` (volume and mean depth that the epoch's map shows of the whole block), `signal_to_noise` (of the matched filter, which
-knows the niche's shape: docs/detector.md), `ignore` (1 where that is below the config's annotation.ignore_below: training leaves
+knows the niche's shape: docs/validation), `ignore` (1 where that is below the config's annotation.ignore_below: training leaves
 the block out of its loss, evaluations count it; `iscrowd` stays 0), `share_in_tile` (of the block's pixels; less than 1 where the
 tile's edge cuts it), `shape`, `sensor`, `wall`, `noise`, `size_class`, `seed`, `epoch` (index in the plan),
 `source`.

@@ -244,7 +244,7 @@ def _closed(each: LocalCluster | Client) -> None:
 
 
 def _remote(stack: ExitStack, address: str) -> Client:
-    """The user's scheduler; for tls:// Dask takes the certificates from its own configuration (docs/dataset.md)."""
+    """The user's scheduler; for tls:// Dask takes the certificates from its own configuration (docs/reference/data_sets.md)."""
     from distributed import Client
 
     try:
@@ -253,7 +253,7 @@ def _remote(stack: ExitStack, address: str) -> Client:
         raise InputError(
             f"no scheduler answers at '{address}' ({error})",
             where="--scheduler",
-            remedy="give the address that it printed, and for tls:// the certificates (docs/dataset.md)",
+            remedy="give the address that it printed, and for tls:// the certificates (docs/reference/data_sets.md)",
         ) from None
     stack.callback(_closed, client)
     return client

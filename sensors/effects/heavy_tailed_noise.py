@@ -21,7 +21,7 @@ class HeavyTailedNoise(NodeNoise):
 
     A normal error whose size varies log-normally from place to place: standard deviation sigma, kurtosis 3 exp(4 t^2). Both
     fields: Gaussian values on a grid of nodes `step` apart, bilinear. Not in the shared catalogue; drawn from OpenCV's
-    semi-global matching of rendered and of real pictures (docs/matching.md).
+    semi-global matching of rendered and of real pictures (docs/explanation/matching.md).
     """
 
     name: Literal["heavy_tailed_noise"] = "heavy_tailed_noise"

@@ -15,7 +15,7 @@ class TangentialDistortion(CameraEffect):
 
     name: Literal["tangential_distortion"] = "tangential_distortion"
     means = "The lens's elements are not centred as the calibration says."
-    act = "Calibrate the camera again; check that p1 and p2 were not exchanged between two programs (docs/formats/cameras.md)."
+    act = "Calibrate the camera again; check that p1 and p2 were not exchanged between two programs."
     sets = (("p1",), ("p2",), ("p1", "p2"))
     p1: float = parameter(
         "real minus calibrated p1, Metashape's order",

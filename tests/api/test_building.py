@@ -30,8 +30,8 @@ COARSE: dict[str, Any] = {"station__distance_m": 12.0, "scanner__azimuth_step_ra
 
 
 def own_sensor() -> dict[str, Any]:
-    """What the Python block of docs/extend/sensor.md defines."""
-    text = (ROOT / "docs" / "extend" / "sensor.md").read_text()
+    """What the Python block of docs/howto/add_sensor.md defines."""
+    text = (ROOT / "docs" / "howto" / "add_sensor.md").read_text()
     code = next(block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "class FlashLidar" in block)
     body = code[code.index("@dataclass") :]
     assert len([line for line in body.splitlines() if line.strip()]) <= 30

@@ -1,4 +1,4 @@
-"""What is public stands on docs/python.md, with its parameters; notebooks and examples use nothing else.
+"""What is public stands on docs/reference/python.md, with its parameters; notebooks and examples use nothing else.
 
 python tests/api/test_public.py    writes the list anew
 """
@@ -18,7 +18,7 @@ import scene
 import sensors
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "python.md"
+PAGE = ROOT / "docs" / "reference" / "python.md"
 PACKAGES = (pipeline, sensors, scene)
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 _LIST = re.compile(r"(?<=```text\n)(.*)(?=```)", re.DOTALL)
@@ -75,7 +75,7 @@ def sources() -> dict[str, str]:
         path.name: "\n".join(cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code")
         for path in NOTEBOOKS
     }
-    for page in (PAGE, ROOT / "docs" / "extend" / "sensor.md"):
+    for page in (PAGE, ROOT / "docs" / "howto" / "add_sensor.md"):
         found |= {f"{page.name} {number}": code for number, code in enumerate(_examples(page))}
     return found
 
@@ -111,7 +111,7 @@ def test_the_page_of_building_blocks_measures_the_volume() -> None:
 
 
 def test_own_sensor_page_runs() -> None:
-    define, use = _examples(ROOT / "docs" / "extend" / "sensor.md")
+    define, use = _examples(ROOT / "docs" / "howto" / "add_sensor.md")
     space: dict[str, object] = {"__name__": "own"}
     exec(compile(define, "sensor.md", "exec", dont_inherit=True), space)
     *before, last = use.strip().splitlines()

@@ -319,7 +319,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_the_page_of_the_command_line_says_what_there_is() -> None:
-    page = (CONFIGS.parent / "docs/command_line.md").read_text()
+    page = (CONFIGS.parent / "docs/reference/command_line.md").read_text()
     for code in (cli.DONE, cli.FAILED, cli.WRONG_INPUT, cli.INTERRUPTED):
         assert f"| {code} |" in page
     for option in ("--json", "--quiet", "--debug", "completion", "init", "schema"):

@@ -61,11 +61,11 @@ def test_every_covariate_has_words() -> None:
 @pytest.mark.parametrize("effect", [*TLS_EFFECTS, *STEREO_EFFECTS], ids=lambda effect: effect.__name__)
 def test_every_effect_of_the_catalogue_says_what_it_means_and_what_to_do(effect: type[Effect]) -> None:
     assert all(text[0].isupper() and text.endswith(".") and len(text) > 25 for text in (effect.means, effect.act))
-    assert page_of(f"effects/{effect.sensor}.{effect.model_fields['name'].default}").startswith("file://")
+    assert page_of(f"reference/effects/{effect.sensor}.{effect.model_fields['name'].default}").startswith("file://")
 
 
 def test_what_the_catalogue_does_not_hold_is_told_in_general_words() -> None:
     term = Named("tls.range_empirical", "empirical", {"name": "range_empirical"}, {}, (), None, 9.0)
     assert "does not hold" in advice(term).means
     assert "Simulate with model_after.yaml" in advice(Named("tls.range_empirical", "physical", {}, {}, (), None, 9.0)).act
-    assert page_of("effects/tls.nothing") == ""
+    assert page_of("reference/effects/tls.nothing") == ""

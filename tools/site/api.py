@@ -32,10 +32,10 @@ def pages() -> dict[str, str]:
             if name in _LEFT_OUT or not modules:
                 continue
             dotted = name.replace("/", ".")
-            made[f"api/{dotted}.md"] = _page(dotted, modules)
+            made[f"reference/api/{dotted}.md"] = _page(dotted, modules)
             listed = ", ".join(f"`{path.stem}`" for path in modules)
             rows.append(f"| [{dotted}]({dotted}.md) | {listed} |")
-    return {"api/index.md": _INTRODUCTION + "\n".join(rows) + "\n", **made}
+    return {"reference/api/index.md": _INTRODUCTION + "\n".join(rows) + "\n", **made}
 
 
 def _page(dotted: str, modules: list[Path]) -> str:

@@ -11,7 +11,7 @@ _TEXT = """# Configuration
 
 A config is short, because everything has a default. Keys carry their units; a key that does not exist is an error with a
 suggestion. `--set a.b=value` overrides any of them on the command line, `--set sensor=glendale_high` and `--set
-scanner=riegl_vz400i` put in a bundled noise model or [scanner](../scanners/index.md). Of a scanner's preset and a key that stand
+scanner=riegl_vz400i` put in a bundled noise model or [scanner](scanners/index.md). Of a scanner's preset and a key that stand
 together, in one file or on one command line, the key wins; a preset on the command line wins over the file's keys that it
 sets, its noise and beam over the file's model. Paths in a config are relative to its folder.
 

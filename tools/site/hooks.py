@@ -45,15 +45,14 @@ def _named(entry: Any) -> Iterator[str]:
 
 
 def _written_out(entry: Any, pages: list[str], named: set[str]) -> Any:
-    """The navigation with folders (an index first) and "*" replaced by the pages that they stand for."""
+    """The navigation with folders replaced by the pages in them (an index first) that are named nowhere else."""
     if isinstance(entry, list):
         parts = [_written_out(part, pages, named) for part in entry]
         return [page for part in parts for page in (part if isinstance(part, list) else [part])]
     if isinstance(entry, dict):
         return {title: _written_out(part, pages, named) for title, part in entry.items()}
-    if entry == "*":
-        return [page for page in pages if "/" not in page and page not in named]
     if not entry.endswith("/"):
         return entry
-    inside = [page for page in pages if page.startswith(entry)]
+    deeper = [other for other in named if other.endswith("/") and other != entry and other.startswith(entry)]
+    inside = [page for page in pages if page.startswith(entry) and not page.startswith(tuple(deeper)) and page not in named]
     return sorted(inside, key=lambda page: (page.removeprefix(entry) not in _FIRST, page))

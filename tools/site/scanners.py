@@ -31,8 +31,8 @@ def pages() -> dict[str, str]:
     presets = {name: read_preset(name) for name in names}
     rows = ["| preset | instrument | ranging | range precision | beam, full angle at 1/e² |", "|---|---|---|---|---|"]
     rows += [_index_row(name, preset) for name, preset in presets.items()]
-    made = {f"scanners/{name}.md": _page(name, preset) for name, preset in presets.items()}
-    return {"scanners/index.md": _INTRODUCTION + "\n" + "\n".join(rows) + "\n", **made}
+    made = {f"reference/scanners/{name}.md": _page(name, preset) for name, preset in presets.items()}
+    return {"reference/scanners/index.md": _INTRODUCTION + "\n" + "\n".join(rows) + "\n", **made}
 
 
 def _index_row(name: str, preset: ScannerPreset) -> str:

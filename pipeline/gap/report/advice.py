@@ -51,7 +51,9 @@ def advice(named: Named) -> Advice:
 
 
 def page_of(name: str) -> str:
-    """Address of a page of the documentation, by its path without ending such as `effects/tls.wobble`, as a file on this machine:
-    of the site where `make docs` has built it, else the text; "" where the documentation is not installed."""
+    """Return the address of a page of the documentation as a file on this machine; "" where the documentation is not installed.
+
+    name: its path without ending, such as `reference/effects/tls.wobble`. The built site (`make docs`) comes before the text.
+    """
     pages = _ROOT / "site" / f"{name}.html", _ROOT / "docs" / f"{name}.md"
     return next((page.as_uri() for page in pages if page.is_file()), "")
