@@ -33,6 +33,7 @@ PAGE = Path(__file__).parent / "reference" / "formats" / "checks.md"
 EYE = ("3", "-20", "2")
 SCAN = ("--position", ",".join(EYE), "--scanner", "riegl_vz400i")
 """Where the scanner stands, and which it is."""
+REFERENCE = ("measurement", "scan.ply", "--reference", "FILE", *SCAN, "--out", "out")
 UTM = np.array([345_200.0, 6_389_450.0, 120.0])
 REFUSED, TAKEN = "refused", "taken"
 NO_FAULT = "none of these"
@@ -150,15 +151,7 @@ KINDS = (
         ".ply",
         {
             "`measurement SCAN`": ("measurement", "FILE", "--reference", "wall.ply", *SCAN, "--out", "out"),
-            "`measurement --reference`": (
-                "measurement",
-                "scan.ply",
-                "--reference",
-                "FILE",
-                *SCAN,
-                "--out",
-                "out",
-            ),
+            "`measurement --reference`": REFERENCE,
             "`gap SCAN`": ("gap", "FILE", "--reference", "wall.ply", *SCAN, "--out", "out"),
             "`surface`": ("surface", "FILE", "--seen-from", *EYE, "--out", "out.ply"),
         },
@@ -181,15 +174,7 @@ KINDS = (
         {
             "`simulate`": ("simulate", "--sensor", "tls", "--config", "site.yaml", "--set", "wall={mesh: FILE}", "--out", "out"),
             "`inspect`": ("inspect", "site.yaml", "--sensor", "tls", "--set", "wall={mesh: FILE}", "--out", "out"),
-            "`measurement --reference`": (
-                "measurement",
-                "scan.ply",
-                "--reference",
-                "FILE",
-                *SCAN,
-                "--out",
-                "out",
-            ),
+            "`measurement --reference`": REFERENCE,
             "`open_wall`": open_wall,
         },
         {
@@ -207,15 +192,7 @@ KINDS = (
         "Rasters",
         ".tif",
         {
-            "`measurement --reference`": (
-                "measurement",
-                "scan.ply",
-                "--reference",
-                "FILE",
-                *SCAN,
-                "--out",
-                "out",
-            ),
+            "`measurement --reference`": REFERENCE,
             "`detect`": ("detect", "baseline", "FILE", "--out", "out"),
         },
         {

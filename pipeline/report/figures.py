@@ -220,7 +220,7 @@ def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str 
 
 
 def _count_scale(known: NDArray[np.floating]) -> Normalize:
-    """The colour scale of whole numbers (n,): a step for each, of many a continuous one."""
+    """Return the colour scale of whole numbers (n,): a colour for each, or a continuous scale where there are many."""
     low, high = float(known.min()), float(known.max())
     if high - low > _MOST_STEPS:
         return _scale(known)

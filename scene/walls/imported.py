@@ -99,7 +99,7 @@ class ImportedWall(Config):
 
 
 def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Join meshes into one, in order. Beside a mesh with an albedo, one without it gets the default."""
+    """Join meshes into one, in order. If any mesh has an albedo, those without one get the default albedo."""
     if len(meshes) == 1:
         return meshes[0]
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])

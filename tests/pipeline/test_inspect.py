@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import stats
 from surfaces import plane, step
 
@@ -381,11 +383,25 @@ def test_headline_table_and_curves_say_the_same(name: str) -> None:
         assert f"sides of {100 * table['smallest_block_m']:.1f} cm exceeds" in answer(plan)
 
 
+def _colours(png: bytes) -> list[tuple[int, ...]]:
+    """The colours of a picture without white, the most frequent first."""
+    pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).reshape(-1, 3)
+    found, count = np.unique(pixels, axis=0, return_counts=True)
+    ordered = [tuple(int(part) for part in found[row]) for row in np.argsort(-count)]
+    return [colour for colour in ordered if colour != (255, 255, 255)]
+
+
 def test_a_map_of_counts_has_whole_steps_and_a_constant_is_told_in_words() -> None:
     grid = Grid(0.0, 3.0, 0.1, 40, 30)
     counts = np.ones((30, 40))
-    constant = map_figure(counts, grid, "cameras", "Cameras that see the wall")
+    constant = _colours(map_figure(counts, grid, "cameras", "Cameras that see the wall"))
+    assert constant[0] == (0xDB, 0xE6, 0xEE)  # one pale colour, on which the words are drawn
     counts[:, :20] = 2
-    assert len(map_figure(counts, grid, "cameras", "Cameras that see the wall")) != len(constant)
+    counts[:, 30:] = 0
+    several = _colours(map_figure(counts, grid, "cameras", "Cameras that see the wall"))
     scale = figures._count_scale(np.array([0.0, 1.0, 2.0]))
+    steps = {value: tuple(int(part) for part in figures.SEQUENTIAL(scale(value), bytes=True)[:3]) for value in (0, 1, 2)}
+    assert len(set(steps.values())) == 3
+    assert several[0] == steps[2]  # half of the map
+    assert set(several[1:3]) == {steps[0], steps[1]}  # a quarter each
     np.testing.assert_array_equal(scale.boundaries, [-0.5, 0.5, 1.5, 2.5])

@@ -22,8 +22,8 @@ from scene.common.regular_file import MOST_TEXT_BYTES, check_file
 
 _DOCUMENT = "doc.xml"
 _DAMAGED = (OSError, zipfile.BadZipFile, KeyError, EOFError, zlib.error, lzma.LZMAError, RuntimeError, UnicodeDecodeError)
-"""Of `zipfile`: unreadable; no archive; without doc.xml; cut off; a damaged stream, of either kind; encrypted, or packed in a way
-that it does not know (NotImplementedError); names in no encoding."""
+"""What `zipfile` raises for a project that cannot be read: no permission, no archive, no doc.xml, a file that is cut off, a
+damaged stream, encryption or a compression that it does not know (both RuntimeError), names in no known encoding."""
 _EXPORT = "save the project in Metashape again, or export the cameras with File > Export > Export Cameras"
 
 

@@ -75,7 +75,7 @@ def read_ptx(path: Path) -> list[PtxScan]:
 
 
 def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """The nearest rotation matrix to one with few digits, and a word where that changed more than rounding does.
+    """Replace a matrix by the nearest rotation, and add a note where that changes it by more than the rounding of its digits.
 
     Raises InputError where it is off by more than a hundredth, or turns left into right.
     """

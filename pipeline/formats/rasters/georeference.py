@@ -86,8 +86,10 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
 
 
 def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, float] | None:
-    """Side of a pixel, step of y from row to row (negative: north is up), x and y of the first corner or centre; None: no
-    place."""
+    """Return how columns and rows become coordinates: step of x, step of y, and x and y of the first pixel, in the file's unit.
+
+    A negative step of y means that the first row is the northernmost. None where the file states no place.
+    """
     scale, tie, matrix = tags.get(PIXEL_SCALE), tags.get(TIEPOINT), tags.get(TRANSFORMATION)
     if scale is not None and tie is not None and len(tie) == 6:
         step_x, step_y = float(scale[0]), -float(scale[1])
