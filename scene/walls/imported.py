@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,8 +18,10 @@ from scene.common.errors import InputError, nearest
 from scene.common.lengths import METRES
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
+from scene.meshes import obj
 from scene.meshes.cleaning import clean, drop_unused, flipped
 from scene.meshes.ply import read_elements
+from scene.meshes.polygons import triangulated
 from scene.meshes.rounding import check_rounding
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it cannot do comes as an exception, or is a texture
@@ -131,7 +134,7 @@ def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...
     Raises InputError where the file cannot be read, and for coordinates that are not finite, no place on earth or rounded away.
     """
     where, metres = str(path), METRES[unit]
-    mesh = _read(path)
+    mesh = _read(path, unit)
     _check_coordinates(mesh, metres, where)
     turned = ("y is up in glTF: turned so that z is",) if _format(path) in _Y_UP else ()
     notes = (*turned, *check_rounding(mesh, metres, where))
@@ -145,8 +148,11 @@ def _extent(mesh: TriangleMesh) -> float:
     return max(float(np.ptp(column[used])) for column in mesh.vertices.T)
 
 
-def _read(path: Path) -> TriangleMesh:
-    """The file's triangles as they are, in the file's unit; all meshes of a scene joined."""
+def _read(path: Path, unit: str) -> TriangleMesh:
+    """Read the file's triangles as they are, in the file's unit; all meshes of a scene joined.
+
+    Raises InputError where the file cannot be read, or states another unit than `unit`.
+    """
     where, kind = str(path), _format(path)
     if not path.exists():
         raise InputError("there is no such file", where=where, remedy="check the path")
@@ -156,10 +162,13 @@ def _read(path: Path) -> TriangleMesh:
     check_file(path, most_bytes=_MOST_BYTES, smaller="export it as a binary PLY of triangles, which can have any size")
     import trimesh
 
-    options = {"skip_materials": True} if kind == "obj" else {}
+    options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     try:
-        loaded = trimesh.load(str(path), file_type=kind, process=False, resolver=_beside(path), **options)
+        source = _obj_source(path, unit) if kind == "obj" else str(path)
+        loaded = trimesh.load(source, file_type=kind, process=False, resolver=_beside(path), **options)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the permissions") from None
     except Exception as error:  # trimesh's readers raise whatever their parsing meets
@@ -181,6 +190,22 @@ def _read(path: Path) -> TriangleMesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
+
+
+def _obj_source(path: Path, unit: str) -> str | io.BytesIO:
+    """Return what trimesh is to read of an OBJ file: its path, or its text where the file needs to be made plain.
+
+    Raises OSError where it cannot be read, and InputError where a comment in the file names another unit than `unit`.
+    """
+    text = path.read_bytes()
+    stated = obj.stated_unit(text)
+    if stated is not None and stated[0] != unit:
+        raise InputError(
+            f"says in a comment that its unit is {stated[0]} ('{stated[1][:80]}'), and is to be read in {unit}",
+            where=str(path),
+            remedy=f"set `unit` to {stated[0]}, or remove the comment if it is wrong",
+        )
+    return str(path) if obj.is_plain(text) else io.BytesIO(obj.made_plain(text))
 
 
 def _beside(path: Path) -> Any:
@@ -211,8 +236,10 @@ def _plain_ply(path: Path) -> TriangleMesh | None:
     more = "edge" in elements or not {*vertex, *face}.isdisjoint(_TEXTURE) or not set(face).isdisjoint(_COLOURS)
     if more or any(colour.dtype != np.uint8 for colour in colours):
         return None
-    if faces.shape[1:] != (3,) or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+    if faces.ndim != 2 or faces.shape[1] < 3 or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
         return None
+    if faces.shape[1] > 3:
+        faces = triangulated(vertices, faces)
     albedo = vertex["albedo"].astype(np.float32) if "albedo" in vertex else None
     albedo = _luminance(np.stack(colours, axis=1)) if albedo is None and len(colours) == 3 else albedo
     return TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), albedo)

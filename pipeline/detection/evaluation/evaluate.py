@@ -185,17 +185,24 @@ def coco_metrics(truth: Mapping[str, Any], predictions: Sequence[Mapping[str, An
         "AR_medium",
         "AR_large",
     )
-    if not predictions:
-        return dict.fromkeys(names, 0.0)
     with contextlib.redirect_stdout(io.StringIO()):
         reference = COCO()
         reference.dataset = {**truth, "annotations": _numbered(truth["annotations"])}
         reference.createIndex()
-        assessment = COCOeval(reference, reference.loadRes(_numbered(predictions)), kind)
+        found = reference.loadRes(_numbered(predictions)) if predictions else _without_annotations(reference)
+        assessment = COCOeval(reference, found, kind)
         assessment.evaluate()
         assessment.accumulate()
         assessment.summarize()
     return {name: float(value) for name, value in zip(names, assessment.stats, strict=True)}
+
+
+def _without_annotations(reference: COCO) -> COCO:
+    """Return the images and categories of a data set alone; pycocotools loads no empty list of detections."""
+    empty = COCO()
+    empty.dataset = {**reference.dataset, "annotations": []}
+    empty.createIndex()
+    return empty
 
 
 def _numbered(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -56,6 +56,9 @@ class TextLayout:
     stated: int | None = None
 
 
+_BINARY_KINDS = {b"LASF": ("a LAS or LAZ file", ".laz"), b"ASTM-E57": ("an E57 file", ".e57"), b"glTF": ("a glTF file", ".glb")}
+
+
 def encoding_of(path: Path) -> str:
     """The codec of a text: as its byte-order mark says, UTF-16 by its null bytes, else UTF-8 or Western European.
 
@@ -63,6 +66,10 @@ def encoding_of(path: Path) -> str:
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
+    for start, (kind, suffix) in _BINARY_KINDS.items():
+        if head.startswith(start):
+            problem, remedy = f"is {kind} by its first bytes, no text", f"give it the suffix {suffix}"
+            raise InputError(problem, where=str(path), allowed=_ROWS, remedy=remedy)
     for mark, name in _BYTE_ORDER_MARKS:
         if head.startswith(mark):
             return name

@@ -15,6 +15,7 @@ from pipeline.formats.files.xml_file import parsed
 from pipeline.formats.units import metres_of_epsg_unit, understood_crs, units_of_crs
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
 
 PIXEL_SCALE, TIEPOINT, TRANSFORMATION, GEO_KEYS, GDAL_METADATA = 33550, 33922, 34264, 34735, 42112
 MODEL_TYPE, RASTER_TYPE, LINEAR_UNITS, VERTICAL_UNITS = 1024, 1025, 3076, 4099
@@ -23,6 +24,8 @@ _GEOGRAPHIC, _PIXEL_IS_POINT = 2, 2
 _SIDES_M, _FARTHEST_M = (1e-6, 1e6), 1e8
 """Sides of a pixel, and how far from its origin any coordinate system of a survey reaches."""
 _SQUARE = 1e-9
+_TIES_AGREE = 0.01
+"""Share of a pixel by which tie points may differ."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +94,16 @@ def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, floa
     A negative step of y means that the first row is the northernmost. None where the file states no place.
     """
     scale, tie, matrix = tags.get(PIXEL_SCALE), tags.get(TIEPOINT), tags.get(TRANSFORMATION)
-    if scale is not None and tie is not None and len(tie) == 6:
+    if scale is not None and tie is not None and len(tie) >= 6:
         step_x, step_y = float(scale[0]), -float(scale[1])
-        x, y = float(tie[3]) - float(tie[0]) * step_x, float(tie[4]) - float(tie[1]) * step_y
+        x, y = _corner(np.asarray(tie, dtype=np.float64), step_x, step_y, path)
         turned = False
     elif matrix is not None and len(matrix) == 16:
         step_x, step_y, x, y = (float(matrix[place]) for place in (0, 5, 3, 7))
         turned = max(abs(float(matrix[1])), abs(float(matrix[4]))) > _SQUARE * abs(step_x)
+    elif tie is not None:
+        problem = f"states {len(tie) // 6} tie points and no size of its pixels"
+        raise InputError(problem, where=str(path), remedy="resample it to square pixels along the axes (gdalwarp)")
     else:
         return None
     if turned or not step_x > 0 or not np.isclose(step_x, abs(step_y), rtol=_SQUARE, atol=0):
@@ -105,6 +111,23 @@ def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, floa
         remedy = "resample it to square pixels along the axes (gdalwarp)"
         raise InputError(problem, where=str(path), allowed="square pixels, columns towards larger x", remedy=remedy)
     return step_x, step_y, x, y
+
+
+def _corner(ties: FloatArray, step_x: float, step_y: float, path: Path) -> tuple[float, float]:
+    """Return x and y of the first pixel, in the file's unit, from tie points of (column, row, 0, x, y, height) each.
+
+    Raises InputError where tie points disagree by more than a hundredth of a pixel: the raster is warped.
+    """
+    column, row, _, x, y, _ = ties[: len(ties) // 6 * 6].reshape(-1, 6).T
+    corners = np.column_stack([x - column * step_x, y - row * step_y])
+    farthest = float(np.abs(corners - corners[0]).max())
+    if not farthest <= _TIES_AGREE * abs(step_x):
+        raise InputError(
+            f"its {len(corners)} tie points disagree by up to {farthest:.4g} units with pixels of {step_x:g} units",
+            where=str(path),
+            remedy="resample it to square pixels along the axes (gdalwarp)",
+        )
+    return float(corners[0, 0]), float(corners[0, 1])
 
 
 def _geo_keys(tags: dict[int, Any], path: Path) -> dict[int, int]:
