@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from pipeline import open_wall
+from pipeline import open_wall, register
 from pipeline.cli import main as cli
 from pipeline.formats.cameras.metashape import write_metashape
 from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.points import read_points
 from pipeline.formats.rasters.geotiff import write_geotiff
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -118,7 +119,7 @@ def _annotated(**changes: object) -> Make:
 
 def _other_records(path: Path) -> None:
     path.mkdir()
-    for name in ("run.json", "measurement.yaml"):
+    for name in ("run.json", "measurement.yaml", "detector.yaml", "annotations.json"):
         (path / name).write_bytes(bytes(range(256)))
 
 
@@ -154,6 +155,7 @@ KINDS = (
             "`measurement --reference`": REFERENCE,
             "`gap SCAN`": ("gap", "FILE", "--reference", "wall.ply", *SCAN, "--out", "out"),
             "`surface`": ("surface", "FILE", "--seen-from", *EYE, "--out", "out.ply"),
+            "`register`": lambda path: register(read_points(path).points, _grid_points()),
         },
         {
             **ANY,
@@ -257,6 +259,10 @@ KINDS = (
             "`icp-study`": ("icp-study", "FILE", "--out", "out"),
             "`calibrate`": ("calibrate", "FILE", "--out", "out"),
             "`gap`": ("gap", "FILE", "--out", "out"),
+            "`view`": ("view", "FILE", "--no-browser"),
+            "`train`": ("train", "FILE", "--out", "out"),
+            "`detect MODEL`": ("detect", "FILE", "map.tif", "--out", "out"),
+            "`detect` a folder": ("detect", "baseline", "FILE", "--out", "out"),
             "`compare --measured`": ("compare", "site.yaml", "--measured", "FILE", "--out", "out"),
         },
         {
@@ -273,6 +279,7 @@ def prepare(folder: Path) -> None:
     """Write the good files that the doors need beside the bad one."""
     write_ply(folder / "wall.ply", _sheet())
     GOOD_POINTS(folder / "scan.ply")
+    _raster(folder / "map.tif")
     (folder / "site.yaml").write_text(SITE)
     (folder / "truth.json").write_text(json.dumps({**COCO, "annotations": [{**BOX, "iscrowd": 0}]}))
     (folder / "found.json").write_text(json.dumps([BOX]))

@@ -21,7 +21,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.registration import register as icp
 from pipeline.run.site import SensorSite, prepare_site
 from pipeline.surface.from_cloud import CloudConfig, surface_of_cloud
-from pipeline.surface.mesh import SurfaceConfig, mesh_observation
+from pipeline.surface.mesh import SurfaceConfig, median_spacing, mesh_observation
 from scene.blocks import block as solids
 from scene.blocks import carve as carving
 from scene.common.config import parse
@@ -29,6 +29,7 @@ from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.geometry.point_planes import normals_of
+from scene.meshes.rounding import check_steps, rounded_axes
 from scene.ray_casting.raycast import RayCaster
 from scene.walls.imported import ImportedWall
 from scene.walls.procedural import ProceduralWall
@@ -168,7 +169,11 @@ def difference(reference: TriangleMesh, epoch: TriangleMesh, gsd_m: float = 0.02
 def _surface_points(given: Any, name: str) -> tuple[FloatArray, FloatArray | None]:
     """Points (n, 3) of a mesh or an array, and a mesh's vertex normals; vertices without a normal belong to no surface."""
     if not isinstance(given, TriangleMesh):
-        return _table(given, name), None
+        points = _table(given, name)
+        rounded = rounded_axes(points)
+        if rounded:
+            check_steps(rounded, median_spacing(points - points[0]), name, "the points' spacing is")
+        return points, None
     normals = given.vertex_normals()
     length = np.linalg.norm(normals, axis=1)
     used = np.isfinite(length) & (length > 0)

@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 
 from pipeline.cli.answer import Answer
-from pipeline.cli.parser import add_output_options, between
+from pipeline.cli.parser import add_output_options, between, one_of
 from scene.common.errors import InputError
+from scene.common.lengths import METRES
 
 SUMMARY = "mesh a point cloud, so that it can be a wall or a reference"
 EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --out wall.ply
@@ -16,7 +17,7 @@ EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="points: .laz .las .ply .e57 .xyz")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the mesh, .ply, in the points' coordinates")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the mesh, .ply, in the points' coordinates, m")
     parser.add_argument(
         "--seen-from",
         type=between(-1e8, 1e8),
@@ -24,6 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar=("X", "Y", "Z"),
         help="where a sensor stood, in the points' coordinates [m]: the surface looks there",
+    )
+    parser.add_argument(
+        "--unit",
+        type=one_of(*METRES),
+        metavar="|".join(METRES),
+        help="of the points (default: as the file states, else m); the mesh is in m",
     )
     parser.add_argument(
         "--method",
@@ -53,11 +60,11 @@ def run(arguments: argparse.Namespace) -> Answer:
     import numpy as np
 
     from pipeline.formats.meshes.ply import write_ply
-    from pipeline.formats.points.points import read_points
+    from pipeline.formats.points.points import joined, read_placed_scans
     from pipeline.surface.from_cloud import CloudConfig, surface_of_cloud
 
     config = CloudConfig(method=arguments.method, poisson_depth=arguments.depth, poisson_trim_spacings=arguments.trim)
-    cloud = read_points(arguments.cloud)
+    cloud = joined([scan.cloud for scan in read_placed_scans(arguments.cloud, arguments.unit)])
     surface = surface_of_cloud(cloud, np.array(arguments.seen_from), config, str(arguments.cloud))
     mesh = surface.mesh
     write_ply(out, mesh)

@@ -380,3 +380,12 @@ def test_rigid_transform_conventions() -> None:
     np.testing.assert_allclose(move.apply(np.array([1.0, 2.0, 3.0])), [1.1, 2.0, 3.0], atol=1e-15)
     np.testing.assert_allclose(move.rotation_vector, vector, atol=1e-15)
     np.testing.assert_allclose(move.inverse().apply(move.apply(np.eye(3))), np.eye(3), atol=1e-15)
+
+
+def test_rounded_arrays_are_refused() -> None:
+    """Projected coordinates in single precision have steps of half a metre."""
+    from pipeline import register as register_surfaces
+
+    points = [*np.random.default_rng(5).uniform([0, 0, 0], [20, 2, 10], (2000, 3)), 345200.0, 5389450.0, 120.0]
+    with pytest.raises(InputError, match="single precision"):
+        register_surfaces(points.astype(np.float32), points)

@@ -109,3 +109,13 @@ def test_without_open3d_the_extra_is_named(
     words = ["--seen-from", *map(str, STATION), "--out", str(tmp_path / "wall.ply")]
     assert cli.main(["surface", str(cloud), *words, "--method", "poisson"]) == 2
     assert "make setup EXTRAS=poisson" in capsys.readouterr().err
+
+
+def test_points_in_another_unit_become_a_mesh_in_metres(tmp_path: Path) -> None:
+    x, z = (each.ravel() for each in np.meshgrid(np.arange(0.0, 5.0, 0.1), np.arange(0.0, 4.0, 0.1)))
+    points = np.column_stack([x, 0.1 * np.sin(x), z])
+    (tmp_path / "scan.xyz").write_text("\n".join(" ".join(f"{value:.6f}" for value in row) for row in 1000.0 * points))
+    words = ["surface", str(tmp_path / "scan.xyz"), "--unit", "mm", "--seen-from", "2.5", "-10", "2", "--out"]
+    assert cli.main([*words, str(tmp_path / "wall.ply")]) == 0
+    found = read_ply(tmp_path / "wall.ply")
+    np.testing.assert_allclose(found.bounds, [points.min(axis=0), points.max(axis=0)], atol=1e-6)
