@@ -386,6 +386,7 @@ def test_rounded_arrays_are_refused() -> None:
     """Projected coordinates in single precision have steps of half a metre."""
     from pipeline import register as register_surfaces
 
-    points = [*np.random.default_rng(5).uniform([0, 0, 0], [20, 2, 10], (2000, 3)), 345200.0, 5389450.0, 120.0]
+    offset = np.array([345_200.0, 5_389_450.0, 120.0])
+    points = np.random.default_rng(5).uniform([0, 0, 0], [20, 2, 10], (2000, 3)) + offset
     with pytest.raises(InputError, match="single precision"):
         register_surfaces(points.astype(np.float32), points)
