@@ -154,8 +154,20 @@ class SeenBlocks:
 
 @dataclass(frozen=True)
 class SensorAssessment:
-    """All figures of one sensor. wall: errors everywhere, within the niches too; complete: share of the wall with data, mean over
-    the epochs; visible: share that the sensor can see; complete_of_visible; by: statistics against each covariate."""
+    """All figures of one sensor.
+
+    Attributes
+    ----------
+    wall : DifferenceStatistics
+        Errors everywhere, within the niches too.
+    by : dict
+        Statistics against each covariate.
+    visible : float
+        Share of the wall that the sensor can see.
+    complete, complete_of_visible, complete_of_hidden : float
+        Share of pixels with data, mean over the epochs: of the whole wall, of what the sensor can see, and of what it cannot,
+        where triangles bridge a gap.
+    """
 
     name: str
     sensor: str
@@ -166,6 +178,7 @@ class SensorAssessment:
     visible: float
     complete: float
     complete_of_visible: float
+    complete_of_hidden: float
     points: int
     scan_seconds: float | None
     seconds: float
@@ -183,6 +196,7 @@ class SensorAssessment:
             "visible": self.visible,
             "complete": self.complete,
             "complete_of_visible": self.complete_of_visible,
+            "complete_of_hidden": self.complete_of_hidden,
             "points": self.points,
             "scan_seconds": self.scan_seconds,
             "seconds_per_epoch": self.seconds,
@@ -225,7 +239,7 @@ def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> SensorAssessment:
     errors = np.stack([change - epoch.change for change, epoch in zip(seen.changes, trial.epochs, strict=True)])
     noise = noise_of(stable, gsd, random)
     data, surface = ~np.isnan(seen.changes), trial.ground.found
-    in_view = seen.visible & surface
+    in_view, hidden = seen.visible & surface, surface & ~seen.visible
     return SensorAssessment(
         name=seen.contestant.name,
         sensor=seen.contestant.sensor,
@@ -236,6 +250,7 @@ def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> SensorAssessment:
         visible=float(np.mean(in_view[surface])),
         complete=float(np.mean(data[:, surface])),
         complete_of_visible=float(np.mean(data[:, in_view])) if in_view.any() else 0.0,
+        complete_of_hidden=float(np.mean(data[:, hidden])) if hidden.any() else 0.0,
         points=seen.points[0],
         scan_seconds=_scan_seconds(seen),
         seconds=float(np.mean(seen.seconds)),

@@ -226,6 +226,7 @@ def _rows(comparison: ComparedSensors, sizes: Mapping[str, Mapping[str, int]]) -
         ("Hidden (occlusion)", simulated([percent(1 - each.visible) for each in found])),
         ("Wall with data (completeness)", simulated([percent(each.complete) for each in found])),
         ("Visible wall with data", simulated([percent(each.complete_of_visible) for each in found])),
+        ("Hidden wall with data (bridged by triangles)", simulated([percent(each.complete_of_hidden) for each in found])),
         (
             "Angular step, azimuth by zenith",
             simulated([_step(seen.contestant.angular_step_rad) for seen in comparison.trial.seen]),

@@ -192,6 +192,8 @@ def test_planted_noise_is_measured(trial: Trial) -> None:
         assert each.noise.stable.count > 5000
         assert each.noise.model.sill_m2 == pytest.approx(each.noise.stable.nmad**2, rel=0.5)
         assert 0.5 < each.complete_of_visible <= 1
+        parts = each.visible * each.complete_of_visible + (1 - each.visible) * each.complete_of_hidden
+        assert parts == pytest.approx(each.complete)
     assert noisy.noise.stable.nmad / quiet.noise.stable.nmad == pytest.approx(10, rel=0.2)
     assert sum(block.seen for block in quiet.detection.blocks) >= sum(block.seen for block in noisy.detection.blocks)
     limits = [np.median([block.limit_m for block in each.detection.blocks if block.limit_m]) for each in found]
