@@ -37,6 +37,8 @@ _THIN_PX = 1.2
 """Area over length of the outline, pixels, below which a region is a thin line."""
 _MARGIN_PX = 2
 """Pixels without data in bays of a region that are at most twice as wide are counted to it."""
+_EDGE_PX = 5
+"""Side of the square about a pixel in which an edge of the rock would be spread."""
 _GAP_SHARE, _RIM_SHARE = 1.0, 1.3
 """Shares of the volume in pixels without data, and in the pixels along the outline, that are taken as one standard deviation of
 it. They are set so that the intervals of simulated rockfalls hold the truth as often as they say (docs/validation/monitor.md)."""
@@ -172,32 +174,38 @@ def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Cha
 
 
 def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change: Change) -> Region:
-    """Measure the region of a mask whose pixels all have data."""
+    """Measure the region of a mask whose pixels all have data.
+
+    Volume and significance are those of the whole mask. Heights come from 3 x 3 pixels, so that a sharp edge is spread over
+    neighbouring ones: outline, area and depth are those of the pixels with at least half the depth of what lies around.
+    """
     row, column, mask = _padded(mask, row, column, change.difference.shape)
     window = (slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1]))
     grid, gsd, sign = change.grid, change.grid.gsd, 1.0 if kind == "missing" else -1.0
     whole, depth = _with_gaps_filled(mask, sign * change.difference[window].astype(np.float64))
-    pixels, area = int(whole.sum()), int(whole.sum()) * gsd**2
+    pixels = int(whole.sum())
     one_sigma = float(np.mean(change.significance.one_sigma[window][mask]))
     registration = float(np.sqrt(np.mean(change.registration[window][mask].astype(np.float64) ** 2)))
     noise = float(np.hypot(one_sigma * change.significance.sigma_of_mean(int(mask.sum())), registration))
     rim = whole & ~ndimage.binary_erosion(whole)
     rough = _GAP_SHARE * depth[whole & ~mask].sum(), _RIM_SHARE * np.abs(depth[rim]).sum()
-    rows, columns = np.nonzero(whole)
+    deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
+    inner = whole & (depth >= deepest / 2)
+    rows, columns = np.nonzero(inner)
     return Region(
         kind=kind,
         row=row,
         column=column,
-        mask=whole,
+        mask=inner,
         x_m=grid.x_min + (column + float(columns.mean()) + 0.5) * gsd,
         y_m=grid.y_max - (row + float(rows.mean()) + 0.5) * gsd,
         z_m=float(np.median(change.reference.height[window][mask])),
         width_m=(int(columns.max()) - int(columns.min()) + 1) * gsd,
         height_m=(int(rows.max()) - int(rows.min()) + 1) * gsd,
-        area_m2=area,
-        depth_median_m=float(np.median(depth[mask])),
-        depth_largest_m=float(depth[mask].max()),
-        volume_m3=float(depth[whole].mean()) * area,
+        area_m2=int(inner.sum()) * gsd**2,
+        depth_median_m=float(np.median(depth[inner])),
+        depth_largest_m=float(depth[inner].max()),
+        volume_m3=float(depth[whole].sum()) * gsd**2,
         volume_std_m3=float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2,
         significance=float(depth[mask].mean()) / max(noise, 1e-9),
         marks=_marks(mask, window, sign, change),
@@ -256,7 +264,7 @@ class Catalogue:
     def identified(self, regions: Sequence[Region]) -> list[Region]:
         """Give the regions of the next epoch their events' numbers, the largest first; new events count on."""
         named, taken = [], set()
-        for region in sorted(regions, key=lambda each: -each.area_m2):
+        for region in sorted(regions, key=lambda each: -each.volume_m3):
             shared = {
                 number: _shared_share(region, other)
                 for number, other in self._last.items()

@@ -21,7 +21,7 @@ _CELL_M = 0.5
 _POINTS_APART = 1.5
 """Pixel side over the mean distance of neighbouring points: 3 x 3 pixels then hold some twenty points."""
 _MOST_COUNTED = 3_000_000
-_ROUND = np.array([1.0, 2.0, 2.5, 5.0, 10.0])
+_ROUND = np.array([1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _MOST_PIXELS = 60_000_000
 _FINEST_M = 0.002
 

@@ -92,7 +92,8 @@ def _about(epoch: Followed, result: Result) -> dict[str, Any]:
     shift = 1e3 * float(np.linalg.norm(registration["sigma_translation_m"]))
     registered = (
         f"{epoch.source.name} was registered on {result.site.source.name} by {registration['stable_pixels']:,} stable pixels. "
-        f"Their differences have an RMS of {1e3 * registration['rms_m']:.1f} mm. The standard deviation of the shift is {shift:.2g} mm."
+        f"Their differences have an RMS of {1e3 * registration['rms_m']:.1f} mm. "
+        f"The standard deviation of the shift is {shift:.2g} mm."
     )
     predicted = None if np.isnan(record.predicted_level_m) else compared_in_words(record.level_m, record.predicted_level_m)
     return {"number": epoch.number, "registered": registered, "predicted": predicted, "notes": record.notes}
