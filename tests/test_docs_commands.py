@@ -252,9 +252,9 @@ NAMED = (
     "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",
-    "scarpsim inspect CONFIG",
     "scarpsim inspect my_site.yaml",
     "scarpsim dataset",
+    "scarpsim surface",
     "scarpsim surface scan.laz --seen-from X Y Z --out wall.ply",
     "scarpsim view",
 )
