@@ -1,7 +1,7 @@
 """Every command of README.md and docs/ does what its page says: it is run on a small scene, or resolved as if it were.
 
-A command that stands in none of the lists here fails `test_every_command_is_in_a_list`. The how-tos' commands are carried out by
-test_docs.py, those of docs/reference/mistakes.md by test_mistakes.py.
+A command that stands in none of the lists here fails `test_every_command_is_in_a_list`. test_docs.py carries out the commands of
+how-to guides and tutorials, and test_mistakes.py those of docs/reference/mistakes.md.
 """
 
 from __future__ import annotations
@@ -216,6 +216,8 @@ PARSED = (
     "scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis",
     "scarpsim gap cloud.ply --reference wall.ply --photographs --out diagnosis",
     "scarpsim view diagnosis",
+    "scarpsim view finding",
+    "scarpsim view runs/scanner runs/pair",
     "scarpsim view runs/stereo runs/tls",
     "scarpsim view sets/small/test",
     "scarpsim doctor",
@@ -316,7 +318,11 @@ def test_every_command_is_in_a_list() -> None:
     listed = [*RUN, *RESOLVED, *PARSED, *NAMED, *OF_A_STYLE_TO_COME, *OF_A_PACKAGE_TO_COME]
     assert len(set(listed)) == len(listed)
     carried_out = {
-        line for page in howtos.PICTURES for step in howtos.steps(page) if not step.file for line in step.text.splitlines()
+        line
+        for page in (*howtos.PICTURES, *howtos.TUTORIALS)
+        for step in howtos.steps(page)
+        if not step.file
+        for line in step.text.splitlines()
     }
     shown = {command for page in PAGES if page.name not in TRIED_ELSEWHERE for command in commands(page)}
     assert shown - carried_out - set(listed) == set(), "put these into one of the lists, at best RUN"
