@@ -148,9 +148,9 @@ def page(answers: dict[Mistake, str]) -> str:
     """docs/reference/mistakes.md."""
     head = """# Common mistakes
 
-This page is for users who got an error message and want to know what caused it. It shows common mistakes and the message that each one gets.
-A mistake ends the command with exit status 2 and leaves no half-written results. `...` stands for `--config site.yaml --out out`, a
-small site.
+This page is for users who got an error message and want to know what caused it. It shows common mistakes and their messages.
+A mistake ends the command with exit status 2 and leaves no half-written results. `...` stands for `--config site.yaml --out out`,
+a small site.
 
 `python docs/make_mistakes.py` writes this page, and the tests try every command on it.
 """
