@@ -34,6 +34,9 @@ _TUKEY = 4.685
 """Tuning constant of Tukey's biweight, in standard deviations: 95 % efficient for normal errors (Huber 1981)."""
 _ROUNDS, _SETTLED_M = 30, 1e-6
 """Most rounds of the robust fit, and change of a height below which it has converged, m."""
+_LOWERED, _MORE_THAN_EXPECTED, _ENOUGH_AGREE = 0.7, 1.5, 0.15
+"""Factor by which the scale of the robust fit is lowered at a time; it stops at so many times the expected one, and where a
+smaller share of the pixels would agree."""
 _MOST_FITTED = 150_000
 """Pixels that the fit takes."""
 _BLOCKS = 6
@@ -43,6 +46,8 @@ _LEAST_PIXELS = 300
 _FEWEST_BLOCKS = 5
 _FEW_STABLE = 0.25
 """Share of the compared pixels below which the user is told that little of the wall is stable."""
+_FARTHEST_NOISE = 3.0
+"""Times the limit of the robust fit (14 standard deviations) beyond which a difference is no noise, however long its tails."""
 _UNDETERMINED = 1e-7
 """Motions whose effect on the heights, relative to the largest, is smaller than this are left as they are."""
 
@@ -61,6 +66,8 @@ class Alignment:
         Centre of the rotation, wall frame, m.
     stable : (h, w) bool array
         Pixels on which the registration rests.
+    quiet : (h, w) bool array
+        Those and pixels as far off as the long tails of noise reach.
     rms_m : float
         Root mean square of the differences on these pixels.
     notes : tuple of str
@@ -71,6 +78,7 @@ class Alignment:
     covariance: FloatArray
     centre: FloatArray
     stable: NDArray[np.bool_]
+    quiet: NDArray[np.bool_]
     rms_m: float
     notes: tuple[str, ...] = ()
 
@@ -141,14 +149,18 @@ def refine(reference: HeightRaster, epoch: HeightRaster, areas: Sequence[Area]) 
     fitted = _thinned(compared)
     design = _design(epoch, centre)[:, fitted]
     target, weight = difference[fitted].astype(np.float64), _weights_by_sigma(reference, epoch, fitted)
-    parameters, robust, limit = _robust_fit(design, target, weight)
+    expected = float(np.median(np.sqrt(weight) * np.hypot(reference.sigma[fitted], epoch.sigma[fitted])))
+    parameters, robust, limit = _robust_fit(design, target, weight, expected)
     covariance, groups = _jackknife(design, target, weight * robust, _block_numbers(fitted))
     rest = np.where(compared, difference - np.einsum("k,khw->hw", parameters, _design(epoch, centre)), np.nan)
     stable = compared.copy()
-    stable[compared] = np.abs(rest[compared]) * np.sqrt(_weights_by_sigma(reference, epoch, compared)) < limit
+    apart = np.abs(rest[compared]) * np.sqrt(_weights_by_sigma(reference, epoch, compared))
+    stable[compared] = apart < limit
+    quiet = compared.copy()
+    quiet[compared] = apart < _FARTHEST_NOISE * limit
     notes = _notes(float(stable.sum() / compared.sum()), groups, bool(areas))
     transform = RigidTransform.about(centre, parameters[3:], parameters[:3])
-    return Alignment(transform, covariance, centre, stable, float(np.sqrt(np.mean(rest[stable] ** 2))), notes)
+    return Alignment(transform, covariance, centre, stable, quiet, float(np.sqrt(np.mean(rest[stable] ** 2))), notes)
 
 
 def applied(alignment: Alignment, epoch: HeightRaster) -> NDArray[np.float32]:
@@ -191,22 +203,40 @@ def _thinned(compared: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return few
 
 
-def _robust_fit(design: FloatArray, target: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Iteratively reweighted least squares, from the median on.
+def _robust_fit(
+    design: FloatArray, target: FloatArray, weight: FloatArray, expected: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Iteratively reweighted least squares with Tukey's weights, from the median on.
 
-    Returns the parameters (6,), Tukey's weights (n,), and the weighted residual beyond which a weight is zero.
+    The scale begins at the spread of the residuals. Where much of the wall moved, that is far more than noise: it is lowered step
+    by step towards what noise explains, as long as enough pixels agree, so that the fit settles on what did not move.
+
+    Parameters
+    ----------
+    design, target, weight : (6, n), (n,), (n,) arrays
+    expected : float
+        Standard deviation of a weighted residual by the heights' own errors, m.
+
+    Returns
+    -------
+    parameters (6,), Tukey's weights (n,), and the weighted residual beyond which a weight is zero, m
     """
     parameters = np.zeros(6)
     parameters[2] = np.median(target)
-    robust, limit = np.ones(len(target)), np.inf
+    standard = np.sqrt(weight) * (target - parameters @ design)
+    scale, robust = max(1.4826 * float(np.median(np.abs(standard))), 1e-9), np.ones(len(target))
     for _ in range(_ROUNDS):
         standard = np.sqrt(weight) * (target - parameters @ design)
-        limit = _TUKEY * max(1.4826 * float(np.median(np.abs(standard - np.median(standard)))), 1e-9)
-        robust = np.maximum(1 - (standard / limit) ** 2, 0.0) ** 2
+        own = max(1.4826 * float(np.median(np.abs(standard))), 1e-9)
+        smaller = max(_LOWERED * scale, _MORE_THAN_EXPECTED * expected)
+        agree = float((np.abs(standard) < _TUKEY * smaller).mean())
+        scale = min(own, smaller if agree >= _ENOUGH_AGREE else scale)
+        robust = np.maximum(1 - (standard / (_TUKEY * scale)) ** 2, 0.0) ** 2
         before, parameters = parameters, _solved(*_normal_equations(design, target, weight * robust))
-        if np.abs((parameters - before) @ design).max() < _SETTLED_M:
+        settled = scale in (own, _MORE_THAN_EXPECTED * expected) or agree < _ENOUGH_AGREE
+        if settled and np.abs((parameters - before) @ design).max() < _SETTLED_M:
             break
-    return parameters, robust, limit
+    return parameters, robust, _TUKEY * scale
 
 
 def _normal_equations(design: FloatArray, target: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from pipeline.change.areas import Area
 from pipeline.monitor.alignment import Alignment, applied, coarse, reference_surface, refine
-from pipeline.monitor.events import Change, Region, find_regions
+from pipeline.monitor.events import Change, ChangedRegion, find_regions
 from pipeline.monitor.gridding import HeightRaster, gridded
 from pipeline.monitor.significance import significance
 from pipeline.registration.closest_points import ReferenceSurface
@@ -25,14 +25,14 @@ _AROUND_PX = 3
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceHeights:
     """The reference epoch: its heights, and its pixels as a surface that ICP pairs points with."""
 
     raster: HeightRaster
     surface: ReferenceSurface
 
     @classmethod
-    def of(cls, points: FloatArray, grid: Grid) -> Reference:
+    def of(cls, points: FloatArray, grid: Grid) -> ReferenceHeights:
         """Prepare the reference from its points (n, 3), wall frame, m."""
         raster = gridded(points, grid)
         return cls(raster, reference_surface(raster))
@@ -50,22 +50,22 @@ class EpochChange:
         The last fit, with its uncertainty.
     change : Change
         Difference map and level of detection.
-    regions : list of Region
+    regions : list of ChangedRegion
         What changed, the largest volume first.
     """
 
     transform: RigidTransform
     alignment: Alignment
     change: Change
-    regions: list[Region]
+    regions: list[ChangedRegion]
 
 
-def compare_epoch(reference: Reference, points: FloatArray, stable: Sequence[Area], seed: int) -> EpochChange:
+def compare_epoch(reference: ReferenceHeights, points: FloatArray, stable: Sequence[Area], seed: int) -> EpochChange:
     """Compare an epoch's points (n, 3), wall frame, m, with the reference.
 
     Parameters
     ----------
-    reference : Reference
+    reference : ReferenceHeights
     points : (n, 3) array
     stable : sequence of Area
         Stable rock as the user says, wall frame; empty: found here.
@@ -85,16 +85,16 @@ def compare_epoch(reference: Reference, points: FloatArray, stable: Sequence[Are
     registration = alignment.sigma(epoch)
     predicted = np.sqrt(reference.raster.sigma**2 + epoch.sigma**2 + registration**2).astype(np.float32)
 
-    def changed(unchanged: NDArray[np.bool_]) -> tuple[Change, list[Region]]:
+    def changed(unchanged: NDArray[np.bool_]) -> tuple[Change, list[ChangedRegion]]:
         found = Change(difference, significance(difference, predicted, unchanged), registration, reference.raster, epoch)
         return found, find_regions(found)
 
     _, regions = changed(alignment.stable)
-    change, regions = changed(np.isfinite(difference) & ~_surely_changed(regions, difference.shape))
+    change, regions = changed(alignment.quiet & ~_surely_changed(regions, difference.shape))
     return EpochChange(alignment.transform.after(first), alignment, change, regions)
 
 
-def _surely_changed(regions: Sequence[Region], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _surely_changed(regions: Sequence[ChangedRegion], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """(h, w) where something surely changed, with a margin: noise is measured elsewhere."""
     sure = np.zeros(shape, dtype=bool)
     for region in regions:

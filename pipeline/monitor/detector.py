@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from pycocotools import mask as coco_mask
 
-from pipeline.monitor.events import Change, Region, region_of_mask
+from pipeline.monitor.events import Change, ChangedRegion, region_of_mask
 from scene.common.errors import InputError, OutsideError
 
 CONFIDENCE = 0.9
@@ -20,7 +20,7 @@ _COMMAND = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.ar
 _WRONG_INPUT = 2
 
 
-def regions_of_detector(detector: str, difference: Path, change: Change) -> list[Region]:
+def regions_of_detector(detector: str, difference: Path, change: Change) -> list[ChangedRegion]:
     """Search a difference map with a detector and measure what it finds, the largest volume first.
 
     The detector works in a process of its own, as TensorFlow and the ray tracer's compiler do not belong into one. Raises

@@ -47,7 +47,7 @@ _SAME_PLACE = 0.3
 
 
 @dataclass(frozen=True)
-class Region:
+class ChangedRegion:
     """A connected part of the wall that changed.
 
     Attributes
@@ -127,11 +127,11 @@ class Change:
         return self.reference.grid
 
 
-def find_regions(change: Change) -> list[Region]:
+def find_regions(change: Change) -> list[ChangedRegion]:
     """Find the regions that changed, the largest volume first."""
     standard = change.difference / change.significance.one_sigma
     beyond = np.abs(change.difference) > _GROWS * change.significance.level
-    regions: list[Region] = []
+    regions: list[ChangedRegion] = []
     for sign, kind in ((1.0, "missing"), (-1.0, "added")):
         labels, count = ndimage.label(beyond & (sign * standard > 0))
         begun = _begins(sign * standard, change.significance)
@@ -142,7 +142,7 @@ def find_regions(change: Change) -> list[Region]:
     return sorted(regions, key=lambda region: -region.volume_m3)
 
 
-def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float, change: Change) -> Region | None:
+def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float, change: Change) -> ChangedRegion | None:
     """Measure a detector's mask; None where the map has no data in it."""
     window = change.difference[row : row + mask.shape[0], column : column + mask.shape[1]]
     known = mask & np.isfinite(window)
@@ -164,7 +164,7 @@ def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArr
     return found
 
 
-def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Change) -> Iterator[Region]:
+def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Change) -> Iterator[ChangedRegion]:
     """The region of a mask, where it is large and significant enough."""
     if int(mask.sum()) < _LEAST_PIXELS:
         return
@@ -173,7 +173,7 @@ def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Cha
         yield region
 
 
-def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change: Change) -> Region:
+def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change: Change) -> ChangedRegion:
     """Measure the region of a mask whose pixels all have data.
 
     Volume and significance are those of the whole mask. Heights come from 3 x 3 pixels, so that a sharp edge is spread over
@@ -192,7 +192,7 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
     inner = whole & (depth >= deepest / 2)
     rows, columns = np.nonzero(inner)
-    return Region(
+    return ChangedRegion(
         kind=kind,
         row=row,
         column=column,
@@ -259,9 +259,9 @@ class Catalogue:
     """Events over all epochs: a region where an event was before is the same event."""
 
     def __init__(self) -> None:
-        self._last: dict[int, Region] = {}
+        self._last: dict[int, ChangedRegion] = {}
 
-    def identified(self, regions: Sequence[Region]) -> list[Region]:
+    def identified(self, regions: Sequence[ChangedRegion]) -> list[ChangedRegion]:
         """Give the regions of the next epoch their events' numbers, the largest first; new events count on."""
         named, taken = [], set()
         for region in sorted(regions, key=lambda each: -each.volume_m3):
@@ -280,7 +280,7 @@ class Catalogue:
         return sorted(named, key=lambda each: -each.volume_m3)
 
 
-def _shared_share(one: Region, other: Region) -> float:
+def _shared_share(one: ChangedRegion, other: ChangedRegion) -> float:
     """Pixels that two regions share, over those of the smaller one."""
     top, left = max(one.row, other.row), max(one.column, other.column)
     bottom = min(one.row + one.mask.shape[0], other.row + other.mask.shape[0])

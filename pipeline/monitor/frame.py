@@ -16,8 +16,8 @@ from scene.geometry.mesh import FloatArray
 
 _SAMPLE = 200_000
 """Points that the mean plane is fitted to."""
-_CELL_M = 0.5
-"""Side of the cells by which the area that has points is counted."""
+_CELL_M, _POINTS_A_CELL, _ROUNDS = 0.5, 3.0, 3
+"""Side of the cells by which the area that has points is counted: at first, m, then in distances of the points; and how often."""
 _POINTS_APART = 1.5
 """Pixel side over the mean distance of neighbouring points: 3 x 3 pixels then hold some twenty points."""
 _MOST_COUNTED = 3_000_000
@@ -78,7 +78,11 @@ def raster_of(points: FloatArray, gsd_m: float | None) -> Grid:
 def _usual_gsd(points: FloatArray) -> float:
     """A round number of metres somewhat above the mean distance of neighbouring points."""
     few = points[:: len(points) // _MOST_COUNTED + 1, :2]
-    cells = np.unique(np.floor(few / _CELL_M).astype(np.int64), axis=0)
-    spacing = _POINTS_APART * float(np.sqrt(len(cells) * _CELL_M**2 / len(points)))
+    apart, cell = _CELL_M, _CELL_M
+    for _ in range(_ROUNDS):
+        cells = len(np.unique(np.floor(few / cell).astype(np.int64), axis=0))
+        apart = float(np.sqrt(cells * cell**2 / len(points)))
+        cell = _POINTS_A_CELL * apart * float(np.sqrt(len(points) / len(few)))
+    spacing = _POINTS_APART * apart
     power = 10.0 ** np.floor(np.log10(max(spacing, _FINEST_M)))
     return float(power * _ROUND[np.searchsorted(_ROUND, max(spacing, _FINEST_M) / power - 1e-9)])

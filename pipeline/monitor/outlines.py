@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.monitor.events import Region
+from pipeline.monitor.events import ChangedRegion
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
@@ -23,7 +23,7 @@ def rings(mask: NDArray[np.bool_]) -> list[FloatArray]:
     return [np.concatenate([each, each[:1]]) for each in corners]
 
 
-def in_survey(region: Region, grid: Grid, heights: NDArray[np.float32], frame: WallFrame) -> list[FloatArray]:
+def in_survey(region: ChangedRegion, grid: Grid, heights: NDArray[np.float32], frame: WallFrame) -> list[FloatArray]:
     """(n, 3) corners of a region's outline, survey coordinates, m, on the reference's surface (h, w), wall frame, m."""
     result = []
     for ring in rings(region.mask):

@@ -19,12 +19,12 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import LazHeader, write_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.formats.records.geopackage import write_geopackage
-from pipeline.monitor.events import Region
+from pipeline.monitor.events import ChangedRegion
 from pipeline.monitor.options import MonitorOptions
 from pipeline.monitor.outlines import in_survey
 from pipeline.monitor.reading import EpochData, EpochSource
 from pipeline.monitor.records import EpochRecord
-from pipeline.monitor.site import Site
+from pipeline.monitor.site import ReferenceSite
 from pipeline.report.provenance import versions
 
 SCHEMA = 1
@@ -45,7 +45,7 @@ class Followed:
 
     source: EpochSource
     record: EpochRecord
-    regions: list[Region]
+    regions: list[ChangedRegion]
 
     @property
     def number(self) -> int:
@@ -59,7 +59,7 @@ class Result:
 
     folder: Path
     sources: tuple[EpochSource, ...]
-    site: Site
+    site: ReferenceSite
     epochs: tuple[Followed, ...]
     options: MonitorOptions
 
@@ -87,7 +87,7 @@ class Result:
         return first
 
 
-def write_points(epoch: Followed, data: EpochData, site: Site, out: Path) -> None:
+def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Path) -> None:
     """Write an epoch's points, registered, in survey coordinates, with what the maps say at each."""
     wall = epoch.record.transform.apply(site.frame.to_wall(data.points))
     event = event_raster(epoch.regions, site.grid.shape)
@@ -114,7 +114,7 @@ def write_results(result: Result) -> None:
     write_json(result.folder / "monitor.json", without_nan(_document(result, rows)))
 
 
-def event_raster(regions: Sequence[Region], shape: tuple[int, ...]) -> NDArray[np.int32]:
+def event_raster(regions: Sequence[ChangedRegion], shape: tuple[int, ...]) -> NDArray[np.int32]:
     """(h, w) the number of the event at each pixel, 0 where there is none; smaller events lie over larger ones."""
     raster = np.zeros(shape, dtype=np.int32)
     for region in sorted(regions, key=lambda each: -each.area_m2):
@@ -122,7 +122,7 @@ def event_raster(regions: Sequence[Region], shape: tuple[int, ...]) -> NDArray[n
     return raster
 
 
-def _at(raster: NDArray[np.float32], wall: NDArray[np.float64], site: Site) -> NDArray[np.float32]:
+def _at(raster: NDArray[np.float32], wall: NDArray[np.float64], site: ReferenceSite) -> NDArray[np.float32]:
     """(n,) a raster's values at points of the wall frame, NaN beside the map."""
     grid = site.grid
     column = np.floor((wall[:, 0] - grid.x_min) / grid.gsd).astype(np.int64)

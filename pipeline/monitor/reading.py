@@ -137,7 +137,7 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
 def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
     """Read an epoch. Raises InputError for whatever is wrong in its files."""
     if source.run is not None:
-        return _of_run(source)
+        return _of_run(source, source.run)
     parts = [_read_file(file, options) for file in source.files]
     if len(parts) == 1:
         return parts[0]
@@ -179,10 +179,9 @@ def _epochs_of_run(folder: Path) -> list[EpochSource]:
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 
 
-def _of_run(source: EpochSource) -> EpochData:
+def _of_run(source: EpochSource, run: dict[str, Any]) -> EpochData:
     """An epoch of a run, whose points are in the wall frame of its config."""
-    assert source.run is not None
-    stated = source.run["wall_frame"]
+    stated = run["wall_frame"]
     frame = WallFrame(np.array(stated["rotation"]), np.array(stated["origin_m"]))
     (scan,) = read_scans(source.files[0])
     middle = scan.cloud.points.mean(axis=0) + np.array([0.0, 0.0, _BEFORE_M])

@@ -13,7 +13,7 @@ from pycocotools import mask as coco_mask
 
 from pipeline.change.annotate import run_length_encoding
 from pipeline.formats.files.atomic import write_json
-from pipeline.monitor.events import Region
+from pipeline.monitor.events import ChangedRegion
 from pipeline.registration.rigid import RigidTransform
 
 KEPT = ".monitor"
@@ -40,7 +40,7 @@ class EpochRecord:
         Median level of detection, and what the sensor's model predicts (NaN without a model).
     area_m2 : float
         Of the wall that is compared.
-    regions : tuple of Region
+    regions : tuple of ChangedRegion
         Without numbers of events.
     """
 
@@ -53,7 +53,7 @@ class EpochRecord:
     level_m: float
     predicted_level_m: float
     area_m2: float
-    regions: tuple[Region, ...]
+    regions: tuple[ChangedRegion, ...]
 
     def write(self, folder: Path, fingerprint: str, shape: tuple[int, ...]) -> None:
         """Keep the record; fingerprint: of the reference and the options; shape: of the map."""
@@ -93,7 +93,7 @@ def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str)
     )
 
 
-def without_numbers(region: Region) -> Region:
+def without_numbers(region: ChangedRegion) -> ChangedRegion:
     """The region as yet of no event."""
     return replace(region, identity=0)
 
@@ -102,7 +102,7 @@ def _file(folder: Path, number: int) -> Path:
     return folder / KEPT / f"epoch_{number:03d}.json"
 
 
-def _plain(region: Region, shape: tuple[int, ...]) -> dict[str, Any]:
+def _plain(region: ChangedRegion, shape: tuple[int, ...]) -> dict[str, Any]:
     numbers = region.numbers()
     score = None if np.isnan(region.score) else region.score
     size = list(region.mask.shape)
@@ -114,10 +114,10 @@ def _plain(region: Region, shape: tuple[int, ...]) -> dict[str, Any]:
     }
 
 
-def _region(values: dict[str, Any]) -> Region:
+def _region(values: dict[str, Any]) -> ChangedRegion:
     height, width = values.pop("size")
     whole = coco_mask.decode(values.pop("mask")) > 0
     row, column = values["row"], values["column"]
     values["score"] = float("nan") if values["score"] is None else values["score"]
     mask = np.ascontiguousarray(whole[row : row + height, column : column + width])
-    return Region(mask=mask, marks=tuple(values.pop("marks")), identity=values.pop("id"), **values)
+    return ChangedRegion(mask=mask, marks=tuple(values.pop("marks")), identity=values.pop("id"), **values)

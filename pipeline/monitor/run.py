@@ -26,7 +26,7 @@ from pipeline.monitor.options import NO_DETECTOR, MonitorOptions
 from pipeline.monitor.products import Followed, Result, write_points, write_results
 from pipeline.monitor.reading import EpochData, EpochSource, find_epochs, read_epoch
 from pipeline.monitor.records import EpochRecord, kept
-from pipeline.monitor.site import Site, prepared
+from pipeline.monitor.site import ReferenceSite, prepared
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 
@@ -106,7 +106,7 @@ def monitor(
     return result
 
 
-def _fingerprint(site: Site, options: MonitorOptions) -> str:
+def _fingerprint(site: ReferenceSite, options: MonitorOptions) -> str:
     """Of all that a record depends on beside its epoch."""
     told = {"reference": site.source.checksums(), "options": options.to_dict(), "grid": site.grid.__dict__}
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
@@ -114,7 +114,7 @@ def _fingerprint(site: Site, options: MonitorOptions) -> str:
 
 def _compared_in_processes(
     left: Sequence[tuple[int, EpochSource]],
-    site: Site,
+    site: ReferenceSite,
     out: Path,
     options: MonitorOptions,
     fingerprint: str,
@@ -154,13 +154,13 @@ class _Frozen:
 
 
 @lru_cache(1)
-def _site_of_worker(reference: EpochSource, frozen: _Frozen) -> Site:
+def _site_of_worker(reference: EpochSource, frozen: _Frozen) -> ReferenceSite:
     """The reference, prepared once in each process."""
     return prepared(reference, frozen.options)
 
 
 def processed(
-    number: int, source: EpochSource, site: Site, out: Path, options: MonitorOptions, fingerprint: str
+    number: int, source: EpochSource, site: ReferenceSite, out: Path, options: MonitorOptions, fingerprint: str
 ) -> tuple[EpochRecord, EpochData]:
     """Compare one epoch, write its maps and its record; returns the record and what was read."""
     data = read_epoch(source, options)
@@ -189,14 +189,14 @@ def processed(
     return record, data
 
 
-def _predicted(options: MonitorOptions, site: Site, found: EpochChange) -> float:
+def _predicted(options: MonitorOptions, site: ReferenceSite, found: EpochChange) -> float:
     model = None if options.photographs else scanner_model(options)
     if model is None:
         return float("nan")
     return predicted_level(model, site.reference.raster, found.change.epoch, site.station)
 
 
-def _check_same_site(data: EpochData, site: Site, source: EpochSource) -> list[str]:
+def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) -> list[str]:
     """Notes on an epoch's coordinates and density. Raises InputError where it lies elsewhere, or is in another unit."""
     wall = site.frame.to_wall(data.points[:: max(len(data.points) // 100_000, 1)])
     grid = site.grid

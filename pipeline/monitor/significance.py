@@ -23,6 +23,12 @@ from scene.geometry.mesh import FloatArray
 
 NORMAL_95 = 1.959964
 """The 95 % quantile of the absolute value of a normal variable."""
+MEDIAN = 0.674490
+"""The median of the absolute value of a normal variable."""
+_LONGEST_TAIL = 1.6
+"""Times a normal distribution of the same median that a quantile of the noise may reach: what is farther out may have moved."""
+_LEAST_FACTOR = 0.1
+"""Least level of detection over the predicted standard deviation: copies of one scan do not differ at all."""
 _CLASSES = 8
 _FEWEST_IN_CLASS = 400
 _SIDES = (1, 2, 3, 5, 7, 11, 15, 23, 31, 47, 63)
@@ -88,11 +94,11 @@ def significance(difference: NDArray[np.float32], predicted: NDArray[np.float32]
 
 
 def _sigma_with_tails(means: NDArray[np.float64]) -> float:
-    """Largest of the standard deviations that quantiles from the median on outwards tell: noise has long tails at edges."""
+    """Largest of the standard deviations that quantiles tell, from the median on outwards: noise has long tails at edges."""
     apart = np.abs(means - np.median(means))
     known = [quantile for quantile in _QUANTILES if (1 - quantile) * len(apart) >= 1]
     found = [float(np.quantile(apart, quantile)) / float(ndtri((1 + quantile) / 2)) for quantile in known]
-    return max(*found, 1e-3)
+    return max(min(max(found), _LONGEST_TAIL * found[0]), 1e-3)
 
 
 def _factor(difference: NDArray[np.float32], predicted: NDArray[np.float32], stable: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -105,7 +111,8 @@ def _factor(difference: NDArray[np.float32], predicted: NDArray[np.float32], sta
         inside = (of >= low) & (of <= high)
         if inside.any():
             middle.append(float(np.median(of[inside])))
-            quantile.append(float(np.quantile(ratio[inside], 0.95)))
+            half, most = np.quantile(ratio[inside], [0.5, 0.95])
+            quantile.append(float(max(min(most, _LONGEST_TAIL * NORMAL_95 * half / MEDIAN), _LEAST_FACTOR)))
     return np.interp(predicted, middle, quantile).astype(np.float32)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.monitor.comparison import Reference
+from pipeline.monitor.comparison import ReferenceHeights
 from pipeline.monitor.frame import raster_of, towards_sensor, wall_frame
 from pipeline.monitor.options import MonitorOptions
 from pipeline.monitor.reading import EpochData, EpochSource, read_epoch
@@ -19,7 +19,7 @@ _STEEP = float(np.tan(np.radians(65.0)))
 
 
 @dataclass(frozen=True)
-class Site:
+class ReferenceSite:
     """The reference, prepared for comparisons.
 
     Attributes
@@ -29,7 +29,7 @@ class Site:
         z along the direction of change, towards the sensor.
     station : (3,) array
         Where the sensor stood, or a place before the wall, wall frame, m.
-    reference : Reference
+    reference : ReferenceHeights
     points : int
     crs : str
         WKT, empty where the file states none.
@@ -39,7 +39,7 @@ class Site:
     source: EpochSource
     frame: WallFrame
     station: FloatArray
-    reference: Reference
+    reference: ReferenceHeights
     points: int
     crs: str
     notes: tuple[str, ...]
@@ -50,14 +50,14 @@ class Site:
         return self.reference.raster.grid
 
 
-def prepared(source: EpochSource, options: MonitorOptions) -> Site:
+def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
     """Read the reference and choose frame and raster."""
     data = read_epoch(source, options)
     towards, how = towards_sensor(data, options, source.name)
     frame = wall_frame(data.points, towards, options.direction)
     grid = raster_of(frame.to_wall(data.points), options.gsd_m or _gsd_of_mesh(data))
     points = data.wall_points(frame, grid.gsd)
-    reference = Reference.of(points, grid)
+    reference = ReferenceHeights.of(points, grid)
     seen = float(reference.raster.known.mean())
     notes = [*data.notes, f"the wall was seen from its side of ({', '.join(f'{value:.2f}' for value in towards)}), {how}"]
     steep = reference.raster.steepness[reference.raster.known]
@@ -68,7 +68,7 @@ def prepared(source: EpochSource, options: MonitorOptions) -> Site:
         )
     if seen < _TENTH:
         notes.append(f"only {100 * seen:.0f} % of the map has data: a larger --gsd has fewer gaps")
-    return Site(source, frame, frame.to_wall(towards), reference, len(data.points), data.crs, tuple(notes))
+    return ReferenceSite(source, frame, frame.to_wall(towards), reference, len(data.points), data.crs, tuple(notes))
 
 
 def _gsd_of_mesh(data: EpochData) -> float | None:

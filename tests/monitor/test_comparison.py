@@ -7,7 +7,7 @@ import pytest
 from monitor_cases import HEIGHT_M, WIDTH_M, depth
 
 from pipeline.monitor.alignment import applied, refine
-from pipeline.monitor.comparison import Reference, compare_epoch
+from pipeline.monitor.comparison import ReferenceHeights, compare_epoch
 from pipeline.monitor.events import Catalogue
 from pipeline.monitor.gridding import gridded
 from pipeline.monitor.magnitude import fit_power_law
@@ -73,7 +73,7 @@ def test_five_percent_of_stable_rock_exceed_the_level() -> None:
 
 def test_blocks_are_found_with_their_volumes_and_nothing_else() -> None:
     blocks = ((3.0, 3.0, 0.6, 0.15), (10.0, 6.0, 0.8, 0.08), (13.0, 2.5, 0.4, 0.3))
-    found = compare_epoch(Reference.of(wall(1), GRID), wall(2, missing=blocks), (), 1)
+    found = compare_epoch(ReferenceHeights.of(wall(1), GRID), wall(2, missing=blocks), (), 1)
     assert len(found.regions) == len(blocks)
     for x, y, side, deep in blocks:
         (region,) = (each for each in found.regions if np.hypot(each.x_m - x, each.y_m - y) < 0.15)
@@ -86,7 +86,7 @@ def test_blocks_are_found_with_their_volumes_and_nothing_else() -> None:
 
 
 def test_added_rock_has_the_other_sign() -> None:
-    found = compare_epoch(Reference.of(wall(1), GRID), wall(2, missing=((8.0, 5.0, 1.0, -0.1),)), (), 1)
+    found = compare_epoch(ReferenceHeights.of(wall(1), GRID), wall(2, missing=((8.0, 5.0, 1.0, -0.1),)), (), 1)
     (region,) = found.regions
     assert region.kind == "added"
     assert region.volume_m3 == pytest.approx(0.1, abs=3 * region.volume_std_m3)
@@ -94,18 +94,18 @@ def test_added_rock_has_the_other_sign() -> None:
 
 def test_nothing_is_found_where_nothing_fell() -> None:
     """Five pairs of 160 m2; the aim is one false event in 1,000 m2."""
-    reference = Reference.of(wall(1), GRID)
+    reference = ReferenceHeights.of(wall(1), GRID)
     assert sum(len(compare_epoch(reference, wall(seed), (), 1).regions) for seed in range(2, 7)) <= 1
 
 
 def test_epochs_that_do_not_overlap_are_refused() -> None:
-    reference = Reference.of(wall(1), GRID)
+    reference = ReferenceHeights.of(wall(1), GRID)
     with pytest.raises(InputError):
         compare_epoch(reference, wall(2) + np.array([200.0, 0.0, 0.0]), (), 1)
 
 
 def test_an_event_keeps_its_number_and_a_new_one_gets_the_next() -> None:
-    reference = Reference.of(wall(1), GRID)
+    reference = ReferenceHeights.of(wall(1), GRID)
     first = compare_epoch(reference, wall(2, missing=((3.0, 3.0, 0.6, 0.2),)), (), 1)
     second = compare_epoch(reference, wall(3, missing=((3.0, 3.0, 0.7, 0.2), (10.0, 6.0, 1.2, 0.3))), (), 1)
     catalogue = Catalogue()
