@@ -215,10 +215,14 @@ def main() -> None:
 
 _HEAD = """# What each threshold does
 
-Each threshold of `pipeline/gap/decisions.py` at 0.7 and 1.4 times its value, on development cases of some thousand points made by
-`benchmarks/gap_thresholds.py`: in how many of the cases that ask for it the answer changes (verdict or names), and what
-becomes wrong, or right, by it. A threshold that is missing was asked for by no case; "-": its value may not be so large or small,
-or the time was up."""
+This page shows how far the answers of `scarpsim gap` depend on its thresholds. It is for developers who change one, and for users who wonder
+whether a default decides their case. `--set` changes a threshold for one diagnosis, and `gap.json` records the values:
+
+    scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
+
+Each threshold of `pipeline/gap/decisions.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand points of the
+[closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose answer (verdict or names) changes, and
+what becomes wrong or right. A threshold that no case uses is not listed. "-" means that the value is not allowed, or that the time was up."""
 
 
 if __name__ == "__main__":
