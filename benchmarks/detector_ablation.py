@@ -6,7 +6,8 @@
 Small and medium blocks at one level of noise out of sets as in detector_table.py. Every network
 starts from random weights; the score that counts is set on the validation images, F1 is of all tests together. What is in --out
 already is not made again. The first row is trained once for each of --seeds, which tells how much chance does; the others are
-trained with the first of them and set against the mean of that row. --write puts the table into docs/validation/detector_training.md.
+trained with the first of them and set against the mean of that row. --write puts the table into
+docs/validation/detector_training.md.
 """
 
 from __future__ import annotations
