@@ -145,13 +145,15 @@ def _in_short(results: list[Result]) -> str:
     spoke = [each for each in results if each.outcome in _NAMING]
     wrong = [each for each in spoke if each.outcome in _BLAMING]
     moved = [each for each in results if each.truth["kind"] == "change"]
+    right = sum(each.right for each in clear)
+    rejected, blamed = (sum(map(_alarmed, group)) for group in (quiet, moved))
     return f"""This page shows how `scarpsim gap` does on {len(results)} simulated measurements of a generator that does not share
 the program's assumptions. It is for users who want to know how far the results of one generator carry over to other data.
 
-- {sum(each.right for each in clear)} of {len(clear)} clear effects (ratio of {CLEAR:.0f} or more, the nearest other apart) are answered rightly.
+- {right} of {len(clear)} clear effects (ratio of {CLEAR:.0f} or more, the nearest other apart) are answered rightly.
 - {len(wrong)} of {len(spoke)} answers that name an effect hold a wrong name.
-- {sum(map(_alarmed, quiet))} of {len(quiet)} measurements without an effect are rejected; an effect is named in {_named(quiet)} of them.
-- {sum(map(_alarmed, moved))} of {len(moved)} measurements with nothing but changes of the scene are rejected.
+- {rejected} of {len(quiet)} measurements without an effect are rejected; an effect is named in {_named(quiet)} of them.
+- {blamed} of {len(moved)} measurements with nothing but changes of the scene are rejected.
 """
 
 
