@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from pipeline.api.measuring import diagnose as diagnose
     from pipeline.api.measuring import measure as measure
     from pipeline.api.meshes import Mesh as Mesh
+    from pipeline.api.monitoring import Monitoring as Monitoring
+    from pipeline.api.monitoring import monitor as monitor
     from pipeline.api.pictures import Picture as Picture
     from pipeline.api.planning import Plans as Plans
     from pipeline.api.planning import SensorPlan as SensorPlan
@@ -64,6 +66,7 @@ _MODULES = {
     "pipeline.api.detecting": ("Detections", "detect"),
     "pipeline.api.measuring": ("Diagnosis", "Measurement", "diagnose", "measure"),
     "pipeline.api.meshes": ("Mesh",),
+    "pipeline.api.monitoring": ("Monitoring", "monitor"),
     "pipeline.api.pictures": ("Picture",),
     "pipeline.api.planning": ("Plans", "SensorPlan", "plan"),
     "pipeline.api.points": ("Points",),

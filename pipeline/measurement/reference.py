@@ -15,6 +15,7 @@ from pipeline.formats.rasters.geotiff import read_raster
 from pipeline.formats.units import AxisUnits, agreed_units
 from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.station import Station
+from pipeline.surface.raster_mesh import mesh_of_raster
 from pipeline.surface.triangulation import SeenSurface, triangulated
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
@@ -102,22 +103,16 @@ def from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Ref
     known = np.isfinite(heights)
     if not known.any() or min(heights.shape) < 2:
         raise InputError("holds no heights", where=str(path), remedy="export the elevation model again")
-    x, y = np.meshgrid(
-        grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd, grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
-    )
-    number = (np.cumsum(known) - 1).reshape(known.shape)
-    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
-    whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
-    if not whole.any():
+    mesh = mesh_of_raster(heights.astype(np.float64), grid)
+    if not len(mesh.faces):
         raise InputError("has no four neighbouring pixels with heights", where=str(path), remedy="export a whole elevation model")
-    faces = np.concatenate([np.stack(each, axis=-1)[whole] for each in ((a, c, d), (a, d, b))]).astype(np.int32)
-    vertices = np.stack([x[known] * metres, y[known] * metres, heights[known].astype(np.float64) * up], axis=1)
+    mesh = mesh.with_vertices(mesh.vertices * np.array([metres, metres, up]))
     words = f"elevation model {path.name}: {int(known.sum()):,} heights every {grid.gsd * metres:.3g} m, taken as exact"
     limit = (
         "an elevation model has one height at each place: overhangs are missing, and steep faces are chords between pixels, "
         "whose error looks like one of the sensor"
     )
-    return Reference(TriangleMesh(vertices, faces), 0.0, (words, *notes), (limit,))
+    return Reference(mesh, 0.0, (words, *notes), (limit,))
 
 
 def half_of(scan: RawScan, station: Station) -> Reference:
