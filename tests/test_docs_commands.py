@@ -55,6 +55,7 @@ RUN = (INIT, MY_SITE, MY_SET, PLAN, SCRIPT, COMPLETION, VIEW)
 """Carried out by the tests of their own below."""
 
 RESOLVED = (
+    "simulate --sensor stereo --set matcher=sgbm",
     "simulate --sensor tls --config runs/mine/run.json",
     "simulate --sensor tls --set scanner=my_scanner.yaml",
     "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high --set reconstruction=vertices "
@@ -244,7 +245,6 @@ NAMED = (
     "scarpsim compare CONFIG [CONFIG ...] [--measured FOLDER ...] [--epochs N] [--sizes-m FIRST LAST | --blocks config] "
     "[--own-step]",
     "scarpsim detect",
-    "scarpsim detect default",
     "scarpsim export",
     "scarpsim gap",
     "scarpsim gap --identifiability",
