@@ -55,6 +55,7 @@ RUN = (INIT, MY_SITE, MY_SET, PLAN, SCRIPT, COMPLETION, VIEW)
 """Carried out by the tests of their own below."""
 
 RESOLVED = (
+    "simulate --sensor stereo --set matcher=sgbm",
     "simulate --sensor tls --config runs/mine/run.json",
     "simulate --sensor tls --set scanner=my_scanner.yaml",
     "simulate --sensor stereo --config configs/sites/glendale.yaml --set sensor=glendale_high --set reconstruction=vertices "
@@ -205,6 +206,7 @@ PARSED = (
     "scarpsim dataset split sets/twelve --by sensor --out sets/twelve_by",
     "scarpsim dataset split sets/thirteen --by sensor --out sets/thirteen_by",
     "scarpsim detect detector/best runs/bulga --out found",
+    "scarpsim detect default runs/bulga --out found",
     "scarpsim detect default runs/bulga --unmirrored",
     "scarpsim detect default sets/direct/test --out found",
     "scarpsim evaluate sets/direct/test found/detections.json --by size_class --confidence 0.95",
@@ -243,14 +245,11 @@ NAMED = (
     "scarpsim compare CONFIG [CONFIG ...] [--measured FOLDER ...] [--epochs N] [--sizes-m FIRST LAST | --blocks config] "
     "[--own-step]",
     "scarpsim detect",
-    "scarpsim detect default",
     "scarpsim export",
     "scarpsim gap",
     "scarpsim gap --identifiability",
     "scarpsim gap --identifiability CONFIG",
     "scarpsim gap MEASUREMENT --identifiability",
-    "scarpsim gap MEASUREMENT --out DIR",
-    "scarpsim measurement",
     "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",
