@@ -21,7 +21,7 @@ from pydantic import Field
 from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.common.extras import how_to_install
-from scene.common.native_output import stderr_dropped
+from scene.common.native_output import suppress_stderr
 from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, area_normals
 from sensors.signal_chain.observation import Observation
 
@@ -272,6 +272,6 @@ def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[Flo
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     cloud.orient_normals_towards_camera_location(np.asarray(viewpoint, dtype=float))
-    with stderr_dropped():
+    with suppress_stderr():
         surface, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return np.asarray(surface.vertices).copy(), np.asarray(surface.triangles, dtype=np.int32).copy()

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.common.errors import InputError
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray, TriangleMesh
 
 Mended = tuple[TriangleMesh, str]
@@ -191,7 +191,7 @@ def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]]
         part = slice(start, start + _FACES_AT_ONCE)
         result[part] = evaluate(mesh.vertices[mesh.faces[part]])
 
-    side_by_side(fill, range(0, len(result), _FACES_AT_ONCE))
+    map_in_threads(fill, range(0, len(result), _FACES_AT_ONCE))
     return result
 
 

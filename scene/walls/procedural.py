@@ -10,7 +10,7 @@ from pydantic import Field as Key
 
 from scene.common.config import Config
 from scene.common.keyed_random import KeyedRandom
-from scene.common.plug_ins import plugged
+from scene.common.plug_ins import load_plug_ins
 from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh
 from scene.walls.rock import BlockRule, Field, Fractal, JointedBlocks, Notches, Size, SplineNoise, Table, partings, ramp_knots
 
@@ -177,7 +177,7 @@ OWN_SITES = {
 
 PLUG_INS = "scarpsim.wall_styles"
 """The group of entry points by which other packages add styles, each a `Site`."""
-SITES = OWN_SITES | plugged(PLUG_INS, "a scene.procedural.Site", lambda value: isinstance(value, Site), OWN_SITES)
+SITES = OWN_SITES | load_plug_ins(PLUG_INS, "a scene.procedural.Site", lambda value: isinstance(value, Site), OWN_SITES)
 if TYPE_CHECKING:
     Style = str
 else:
