@@ -54,7 +54,7 @@ class MapPanel:
     block: IntArray | None = None
 
 
-def map_in_threads(panels: Sequence[MapPanel], limit_m: float, label: str, *, signed: bool) -> bytes:
+def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, signed: bool) -> bytes:
     """Maps in rows of two on one colour scale: -limit_m to limit_m where `signed`, else 0 to limit_m."""
     columns = min(len(panels), 2)
     rows = -(-len(panels) // columns)

@@ -20,7 +20,7 @@ from pipeline.comparison.figures import (
     level_limit_m,
     noise_figure,
     scale_limit_m,
-    map_in_threads,
+    side_by_side,
     table_figure,
 )
 from pipeline.comparison.trial import Trial
@@ -182,8 +182,8 @@ def pictures(comparison: ComparedSensors) -> dict[str, bytes]:
     levels = [MapPanel(name, noise.level, grid) for (name, noise), grid in zip(noises.items(), grids, strict=True)]
     level_limit = level_limit_m(list(noises.values()))
     return {
-        "maps.png": map_in_threads(maps, limit, DIFFERENCE_LABEL, signed=True),
-        "level_of_detection.png": map_in_threads(levels, level_limit, "95 % level of detection of a pixel, mm", signed=False),
+        "maps.png": side_by_side(maps, limit, DIFFERENCE_LABEL, signed=True),
+        "level_of_detection.png": side_by_side(levels, level_limit, "95 % level of detection of a pixel, mm", signed=False),
         "noise.png": noise_figure(noises),
         "by_covariate.png": covariate_figure(found),
         "detection.png": detection_figure(found),

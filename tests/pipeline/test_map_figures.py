@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from pipeline.comparison import figures as comparison_figures
-from pipeline.comparison.figures import MapPanel, map_in_threads
+from pipeline.comparison.figures import MapPanel, side_by_side
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report import figures as gap_figures
@@ -35,7 +35,7 @@ def drawings(grid: Grid) -> dict[str, Callable[[], bytes]]:
     return {
         "difference": lambda: difference_figure(values, grid, block, 0.003),
         "map": lambda: map_figure(np.abs(values), grid, "angle of incidence, degrees from the normal"),
-        "side by side": lambda: map_in_threads(panels, 0.02, DIFFERENCE_LABEL, signed=True),
+        "side by side": lambda: side_by_side(panels, 0.02, DIFFERENCE_LABEL, signed=True),
     }
 
 
