@@ -1,8 +1,8 @@
-"""Simulate the two sensors, a stereo pair and a terrestrial laser scanner, with their errors and noise.
+"""Simulate the two sensors, a stereo pair and a terrestrial laser scanner, with their systematic errors and noise.
 
-Surfaces and maps are made from observations in `pipeline`.
-The names below can be imported from `sensors` itself, for effects of one's own.
-Start with `laser/tls.py` or `stereo/stereo_pair.py`; each error of a sensor is one file in `effects`.
+Surfaces and maps are made from observations in `pipeline`. The names below can be imported from `sensors` itself by code that
+adds an effect or a sensor of its own. Start with `laser/tls.py` or `stereo/stereo_pair.py`; each error of a sensor is one file
+in `effects`.
 """
 
 from __future__ import annotations
