@@ -82,7 +82,7 @@ def epochs_of(run: Path, out: Path, seed: int) -> list[Path]:
 
 
 def compared(run: Path, result: Result) -> tuple[list[Found], list[bool], float]:
-    """Each block of a run beside what was found; of each false event, whether it has a mark; and the area, m2, that was searched."""
+    """Each block of a run beside what was found, whether each false event has a mark, and the area, m2, that was searched."""
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))["wall_frame"]
     frame = WallFrame(np.array(record["rotation"]), np.array(record["origin_m"]))
     found, false, area = [], list[bool](), 0.0
@@ -119,7 +119,7 @@ def _overlap(low: FloatArray, high: FloatArray, other_low: FloatArray, other_hig
 def simulated(count: int) -> Iterator[str]:
     """Rows of the table of simulated epochs."""
     heads = [f"{low:g} to {high:g} l" if np.isfinite(high) else f"above {low:g} l" for low, high in CLASSES_L]
-    yield f"| site | found of {' | '.join(heads)} | false in 1,000 m²: all, without a mark | volume, bias | 95 % intervals that hold |"
+    yield f"| site | found of {' | '.join(heads)} | false in 1,000 m²: all, unmarked | volume, bias | 95 % intervals that hold |"
     yield "|---" * (5 + len(heads)) + "|"
     for name, (sensor, config, keys) in SITES.items():
         with tempfile.TemporaryDirectory() as folder:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene.common.lazy import lazily
+from scene.common.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from pipeline.api.building import carve as carve
@@ -75,4 +75,4 @@ _MODULES = {
     "pipeline.dataset.loaders": ("Sample", "Tiles"),
 }  # fmt: skip
 __all__ = [name for names in _MODULES.values() for name in names]  # noqa: PLE0604, RUF100
-__getattr__, __dir__ = lazily(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_attributes(__name__, {name: module for module, names in _MODULES.items() for name in names})

@@ -27,7 +27,7 @@ class ReferenceError:
         if not isinstance(measurement, TlsMeasurement) or not measurement.reference_error_m:
             return None
         planes = measurement.planes
-        return cls(measurement.reference_error_m, planes is None or planes.of_noise, measurement.viewpoint)
+        return cls(measurement.reference_error_m, planes is None or planes.noise_dominates, measurement.viewpoint)
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
         """Points (n, 3) at the distances that they have from a wall whose vertices are wrong; NaN stays.

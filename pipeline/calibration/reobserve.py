@@ -37,7 +37,7 @@ from sensors.laser.tls import LaserScanner
 from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.signal_chain.observation import Observation
 from sensors.stereo.stereo_pair import StereoPair
-from sensors.subset import asked_for, looking_around
+from sensors.subset import effects_needing_neighbours, restrict_to
 
 _LATTICE_POINTS = 4000
 """Points by which an observation is registered: more of them would not bring it nearer to a registration by all."""
@@ -210,7 +210,7 @@ def _silent(model: Model) -> Model:
 def _asked(sensor: StereoPair | LaserScanner, model: Model, cells: NDArray[np.uint32] | None = None) -> Any:
     """The sensor with another model, asked for all its cells or for some."""
     asked = replace(sensor, model=model, truth=False)  # type: ignore[arg-type]
-    return asked if cells is None else asked_for(asked, cells)
+    return asked if cells is None else restrict_to(asked, cells)
 
 
 def _checked(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
@@ -227,7 +227,7 @@ def _checked(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserSc
             where="reconstruction, surface",
             allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
         )
-    if names := looking_around(site.sensor.model):
+    if names := effects_needing_neighbours(site.sensor.model):
         raise InputError(
             f"{', '.join(names)}: looks at the whole picture or scan, and only windows of it are simulated",
             where="sensor.effects",

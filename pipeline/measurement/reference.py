@@ -16,7 +16,7 @@ from pipeline.formats.units import AxisUnits, agreed_units
 from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.station import Station
 from pipeline.surface.raster_mesh import mesh_of_raster
-from pipeline.surface.triangulation import SeenSurface, triangulated
+from pipeline.surface.triangulation import SeenSurface, triangulate_seen_points
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.meshes.ply import read_elements
@@ -72,7 +72,7 @@ def from_file(
         return Reference(mesh, 0.0, words, (limit,))
     scans = read_scans(path, unit, option="--reference-unit")
     points = np.concatenate([scan.cloud.points for scan in scans])
-    surface = triangulated(points, position, rotation, str(path))
+    surface = triangulate_seen_points(points, position, rotation, str(path))
     said = f"cloud {path.name}: {len(points):,} points, meshed as seen {seen_from}, {len(surface.mesh.faces):,} triangles"
     words = tuple(dict.fromkeys(f"cloud {path.name}: {word}" for scan in scans for word in scan.cloud.notes))
     limits = (
@@ -118,7 +118,7 @@ def from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Ref
 def half_of(scan: RawScan, station: Station) -> Reference:
     """Every other line (or pulse, where these are much finer) as the surface, with the rest to be compared with it."""
     even, what = _halves(scan, station)
-    surface = triangulated(scan.cloud.points[even], station.position, station.rotation, scan.name)
+    surface = triangulate_seen_points(scan.cloud.points[even], station.position, station.rotation, scan.name)
     said = f"half of the scan itself ({what}): {int(even.sum()):,} points, {len(surface.mesh.faces):,} triangles"
     limits = (
         "both halves are of one scan: nothing that changes slowly over the wall can be seen (offset, scale, index, eccentricity, "

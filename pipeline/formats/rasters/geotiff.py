@@ -32,7 +32,7 @@ from pipeline.formats.rasters.georeference import (
     scale_and_offset,
 )
 from scene.common.errors import InputError
-from scene.common.regular_file import READ_LIMIT, check_file, raised_gb
+from scene.common.regular_file import READ_LIMIT, check_file, read_limit_gb
 from scene.geometry.grid import Grid
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # its complaints come as exceptions too
@@ -267,7 +267,7 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
 
 def most_pixels() -> int:
     """Of an image: MOST_PIXELS, or as many as the variable READ_LIMIT allows, of four bytes each."""
-    return max(MOST_PIXELS, int(raised_gb() * 1e9 / 4))
+    return max(MOST_PIXELS, int(read_limit_gb() * 1e9 / 4))
 
 
 def _check_size(page: tifffile.TiffPage, path: Path) -> None:
