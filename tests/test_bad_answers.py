@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from benchmarks.bad_inputs.exchange_cases import zlib_bomb
 from pipeline.cli.main import main
 from pipeline.comparison.comparison import compare_sensors
-from pipeline.comparison.sensors_compared import Contestant
+from pipeline.comparison.sensor_setups import SensorSetup
 from pipeline.config.simulation import SimulationConfig
 from pipeline.detection.inference.weights import check_detector
 from pipeline.detection.products.run import detector_folder
@@ -233,7 +233,7 @@ def test_maps_measured_twice_are_named(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").symlink_to("a")
     with pytest.raises(InputError, match="is given twice"):
-        compare_sensors([Contestant("site", "tls", site)], [tmp_path / "a", tmp_path / "b"])
+        compare_sensors([SensorSetup("site", "tls", site)], [tmp_path / "a", tmp_path / "b"])
 
 
 def test_what_is_no_number_in_a_key_of_others_is_left_out(tmp_path: Path) -> None:
