@@ -3,13 +3,13 @@
 All statistics are logarithms of lengths, m, pooled over the epochs, so that a calibration compares ratios. For windows k of maps
 e, m_ek is the median of a window and r = d - m_ek its residuals:
 
-    size         StD, NMAD and half the width between the 2.5 % and 97.5 % quantiles of r: the marginal distribution variogram
-    sqrt(gamma(h)) of r at distances h along rows and columns, by Cressie and Hawkins (1980), which is robust to
+    size         StD, NMAD and half the width between the 2.5 % and 97.5 % quantiles of r: the marginal distribution
+    variogram    sqrt(gamma(h)) of r at distances h along rows and columns, by Cressie and Hawkins (1980), which is robust to
                  steps: gamma = (mean |r - r'|^(1/2))^4 / (2 (0.457 + 0.494/N))
     deformation  RMS of m_ek in polynomials of degree 2 (bending) and 3 (twisting) over the wall, orthonormal on the windows'
                  centres, and the RMS of the rest; planes are left out, as registration removes them
-    edges        StD and NMAD of r where the surface is steep (the steepest tenth of the pixels), StD elsewhere incidence    NMAD
-    of r in thirds of the remaining pixels, by incidence angle of the line of sight
+    edges        StD and NMAD of r where the surface is steep (the steepest tenth of the pixels), StD elsewhere
+    incidence    NMAD of r in thirds of the remaining pixels, by incidence angle of the line of sight
 
 A large-scale mode has only one draw per epoch, the other statistics have many; the covariance over simulations accounts for that.
 """
