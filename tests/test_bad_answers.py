@@ -248,7 +248,7 @@ def test_what_is_no_number_in_a_key_of_others_is_left_out(tmp_path: Path) -> Non
     [
         ("external", "data in other files"),
         ("soft", "data in other files"),
-        ("storage", "outside of it"),
+        ("storage", "data in other files"),
         ("claims", "claims 4,00"),
     ],
 )
