@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from pipeline.calibration.calibrate import calibrate_material
+from pipeline.calibration.calibrate import calibrate_inputs
 from pipeline.calibration.inputs import CalibrationInputs
-from pipeline.calibration.maps import noise_map
-from pipeline.calibration.parameters import parameters
+from pipeline.calibration.noise_map import noise_map
+from pipeline.calibration.parameters import noise_parameters
 from pipeline.change.difference import raster_grid
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import load_config
@@ -66,7 +66,7 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
     random = KeyedRandom(50_000 + number)
     site = prepare_site(config, sensor, KeyedRandom(config.seed))
     instrument: Any = site.sensor
-    fitted = parameters(instrument.model, ())
+    fitted = noise_parameters(instrument.model, ())
     low, high = np.log([TRUTH[name] for name in fitted.names]).T
     true = np.exp(random.child("truth").generator().uniform(low, high))
     real = replace(site, sensor=replace(instrument, model=fitted.model(true)))
@@ -74,9 +74,9 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
     grid = raster_grid(reconstruct(config, look(config, real, caster, random.child("grid"))).bounds, config.difference)
     maps = np.stack([noise_map(config, real, real, caster, random.child("map", epoch), grid) for epoch in range(EPOCHS)])
     names = tuple(f"epoch {epoch}" for epoch in range(EPOCHS))
-    material = CalibrationInputs(names, grid, maps, ~np.isnan(maps).any(axis=0), False, site, False)
+    inputs = CalibrationInputs(names, grid, maps, ~np.isnan(maps).any(axis=0), False, site, False)
     begun = time.process_time()
-    found = calibrate_material(config, sensor, material, Progress(), with_greedy=False).found
+    found = calibrate_inputs(config, sensor, inputs, Progress(), with_greedy=False).found
     values = zip(fitted.names, true, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True)
     return {
         "parameters": {name: {"true": t, "value": v, "low": a, "high": b} for name, t, v, a, b in values},

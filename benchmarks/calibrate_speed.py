@@ -12,8 +12,8 @@ import argparse
 import numpy as np
 from measure import bare_cast, medians
 
-from pipeline.calibration.maps import noise_map
-from pipeline.calibration.reobserve import Reobserver
+from pipeline.calibration.noise_map import noise_map
+from pipeline.calibration.window_simulator import WindowSimulator
 from pipeline.calibration.windows import choose_windows
 from pipeline.change.difference import raster_grid
 from pipeline.config.bundled import bundled_config
@@ -35,7 +35,7 @@ def main() -> None:
     border = np.ones(grid.shape, dtype=bool)
     border[:100], border[-100:], border[:, :100], border[:, -100:] = False, False, False, False
     windows = choose_windows(border, grid, config.calibration)
-    simulator = Reobserver(config, site, windows)
+    simulator = WindowSimulator(config, site, windows)
     simulator.heights(model, KeyedRandom(0))
     eye = next(iter(site.viewpoints.values()))
     targets = site.mesh.vertices[KeyedRandom(1).generator().integers(0, len(site.mesh.vertices), len(simulator.cells))]

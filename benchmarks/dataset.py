@@ -30,7 +30,7 @@ from pipeline.dataset.cluster import runs
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs
 from pipeline.dataset.run import DatasetSummary, Workers, make_dataset
-from pipeline.dataset.worker import Order
+from pipeline.dataset.worker import EpochOrder
 
 WORKERS = (2, 16, 256)
 SIZES = ("small", "medium", "large")
@@ -104,7 +104,7 @@ def makespan(plan: Sequence[PlannedEpoch], workers: int, cost: Costs) -> float:
     """Time until the last epoch of the plan is done, s, by the rule above."""
     free: list[tuple[float, int]] = [(0.0, number) for number in range(workers)]
     has: dict[int, object] = {}
-    for run in runs([Order("", "", "", planned.index, planned.stage) for planned in plan], workers):
+    for run in runs([EpochOrder("", "", "", planned.index, planned.stage) for planned in plan], workers):
         now, worker = heapq.heappop(free)
         first = plan[run[0].index]
         now += 0.0 if has.get(worker) == first.stage else cost.of_set_up(first)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.calibration.maps import noise_map
+from pipeline.calibration.noise_map import noise_map
 from pipeline.change.difference import statistics
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SensorName

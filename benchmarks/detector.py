@@ -75,13 +75,13 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", str(arguments.threads))
-    from pipeline.detection.network.keras_backend import computing_in, keras_ready
+    from pipeline.detection.network.keras_backend import computing_precision, import_keras
 
-    keras_ready()
+    import_keras()
     import keras
     import tensorflow as tf
 
-    from pipeline.detection.inference.mirrored import network
+    from pipeline.detection.inference.mirrored import build_network
     from pipeline.detection.inference.weights import with_head
     from pipeline.detection.network.config import load_train_config
     from pipeline.detection.network.model import MaskRCNN
@@ -96,7 +96,7 @@ def main() -> None:
     learner.compile(optimizer=keras.optimizers.AdamW(1e-4), jit_compile=False)
 
     def step(precision: Literal["float32", "bfloat16"]) -> None:
-        with computing_in(precision):
+        with computing_precision(precision):
             learner.train_on_batch(batch)
 
     works = partial(step, "float32"), partial(step, "bfloat16"), bare(learner.pyramid, batch["image"], backward=True)
@@ -106,7 +106,7 @@ def main() -> None:
         f"training at {crop or size} px, {count} a step: {count / whole:.2f} images/s, bare {count / alone:.2f}, "
         f"ratio {alone / whole:.2f}; with training.precision=bfloat16 {count / half:.2f}, {whole / half:.2f} times as many"
     )
-    finder, looker = MaskRCNN(config.detector), network(with_head(config.detector, mirrored="both"))
+    finder, looker = MaskRCNN(config.detector), build_network(with_head(config.detector, mirrored="both"))
     image = examples(4, size, config.detector.most_blocks, channels)["image"]
     whole, mirrored, alone = processor_seconds(
         lambda: finder.predict_on_batch({"image": image}),

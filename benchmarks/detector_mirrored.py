@@ -22,7 +22,7 @@ from documents import printed, write_between
 
 from pipeline.detection.evaluation.evaluate import evaluate
 from pipeline.detection.inference import inference, weights
-from pipeline.detection.inference.mirrored import network
+from pipeline.detection.inference.mirrored import build_network
 from pipeline.detection.inference.operating_point import best_shifts
 from pipeline.detection.network.config import Mirroring
 from pipeline.detection.network.data import CocoFolder
@@ -72,7 +72,7 @@ def rows(folder: CocoFolder, detector: Path) -> Iterator[str]:
     yield "|---" * (3 + len(SIZES)) + "|"
     plain = 0.0
     for mirrored, name in WAYS.items():
-        model = network(weights.with_head(weights.load_config(detector), mirrored=mirrored))
+        model = build_network(weights.with_head(weights.load_config(detector), mirrored=mirrored))
         weights.take_weights(model, detector)
         found, seconds = figures(model, folder)
         plain = plain or seconds

@@ -21,7 +21,7 @@ from documents import printed, write_between
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.detection.network.data import CocoFolder, Labelled
+from pipeline.detection.network.data import CocoFolder, LabelledMap
 
 MARKS = "<!-- texture -->", "<!-- end of texture -->"
 EROSION_PX, RING_PX, FEWEST = 4, 14, 30
@@ -29,7 +29,7 @@ SMOOTHER = 0.7
 """Chance gives 6 % of the smallest niches that count a lower ratio: FEWEST independent pixels against ten times as many."""
 
 
-def deviations(shown: Labelled) -> Iterator[tuple[float, float]]:
+def deviations(shown: LabelledMap) -> Iterator[tuple[float, float]]:
     """Inside and around each niche of a map, m."""
     known = np.isfinite(shown.difference)
     share = ndimage.uniform_filter(known.astype(np.float32), 3)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from measure import peak_memory_gb
 
-from pipeline.calibration.maps import noise_map, with_model
+from pipeline.calibration.noise_map import noise_map, with_model
 from pipeline.change.difference import statistics
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config

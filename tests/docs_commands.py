@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cli.main import COMMANDS, command_parser
-from pipeline.comparison.sensors_compared import contestants
+from pipeline.comparison.sensor_setups import sensor_setups
 from pipeline.config.bundled import bundled_config, config_path
 from pipeline.config.overrides import Override, read_override
 from pipeline.config.presets import model_file, read_preset
@@ -76,7 +76,7 @@ def resolved(command: str) -> Iterator[dict[str, Any]]:
         yield load_config(config_path("sites", given.source), overrides, given.sensor, None).model_dump(mode="json")
     elif name == "compare":
         names = [str(ROOT / each) if each.startswith("configs/") else each for each in given.configs]  # typed in a checkout
-        yield from (each.config.model_dump(mode="json") for each in contestants(names, overrides, given.seed))
+        yield from (each.config.model_dump(mode="json") for each in sensor_setups(names, overrides, given.seed))
     elif name == "dataset" and given.words[0] not in ("verify", "merge", "split"):
         yield load_dataset_config(config_path("datasets", Path(given.words[0])), overrides).model_dump(mode="json")
     elif name == "train":

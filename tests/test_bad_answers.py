@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from benchmarks.bad_inputs.exchange_cases import zlib_bomb
 from pipeline.cli.main import main
 from pipeline.comparison.comparison import compare_sensors
-from pipeline.comparison.sensors_compared import Contestant
+from pipeline.comparison.sensor_setups import SensorSetup
 from pipeline.config.simulation import SimulationConfig
 from pipeline.detection.inference.weights import check_detector
 from pipeline.detection.products.run import detector_folder
@@ -233,7 +233,7 @@ def test_maps_measured_twice_are_named(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "b").symlink_to("a")
     with pytest.raises(InputError, match="is given twice"):
-        compare_sensors([Contestant("site", "tls", site)], [tmp_path / "a", tmp_path / "b"])
+        compare_sensors([SensorSetup("site", "tls", site)], [tmp_path / "a", tmp_path / "b"])
 
 
 def test_what_is_no_number_in_a_key_of_others_is_left_out(tmp_path: Path) -> None:
@@ -245,7 +245,12 @@ def test_what_is_no_number_in_a_key_of_others_is_left_out(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("kind", "said"),
-    [("external", "outside of it"), ("soft", "outside of it"), ("storage", "outside of it"), ("claims", "claims 4,00")],
+    [
+        ("external", "data in other files"),
+        ("soft", "data in other files"),
+        ("storage", "data in other files"),
+        ("claims", "claims 4,00"),
+    ],
 )
 def test_weights_hold_their_own_numbers(kind: str, said: str, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
@@ -272,7 +277,7 @@ def test_more_pairs_than_memory_has_room_for_are_named(tmp_path: Path) -> None:
     entries = [{**block, "id": number} for number in range(1, 6000)]
     content = {"images": [image], "annotations": entries, "categories": [{"id": 1}]}
     (tmp_path / "a.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="5,999 detections in image 1, where the truth has 5,999 blocks"):
+    with pytest.raises(InputError, match="image 1 has 5,999 detections, and 5,999 blocks in the truth"):
         assess(tmp_path / "a.json", tmp_path / "a.json", kinds=("bbox",))
 
 

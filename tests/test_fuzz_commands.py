@@ -30,7 +30,7 @@ DOORS = (
     "pipeline.comparison.comparison:compare",
     "pipeline.icp_study.study:study",
     "pipeline.icp_study.study:simulated_surfaces",
-    "pipeline.calibration.calibrate:calibrate_material",
+    "pipeline.calibration.calibrate:calibrate_inputs",
     "pipeline.dataset.run:write_dataset_file",
     "pipeline.dataset.combine:_finish",
     "pipeline.gap.naming.workflow:diagnose",

@@ -50,7 +50,7 @@ import json
 from pathlib import Path
 from pipeline import configure, make_wall
 from pipeline.cli.json_schema import json_schema
-from pipeline.comparison.sensors_compared import contestants
+from pipeline.comparison.sensor_setups import contestants
 from pipeline.formats.points.points import read_points
 from scene import InputError
 

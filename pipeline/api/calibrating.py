@@ -75,7 +75,7 @@ class Calibration:
     @property
     def systematic(self) -> xarray.DataArray:
         """(y, x) the mean of the measured maps, m."""
-        return data_array(self.figures.systematic, self.figures.material.grid, "systematic", "mean of the measured maps")
+        return data_array(self.figures.systematic, self.figures.inputs.grid, "systematic", "mean of the measured maps")
 
     @property
     def warnings(self) -> list[str]:

@@ -12,10 +12,10 @@ from pipeline.api.maps import DIFFERENCE, data_array, dataset
 from pipeline.api.pictures import Picture, html_table, pick
 from pipeline.api.tables import frame
 from pipeline.comparison.assess import SensorAssessment
-from pipeline.comparison.comparison import ComparedSensors as Figures
+from pipeline.comparison.comparison import ComparisonResult as Figures
 from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.report import answer, pictures, summary, write_comparison
-from pipeline.comparison.sensors_compared import Given, contestants
+from pipeline.comparison.sensor_setups import Given, sensor_setups
 from pipeline.config.simulation import SimulationConfig
 from pipeline.report.notebook_progress import python_progress
 from scene.common.errors import InputError, nearest
@@ -44,7 +44,7 @@ def compare(
     folder for report and files, none: nothing is written. overrides: of every config, as `configure` takes them.
     """
     given = _given(sensors, seed, overrides)
-    found = contestants(given, keywords(overrides), seed, own_step=own_step)
+    found = sensor_setups(given, keywords(overrides), seed, own_step=own_step)
     with python_progress(progress) as shown:
         result = Comparison(compare_sensors(found, paths(list(measured)), epochs, sizes_m, shown))
         if out is not None:
@@ -113,7 +113,7 @@ class Comparison:
 
 
 def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any]) -> list[Given]:
-    """What is to be compared as `contestants` takes it: names of files and presets, and configs with a name."""
+    """What is to be compared as `sensor_setups` takes it: names of files and presets, and configs with a name."""
     if not sensors:
         raise InputError("names no sensor", where="compare", remedy='compare("glendale", "riegl_vz400i")')
     only = sensors[0]

@@ -47,7 +47,7 @@ def detect(
     threshold. out: a folder for COCO files, tables, masks and overlays; none: a temporary one, removed when the result goes.
     unmirrored: the network looks at maps as they are, not at their mirror images too, which is faster and finds less.
     """
-    confidences = run.checked_confidences([confidence] if isinstance(confidence, int | float) else confidence)
+    confidences = run.sorted_confidences([confidence] if isinstance(confidence, int | float) else confidence)
     kept = tempfile.TemporaryDirectory(prefix="scarpsim_detect_") if out is None else None
     folder = Path(kept.name) / "found" if kept else empty_folder(Path(str(out)))
     with tempfile.TemporaryDirectory(prefix="scarpsim_maps_") as written:

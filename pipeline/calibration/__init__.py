@@ -1,5 +1,5 @@
-"""Fit the noise of a sensor model to measured difference maps, in size and in pattern (`scarpsim calibrate`).
+"""Fit the noise parameters of a sensor model to measured difference maps (`scarpsim calibrate`).
 
-Naming an effect that the model lacks is the work of `pipeline/gap`.
-Start with `calibrate.py`.
+The fit compares the size of the noise and its spatial pattern. Finding an effect that the model lacks is the task of
+`pipeline/gap`. Start with `calibrate.py`.
 """

@@ -1,4 +1,8 @@
-"""`scarpsim calibrate`, read from top to bottom: measured maps, their noise, the search, what cannot be told apart, a picture."""
+"""Run a calibration (`scarpsim calibrate`) from measured difference maps to the fitted noise and its diagnostics.
+
+The steps, in order: read the maps, describe the noise of each epoch, search for the noise parameters, then find which parameters
+the data cannot separate and how a simpler search would have done.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.calibration.epochs import EpochNoise, Trend, epoch_noise, systematic, trend
-from pipeline.calibration.greedy import Greedy, greedy
-from pipeline.calibration.inputs import CalibrationInputs, read_material
-from pipeline.calibration.parameters import Model, Parameters, parameters
-from pipeline.calibration.reobserve import Reobserver
-from pipeline.calibration.search import OBSERVATION_S, Found, NoiseSearch, fresh_cost
-from pipeline.calibration.signature import Signature
+from pipeline.calibration.greedy import GreedyResult, greedy_search
+from pipeline.calibration.inputs import CalibrationInputs, read_inputs
+from pipeline.calibration.parameters import Model, NoiseParameters, noise_parameters
+from pipeline.calibration.search import OBSERVATION_S, NoiseSearch, SearchResult, cost_of_new_simulations
+from pipeline.calibration.summary_statistics import SummaryStatistics
+from pipeline.calibration.window_simulator import WindowSimulator
 from pipeline.calibration.windows import Windows
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.report.progress import Progress
@@ -30,17 +34,24 @@ from sensors.models.sensor_model import DrawnParameter, OrientationNoise
 from sensors.stereo.stereo_pair import StereoPair
 
 _ALIKE = 0.9
-"""Correlation from which two parameters count as inseparable."""
+"""Absolute correlation above which two parameters count as inseparable."""
 STAGES = {"read": 1.0, "statistics": 1.0, "prepare": 2.0, "round 1": 20.0, "last round": 100.0, "compare": 2.0}
-"""Seconds that stages take, for the plan of the progress; the search plans its rounds anew when it knows their sizes."""
+"""Expected duration of each stage, s, for the progress display; the search corrects them when it knows how many maps it needs."""
 _GREEDY_OBSERVATIONS = 300
+"""Observations that the greedy search is expected to simulate, for the progress display."""
 
 
 @dataclass(frozen=True)
-class Patterns:
-    """What the orientation parameters of the left camera do to the maps, after registration.
+class OrientationPatterns:
+    """Difference maps that the orientation errors of the left camera cause, after registration.
 
-    names: k; size_m: (k,) RMS of the map for one sigma; cosines: (k, k) between the maps.
+    They show which orientation parameters can be told apart. Where the model moves both cameras alike, the maps are of both.
+
+    Attributes
+    ----------
+    names : (k,) names of the orientation parameters with a non-zero sigma.
+    size_m : (k,) RMS of the map of an error of one sigma, m.
+    cosines : (k, k) cosines of the angles between the maps; near 1 in magnitude, two parameters make the same pattern.
     """
 
     names: tuple[str, ...]
@@ -48,19 +59,23 @@ class Patterns:
     cosines: FloatArray
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the content as `calibration.json` holds it."""
         return {"names": self.names, "rms_m": self.size_m, "cosines": self.cosines}
 
 
 @dataclass(frozen=True)
-class Baseline:
-    """The thesis's greedy search beside this one.
+class GreedyComparison:
+    """Result of the greedy search on the same maps, for comparison with `NoiseSearch`.
 
-    cost: of fresh simulations at its end; costs: of this search after each round, with the maps till then; overtaken: maps
-    simulated when this search first had a set nearer to the measurement than `cost`, None if never.
+    Attributes
+    ----------
+    result : The greedy search's end point.
+    cost : Cost of that end point, from newly simulated maps.
+    costs : For each round of `NoiseSearch`, the number of maps simulated so far and the cost of its estimate.
+    overtaken : Maps after which `NoiseSearch` first had a simulation nearer to the measurement than `cost`; None: never.
     """
 
-    result: Greedy
+    result: GreedyResult
     cost: float
     costs: tuple[tuple[int, float], ...]
     overtaken: int | None
@@ -68,22 +83,43 @@ class Baseline:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The result. predicted: (k, n, n) windows of one simulated map; rate: observations per second; cells: traced in each."""
+    """The fitted noise parameters, with all that the report and `calibration.json` need.
+
+    Attributes
+    ----------
+    config : The resolved config of the calibration.
+    sensor : "stereo" or "tls".
+    inputs : The measured maps, their stable ground and the simulated site.
+    windows : Windows in which measured and simulated maps were compared.
+    epochs : Noise statistics of each measured map.
+    median_trend, std_trend : Trends of the median and the standard deviation over the epochs.
+    systematic : (h, w) mean of the measured maps, m; NaN outside stable ground.
+    parameters : The fitted parameters and their bounds.
+    found : Estimate, intervals and goodness of fit.
+    statistics : (m,) names of the summary statistics.
+    observed : (m,) summary statistics of the measurement (logarithms of lengths in m).
+    patterns : Maps of the orientation errors; None for a laser scanner or a model without such errors.
+    baseline : Result of the greedy search; None if it was not asked for.
+    predicted : (k, n, n) windows of one map simulated with the fitted noise, m.
+    rate : Simulated observations per second.
+    cells : Cells of the sensor that each simulated observation traces.
+    seconds : Duration of the whole calibration, s.
+    """
 
     config: SimulationConfig
     sensor: SensorName
-    material: CalibrationInputs
+    inputs: CalibrationInputs
     windows: Windows
     epochs: tuple[EpochNoise, ...]
     median_trend: Trend
     std_trend: Trend
     systematic: NDArray[np.float32]
-    parameters: Parameters
-    found: Found
+    parameters: NoiseParameters
+    found: SearchResult
     statistics: tuple[str, ...]
     observed: FloatArray
-    patterns: Patterns | None
-    baseline: Baseline | None
+    patterns: OrientationPatterns | None
+    baseline: GreedyComparison | None
     predicted: FloatArray
     rate: float
     cells: int
@@ -91,21 +127,23 @@ class CalibrationResult:
 
     @property
     def confidence(self) -> float:
-        """Of the intervals."""
+        """Confidence level of the intervals, 0 to 1."""
         return self.config.calibration.confidence
 
     def simulated_site(self) -> SensorSite:
-        """The site with the calibrated model."""
-        sensor: Any = self.material.site.sensor
-        return replace(self.material.site, sensor=replace(sensor, model=self.model))
+        """Return the site with the calibrated sensor model."""
+        sensor: Any = self.inputs.site.sensor
+        return replace(self.inputs.site, sensor=replace(sensor, model=self.model))
 
     @property
     def model(self) -> Model:
-        """The sensor model with the calibrated noise."""
+        """The sensor model with the fitted noise."""
         return self.parameters.model(np.exp(self.found.x))
 
     def inseparable(self) -> list[tuple[str, str, float]]:
-        """Pairs of fitted parameters whose errors are correlated by more than 0.9, with the correlation."""
+        """Return pairs of parameters that the maps cannot separate: both names, and the correlation (over 0.9 in magnitude) of
+        their errors.
+        """
         names, matrix = self.parameters.names, self.found.correlation
         rows, columns = np.nonzero(np.triu(np.abs(matrix) > _ALIKE, 1))
         return [(names[i], names[j], float(matrix[i, j])) for i, j in zip(rows, columns, strict=True)]
@@ -114,66 +152,93 @@ class CalibrationResult:
 def calibrate(
     config: SimulationConfig, sensor: SensorName, paths: Sequence[Path], progress: Progress, *, with_greedy: bool = True
 ) -> CalibrationResult:
-    """Calibrate the noise of a sensor's model on measured maps; `config.seed` keys all random numbers.
+    """Fit the noise parameters of a sensor model to measured difference maps.
 
-    paths: see `inputs.read_material`. Raises InputError for whatever is wrong with them or with the config.
+    Parameters
+    ----------
+    config : Config of the simulated site; `config.seed` determines all random numbers.
+    sensor : "stereo" or "tls".
+    paths : A folder of results or measurements, or difference maps as GeoTIFFs (see `read_inputs`).
+    progress : Receives the stages and their progress.
+    with_greedy : Whether to run the greedy search too, for comparison.
+
+    Returns
+    -------
+    The fitted noise with its intervals and diagnostics.
+
+    Raises
+    ------
+    InputError
+        If the maps or the config cannot be used.
     """
     began, random = time.perf_counter(), KeyedRandom(config.seed)
     progress.plan(STAGES | ({"compare": OBSERVATION_S * _GREEDY_OBSERVATIONS} if with_greedy else {}))
     with progress.stage("read"):
-        material = read_material(paths, config, sensor, random)
-    return calibrate_material(config, sensor, material, progress, with_greedy=with_greedy, began=began)
+        inputs = read_inputs(paths, config, sensor, random)
+    return calibrate_inputs(config, sensor, inputs, progress, with_greedy=with_greedy, began=began)
 
 
-def calibrate_material(
+def calibrate_inputs(
     config: SimulationConfig,
     sensor: SensorName,
-    material: CalibrationInputs,
+    inputs: CalibrationInputs,
     progress: Progress,
     *,
     with_greedy: bool = True,
     began: float | None = None,
 ) -> CalibrationResult:
-    """The same with maps that are in memory."""
+    """Fit the noise parameters to difference maps that are already in memory.
+
+    Parameters
+    ----------
+    config, sensor, progress, with_greedy : As in `calibrate`.
+    inputs : The measured maps, their stable ground and the site to simulate.
+    began : Start of the calibration on the clock of `time.perf_counter`, s; None: now.
+
+    Raises
+    ------
+    InputError
+        If the site cannot be simulated window by window.
+    """
     began = time.perf_counter() if began is None else began
     random, settings = KeyedRandom(config.seed).child("calibrate"), config.calibration
-    windows = material.windows(config)
-    measured = np.stack([windows.cut(values) for values in material.maps]).astype(np.float64)
+    windows = inputs.windows(config)
+    measured = np.stack([windows.cut(values) for values in inputs.maps]).astype(np.float64)
     with progress.stage("statistics"):
         epochs = tuple(
-            epoch_noise(name, material.on_stable(number), measured[number], material.grid.gsd, random.child("normality", number))
-            for number, name in enumerate(material.names)
+            epoch_noise(name, inputs.on_stable(number), measured[number], inputs.grid.gsd, random.child("normality", number))
+            for number, name in enumerate(inputs.names)
         )
     with progress.stage("prepare"):
-        error = material.reference_error
-        simulator = Reobserver(config, material.site, windows, of_points=material.of_points, reference_error=error)
-        signature = Signature(windows, simulator.silent_heights, _sight(material.site.sensor, windows))
-    fitted = parameters(simulator.sensor.model, settings.fit)
-    observed = signature.of(measured)
+        error = inputs.reference_error
+        simulator = WindowSimulator(config, inputs.site, windows, of_points=inputs.of_points, reference_error=error)
+        summary = SummaryStatistics(windows, simulator.noiseless_heights, _direction_to_sensor(inputs.site.sensor, windows))
+    fitted = noise_parameters(simulator.sensor.model, settings.fit)
+    observed = summary.compute(measured)
 
     def simulate(values: FloatArray, count: int, source: KeyedRandom) -> FloatArray:
-        return signature.of(simulator.maps(fitted.model(values), count, source))
+        return summary.compute(simulator.maps(fitted.model(values), count, source))
 
     search = NoiseSearch(simulate, fitted, len(measured), random, progress)
     started, before = time.perf_counter(), simulator.observations
     found = search.run(observed, settings.simulations, settings.confidence)
     rate = (simulator.observations - before) / (time.perf_counter() - started)
     with progress.stage("compare"):
-        baseline = _baseline(search, found, signature, observed, random) if with_greedy else None
-        patterns = _patterns(simulator, material.site.sensor) if isinstance(material.site.sensor, StereoPair) else None
+        baseline = _baseline(search, found, summary, observed, random) if with_greedy else None
+        patterns = _patterns(simulator, inputs.site.sensor) if isinstance(inputs.site.sensor, StereoPair) else None
         predicted = simulator.maps(fitted.model(np.exp(found.x)), 1, random.child("predicted"))[0]
     return CalibrationResult(
         config=config,
         sensor=sensor,
-        material=material,
+        inputs=inputs,
         windows=windows,
         epochs=epochs,
         median_trend=trend([each.size.median for each in epochs]),
         std_trend=trend([each.size.standard_deviation for each in epochs]),
-        systematic=systematic(np.stack([material.on_stable(number) for number in range(len(epochs))])),
+        systematic=systematic(np.stack([inputs.on_stable(number) for number in range(len(epochs))])),
         parameters=fitted,
         found=found,
-        statistics=signature.names,
+        statistics=summary.names,
         observed=observed,
         patterns=patterns,
         baseline=baseline,
@@ -184,19 +249,21 @@ def calibrate_material(
     )
 
 
-def _baseline(search: NoiseSearch, found: Found, signature: Signature, observed: FloatArray, random: KeyedRandom) -> Baseline:
-    """The thesis's search on the same maps, from the values of the model that was there before."""
-    std, fitted = signature.names.index("size.std"), search.parameters
-    result = greedy(search.simulate, fitted, _present(fitted), std, observed[std], random)
-    costs = tuple((maps, fresh_cost(search, found.surface, observed, x)) for maps, x in found.history)
-    cost = fresh_cost(search, found.surface, observed, result.x)
+def _baseline(
+    search: NoiseSearch, found: SearchResult, summary: SummaryStatistics, observed: FloatArray, random: KeyedRandom
+) -> GreedyComparison:
+    """Run the greedy search on the same maps, starting at the noise of the model before the calibration."""
+    std, fitted = summary.names.index("size.std"), search.parameters
+    result = greedy_search(search.simulate, fitted, _values_before(fitted), std, observed[std], random)
+    costs = tuple((maps, cost_of_new_simulations(search, found.surface, observed, x)) for maps, x in found.history)
+    cost = cost_of_new_simulations(search, found.surface, observed, result.x)
     whitened = ((maps, found.surface.whitening @ (observed - statistics)) for maps, statistics in search.approached)
     overtaken = next((maps for maps, left in whitened if np.sum(left**2) < cost), None)
-    return Baseline(result, cost, costs, overtaken)
+    return GreedyComparison(result, cost, costs, overtaken)
 
 
-def _present(fitted: Parameters) -> FloatArray:
-    """(k,) values in the model before the calibration, within the bounds."""
+def _values_before(fitted: NoiseParameters) -> FloatArray:
+    """Return the (k,) parameter values of the model before the calibration, clipped to the bounds."""
     noise: Any = fitted.base.noise
     values = []
     for name in fitted.names:
@@ -209,29 +276,29 @@ def _present(fitted: Parameters) -> FloatArray:
     return np.clip(values, fitted.low, fitted.high)
 
 
-def _sight(sensor: Any, windows: Windows) -> FloatArray:
-    """(3,) unit vector from the windows' middle to the sensor, wall frame."""
+def _direction_to_sensor(sensor: Any, windows: Windows) -> FloatArray:
+    """Return the (3,) unit vector from the middle of the windows to the sensor, wall frame."""
     eye = sensor.cameras.in_wall_frame(sensor.frame).left.position if isinstance(sensor, StereoPair) else sensor.position
     towards = eye - np.array([*windows.centres().mean(axis=0), 0.0])
     return towards / np.linalg.norm(towards)
 
 
-def _patterns(simulator: Reobserver, pair: StereoPair) -> Patterns | None:
-    """The maps of one sigma of each orientation parameter of the left camera, or of both alike; None where the model has none."""
+def _patterns(simulator: WindowSimulator, pair: StereoPair) -> OrientationPatterns | None:
+    """Simulate the map of a one-sigma error of each orientation parameter; None if the model has no orientation noise."""
     spreads = {name: getattr(pair.model.noise.orientation, name).sigma for name in OrientationNoise.model_fields}
     moving = {name: sigma for name, sigma in spreads.items() if sigma > 0}
     if not moving:
         return None
-    still, maps = simulator.heights(simulator.silent, KeyedRandom(0)), []
+    still, maps = simulator.heights(simulator.noiseless_model, KeyedRandom(0)), []
     for name, sigma in moving.items():
         side: Side = "both" if pair.model.noise.orientation_drawn == "both_alike" else "left"
         alone = OrientationNoise(**{name: DrawnParameter(mean=sigma)}).draw(side, KeyedRandom(0))
         effects: tuple[Effect, ...] = tuple(effect for effect in alone if not effect.is_null)
-        model = simulator.silent.model_copy(update={"effects": (*pair.model.effects, *effects)})
+        model = simulator.noiseless_model.model_copy(update={"effects": (*pair.model.effects, *effects)})
         maps.append(still - simulator.heights(model, KeyedRandom(0)))
     known = np.isfinite(maps).all(axis=0) & simulator.windows.stable
     flat = np.stack([values[known] for values in maps])
-    flat = np.clip(flat, *np.quantile(flat, [0.005, 0.995], axis=1, keepdims=True))  # a step that moved would outweigh the rest
+    flat = np.clip(flat, *np.quantile(flat, [0.005, 0.995], axis=1, keepdims=True))  # else a moved step edge would dominate
     size = np.sqrt(np.mean(flat**2, axis=1))
     unit = flat / np.maximum(size, 1e-12)[:, None]
-    return Patterns(tuple(moving), size, unit @ unit.T / flat.shape[1])
+    return OrientationPatterns(tuple(moving), size, unit @ unit.T / flat.shape[1])

@@ -1,4 +1,7 @@
-"""The noise of measured epochs as the thesis tabulates it (tables 4-6 and 4-7), and what its tables leave out."""
+"""Describe the noise of each measured epoch: its size, tails, normality, variogram, and trend over the epochs.
+
+The statistics are those of tables 4-6 and 4-7 of the thesis, plus the variogram and the number of independent values.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,16 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class EpochNoise:
-    """One difference map over stable ground: size, tails, normality (of as many values as are independent), variogram.
+    """Noise statistics of one difference map over stable ground.
 
-    independent: effective sample size of the windows together.
+    Attributes
+    ----------
+    name : Name of the map.
+    size : Median, standard deviation, RMSE and NMAD, m.
+    tails : Skewness and excess kurtosis.
+    normality : Test for a normal distribution, on only as many values as are independent.
+    variogram, model : Empirical variogram and the model fitted to it.
+    independent : Effective sample size of all windows together.
     """
 
     name: str
@@ -33,7 +43,7 @@ class EpochNoise:
     independent: float
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the content as `calibration.json` holds it."""
         return {
             "name": self.name,
             **self.size.to_dict(),
@@ -46,18 +56,33 @@ class EpochNoise:
 
 @dataclass(frozen=True)
 class Trend:
-    """A straight line through the epochs' values: change per epoch, m, and the p-value of no change; None for fewer than 4."""
+    """Linear trend of a statistic over the epochs.
+
+    Attributes
+    ----------
+    per_epoch_m : Slope of the regression line, m per epoch; None for fewer than 4 epochs.
+    p_value : p-value of the test for zero slope; None for fewer than 4 epochs.
+    """
 
     per_epoch_m: float | None
     p_value: float | None
 
     def to_dict(self) -> dict[str, float | None]:
-        """As JSON holds it."""
+        """Return the content as `calibration.json` holds it."""
         return {"per_epoch_m": self.per_epoch_m, "p_value": self.p_value}
 
 
 def epoch_noise(name: str, stable: NDArray[np.floating], windows: FloatArray, gsd_m: float, random: KeyedRandom) -> EpochNoise:
-    """stable: the map (h, w), m, NaN where it is not stable; windows: (k, n, n) of it, for the variogram."""
+    """Compute the noise statistics of one difference map.
+
+    Parameters
+    ----------
+    name : Name of the map.
+    stable : (h, w) differences, m; NaN outside stable ground.
+    windows : (k, n, n) windows of that map, m, for the variogram.
+    gsd_m : Pixel size, m.
+    random : Source of the random subsample for the normality test.
+    """
     rest = without_outliers(windows)
     found = variogram(rest, gsd_m, largest_lag_m=0.75 * gsd_m * windows.shape[1])
     model = fit_variogram(found)
@@ -68,7 +93,7 @@ def epoch_noise(name: str, stable: NDArray[np.floating], windows: FloatArray, gs
 
 
 def trend(values: Sequence[float]) -> Trend:
-    """The trend of one figure, m, over the epochs in their order."""
+    """Fit a line to one value per epoch, m, in the order of the epochs."""
     if len(values) < 4:
         return Trend(None, None)
     line = stats.linregress(np.arange(len(values)), values)
@@ -76,5 +101,8 @@ def trend(values: Sequence[float]) -> Trend:
 
 
 def systematic(maps: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(h, w) mean over the epochs of (e, h, w) maps, m: what all share, as the reference's errors; NaN where one has none."""
+    """Return the (h, w) mean of (e, h, w) maps over the epochs, m; NaN where any map is NaN.
+
+    It holds what all epochs share, such as errors of the reference.
+    """
     return np.asarray(np.mean(maps, axis=0, dtype=np.float64), dtype=np.float32)

@@ -1,7 +1,7 @@
-"""The thesis's calibration (4.1.5), kept as a baseline: one parameter at a time, by the standard deviation alone.
+"""Search for noise parameters one at a time, by the standard deviation alone (section 4.1.5 of the thesis), as a baseline.
 
-From a set with four times the measured noise, each parameter in turn is lowered by a tenth of its first value while that
-brings the standard deviation of simulated maps nearer to the measured one, and then all again until nothing helps; each test
+The search starts with four times the measured noise. It lowers each parameter in turn by a tenth of its first value while that
+brings the standard deviation of the simulated maps nearer to the measured one, and repeats until nothing helps. Each test
 simulates one map.
 """
 
@@ -11,36 +11,56 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.calibration.parameters import Parameters
+from pipeline.calibration.parameters import NoiseParameters
 from pipeline.calibration.search import Simulate
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
 _STEP = 0.1
+"""Step of a parameter, as a share of its first value."""
 _CLOSE = 0.02
 """Relative difference of the standard deviations at which the search ends."""
 _START_FACTOR = 4.0
-"""The thesis began at about four times the measured noise."""
+"""Simulated over measured noise at the start; the thesis began at about four."""
 
 
 @dataclass(frozen=True)
-class Greedy:
-    """x: (k,) logarithms of the parameters at the end; tests: simulated maps; relative_error: of the standard deviation."""
+class GreedyResult:
+    """End point of the greedy search.
+
+    Attributes
+    ----------
+    x : (k,) natural logarithms of the parameters.
+    tests : Number of simulated maps.
+    relative_error : Simulated standard deviation over the measured one, minus 1.
+    """
 
     x: FloatArray
     tests: int
     relative_error: float
 
 
-def greedy(simulate: Simulate, parameters: Parameters, start: FloatArray, std: int, target: float, random: KeyedRandom) -> Greedy:
-    """Run it. start: (k,) values, scaled here; std: place of log StD among the statistics; target: its measured value."""
+def greedy_search(
+    simulate: Simulate, parameters: NoiseParameters, start: FloatArray, std: int, target: float, random: KeyedRandom
+) -> GreedyResult:
+    """Run the greedy search.
+
+    Parameters
+    ----------
+    simulate : Simulates epochs and returns the logarithms of their summary statistics.
+    parameters : Names and bounds of the parameters.
+    start : (k,) parameter values, scaled here to the noise at which the search starts.
+    std : Index of the standard deviation among the summary statistics.
+    target : Logarithm of the measured standard deviation.
+    random : Source of the simulations' random numbers.
+    """
 
     def error(values: FloatArray, test: int) -> float:
         return float(simulate(values, 1, random.child("greedy", test))[std] - target)
 
     first = np.clip(_START_FACTOR * np.exp(-error(start, 0)) * start, parameters.low, parameters.high)
     lengths = np.array(["step" in name for name in parameters.names])
-    first[lengths] = start[lengths]  # a length on the image has no size that could be too large
+    first[lengths] = start[lengths]  # a step length sets the noise's grid spacing, not its size, so it stays
     values, tests = first.copy(), 2
     best = error(values, 1)
     improved = True
@@ -57,4 +77,4 @@ def greedy(simulate: Simulate, parameters: Parameters, start: FloatArray, std: i
                 if abs(tried) >= abs(best):
                     break
                 values, best, improved = trial, tried, True
-    return Greedy(np.log(values), tests, float(np.expm1(best)))
+    return GreedyResult(np.log(values), tests, float(np.expm1(best)))

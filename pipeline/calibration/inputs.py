@@ -1,4 +1,4 @@
-"""What a calibration starts from: measured difference maps, the ground that is stable, and the site that is to give the like."""
+"""Read the input of a calibration: the measured difference maps, their stable ground, and the site to simulate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.calibration.reference_error import ReferenceError
-from pipeline.calibration.windows import Windows, choose_windows, unchanged
+from pipeline.calibration.windows import Windows, choose_windows, stable_ground
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.measurements.measurement import (
     FILE,
@@ -32,16 +32,28 @@ from sensors.stereo.stereo_pair import StereoPair
 
 BoolArray = NDArray[np.bool_]
 _NEIGHBOURS, _SAMPLE = 64, 5000
-"""In the circle around a point whose size tells how densely points lie, enough for those on its rim not to matter; circles."""
+"""Points in the circle whose size gives the point density, many so that those on its rim hardly matter; number of
+such circles.
+"""
 _REACH_PX = 2
-"""Pixels without a point of their own lie at most so far from one that has, where a cloud covers the ground."""
+"""Largest gap between a point cloud's pixels, px, that still counts as covered ground."""
 
 
 @dataclass(frozen=True)
 class CalibrationInputs:
-    """names: of the e maps; grid, maps: (e, h, w), m; stable: (h, w); drawn: whether the user drew it; site: what measured;
-    of_points: the maps are mean differences of points to the known surface, not of two surfaces; reference_error: of that
-    surface, where it is made of points."""
+    """Measured difference maps on one grid, with their stable ground and the site to simulate.
+
+    Attributes
+    ----------
+    names : (e,) names of the maps.
+    grid : Raster that all maps share.
+    maps : (e, h, w) differences, m; NaN without data.
+    stable : (h, w) true on stable ground that has data in every map.
+    drawn : Whether the user drew the stable areas; otherwise they were detected.
+    site : The instrument in front of the reference surface.
+    of_points : Whether a pixel is the mean distance of its points from the reference; otherwise maps compare two surfaces.
+    reference_error : Error of a reference surface that is made of points; None if it is unknown or zero.
+    """
 
     names: tuple[str, ...]
     grid: Grid
@@ -53,44 +65,70 @@ class CalibrationInputs:
     reference_error: ReferenceError | None = None
 
     def windows(self, config: SimulationConfig) -> Windows:
-        """The windows in which maps are compared."""
+        """Choose the windows in which measured and simulated maps are compared."""
         return choose_windows(self.stable, self.grid, config.calibration)
 
     def on_stable(self, number: int) -> NDArray[np.floating]:
-        """(h, w) one map, NaN where it is not stable."""
+        """Return the (h, w) map of this number, m, with NaN outside stable ground."""
         return np.where(self.stable, self.maps[number], np.float32(np.nan))
 
 
 def config_of(paths: Sequence[Path]) -> Path | None:
-    """The run.json among the inputs' folders, which is the config of a simulated run; None where there is none."""
+    """Return the path of the first `run.json` in the input folders, which serves as the config; None if there is none."""
     return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 
 
 def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorName | None) -> SensorName:
-    """Which sensor measured. Raises InputError where the inputs say another than `wanted` (None: any), or nobody says."""
+    """Return the sensor that measured the inputs.
+
+    Parameters
+    ----------
+    paths : The input folders or files.
+    config : Consulted where neither the inputs nor `wanted` say.
+    wanted : The sensor that the user named; None if the user named none.
+
+    Raises
+    ------
+    InputError
+        If the inputs are of another sensor than `wanted`, if an input does not exist, or if nothing says which sensor it was.
+    """
     for path in paths:
         if not path.exists():
-            raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
+            raise InputError("no such folder or file", where=str(path), remedy="check the path")
         if (path / FILE).is_file():
-            return _agreed(read_measurement(path).sensor, wanted, path)
+            return _matching_sensor(read_measurement(path).sensor, wanted, path)
         if (path / RUN_FILE).is_file():
-            return _agreed(read_run(path / RUN_FILE, "run it again with simulate")["sensor"], wanted, path)
+            return _matching_sensor(read_run(path / RUN_FILE, "run it again with simulate")["sensor"], wanted, path)
     if wanted is not None:
         return wanted
     names = config.sensor_names()
     if len(names) == 1:
         return names[0]
-    raise InputError("the maps may be of either sensor", where="calibrate", remedy="add --sensor stereo or --sensor tls")
+    raise InputError("the sensor of the maps is unknown", where="calibrate", remedy="add --sensor stereo or --sensor tls")
 
 
-def _agreed(found: SensorName, wanted: SensorName | None, path: Path) -> SensorName:
+def _matching_sensor(found: SensorName, wanted: SensorName | None, path: Path) -> SensorName:
+    """Return the sensor found in the input, or raise InputError if the user named the other one."""
     if wanted not in (None, found):
-        raise InputError(f"was measured by {found}, and --sensor is {wanted}", where=str(path), remedy="leave --sensor out")
+        raise InputError(f"measured by {found}, but --sensor is {wanted}", where=str(path), remedy="leave --sensor out")
     return found
 
 
-def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> CalibrationInputs:
-    """Read the measured maps and find their stable ground. Raises InputError for maps that differ in their grids."""
+def read_inputs(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> CalibrationInputs:
+    """Read the measured maps, find their stable ground and prepare the site to simulate.
+
+    Parameters
+    ----------
+    paths : One folder (a run or a measurement), or GeoTIFFs of one grid.
+    config : Gives the site, and the stable areas if the user drew them.
+    sensor : "stereo" or "tls".
+    random : Source of the random numbers for preparing the site.
+
+    Raises
+    ------
+    InputError
+        If the maps differ in their grids, contain no noise, or are given twice.
+    """
     measured, names = _maps(paths, config, random)
     _check_noise(measured.maps, names)
     of_points = bool(measured.points)
@@ -101,39 +139,41 @@ def read_material(paths: Sequence[Path], config: SimulationConfig, sensor: Senso
         site, error = prepare_site(config, sensor, random), None
     areas = config.calibration.stable_areas
     drawn = area_mask(areas, measured.grid) if areas else measured.stable
-    stable = _covered(measured.maps, of_points) & (unchanged(list(measured.maps)) if drawn is None else drawn)
+    stable = _covered(measured.maps, of_points) & (stable_ground(list(measured.maps)) if drawn is None else drawn)
     return CalibrationInputs(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points, error)
 
 
 def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) -> tuple[MeasuredMaps, tuple[str, ...]]:
-    """One folder, or map files; and the maps' names."""
+    """Read the maps of one folder, or map files, and return them with their names."""
     if len(paths) == 1 and paths[0].is_dir():
         found = read_measured(paths[0], config.difference, config.icp, random)
         return found, tuple(f"epoch {number}" for number in range(1, len(found.maps) + 1))
     for path in paths:
         if path.suffix.lower() not in (".tif", ".tiff"):
-            raise InputError("is no difference map", where=str(path), allowed="one folder, or GeoTIFFs of one grid")
+            raise InputError("not a difference map", where=str(path), allowed="one folder, or GeoTIFFs of one grid")
     rasters, grids = zip(*map(read_geotiff, paths), strict=True)
     for path, grid in zip(paths, grids, strict=True):
         if grid != grids[0]:
-            raise InputError(f"{grid} is not {grids[0]} of {paths[0].name}", where=str(path), remedy="bring the maps to one grid")
+            raise InputError(
+                f"the grid {grid} differs from {grids[0]} of {paths[0].name}", where=str(path), remedy="resample to one grid"
+            )
     return MeasuredMaps("maps", grids[0], np.stack(rasters), None), tuple(path.stem for path in paths)
 
 
 def _check_noise(maps: NDArray[np.floating], names: Sequence[str]) -> None:
-    """Maps without any noise are no measurement; one that is given twice would count as two and make the intervals too narrow."""
+    """Raise InputError for a constant map, or one given twice: it would count as two epochs and make the intervals too narrow."""
     for number, (values, name) in enumerate(zip(maps, names, strict=True)):
         known = values[~np.isnan(values)]
         if known.size and np.ptp(known) == 0:
-            problem = f"shows the same difference, {known[0]:g} m, everywhere"
-            raise InputError(problem, where=name, remedy="give maps of measured differences, noise included")
+            problem = f"the difference is {known[0]:g} m everywhere, so the map has no noise"
+            raise InputError(problem, where=name, remedy="give measured maps, noise included")
         for other, other_name in zip(maps[:number], names, strict=False):
             if np.array_equal(values, other, equal_nan=True):
-                raise InputError(f"is the same map as {other_name}", where=name, remedy="give each epoch's map once")
+                raise InputError(f"the map equals {other_name}", where=name, remedy="give each epoch's map once")
 
 
 def _covered(maps: NDArray[np.floating], of_points: bool) -> BoolArray:
-    """(h, w) where every map has data; of points, where some are near in every map."""
+    """Return the (h, w) mask of pixels with data in every map; for point clouds, small gaps between points count as data."""
     known = ~np.isnan(maps)
     if of_points:
         from scipy import ndimage
@@ -143,12 +183,12 @@ def _covered(maps: NDArray[np.floating], of_points: bool) -> BoolArray:
 
 
 def _measured_site(measurement: Measurement, config: SimulationConfig) -> SensorSite:
-    """The instrument of a measurement in front of its reference surface."""
+    """Return the site with the instrument of the measurement in front of its reference surface."""
     sensor: StereoPair | LaserScanner
     if isinstance(measurement, StereoMeasurement):
         name, sensor = "cameras", StereoPair(measurement.cameras, measurement.frame, measurement.model, config.depth_map)
     elif isinstance(measurement, SurfaceMeasurement):
-        raise InputError("has no cameras to simulate", where=FILE, remedy="name `cameras`; scarpsim gap needs none")
+        raise InputError("the measurement names no cameras to simulate", where=FILE, remedy="add `cameras`, or use scarpsim gap")
     else:
         name, sensor = "scanner", _scanner(measurement, config)
     eyes = {name: measurement.viewpoint}
@@ -156,8 +196,11 @@ def _measured_site(measurement: Measurement, config: SimulationConfig) -> Sensor
 
 
 def _scanner(measurement: TlsMeasurement, config: SimulationConfig) -> LaserScanner:
-    """With the measurement's pattern; where that is not known, over all of the reference as densely as the points lie, since the
-    mean of a pixel has the less noise the more points there are."""
+    """Return a scanner with the measurement's scan pattern.
+
+    If the pattern is unknown, it covers the reference with the angular spacing of the measured points: the noise of a pixel's
+    mean depends on how many points the pixel has.
+    """
     (position, rotation), model, frame = measurement.station, measurement.model, measurement.frame
     if measurement.pattern is None:
         world = frame.to_world(position), frame.rotation.T @ rotation
@@ -165,13 +208,16 @@ def _scanner(measurement: TlsMeasurement, config: SimulationConfig) -> LaserScan
         dense = config.scanner.model_copy(update={"azimuth_step_rad": step, "zenith_step_rad": step})
         return LaserScanner.aimed(world, frame, measurement.reference.vertices, dense, model)
     azimuth, zenith = measurement.pattern.azimuth_rad, measurement.pattern.zenith_rad
-    steps = config.scanner.model_copy(update={"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})  # of any size
+    steps = config.scanner.model_copy(update={"azimuth_step_rad": azimuth[2], "zenith_step_rad": zenith[2]})
     return LaserScanner(position, rotation, Pattern.over(azimuth[:2], zenith[:2], steps), steps, model)
 
 
 def _angular_spacing(measurement: TlsMeasurement) -> float:
-    """Side of the square, seen from the scanner, that a point of the first epoch has to itself, rad: median over a sample, of the
-    circle around each that holds 64. Raises InputError where so many lie in one direction."""
+    """Estimate the angular spacing of the first epoch's points as seen from the scanner, rad.
+
+    It is the side of the square that one point has to itself: the median, over a sample of points, from the circle that holds the
+    64 nearest. Raises InputError if so many points lie in one direction that it would be zero.
+    """
     from scipy.spatial import cKDTree
 
     epochs = measurement.epochs
@@ -181,6 +227,6 @@ def _angular_spacing(measurement: TlsMeasurement) -> float:
     reach = cKDTree(ray).query(ray[:: max(len(ray) // _SAMPLE, 1)], [count + 1])[0]
     step = float(np.median(reach) * np.sqrt(np.pi / (count + 0.5)))
     if not step > 0:
-        problem = f"more than {count} points lie in one direction from the scanner, so that they do not tell its angular steps"
-        raise InputError(problem, where=FILE, remedy="name `pattern`, or give each point once")
+        problem = f"more than {count} points lie in one direction from the scanner, so its angular steps are unknown"
+        raise InputError(problem, where=FILE, remedy="add `pattern`, or remove repeated points")
     return step

@@ -1,4 +1,4 @@
-"""The noise parameters that a calibration may fit: where each stands in a sensor model, and between which bounds it is sought."""
+"""The noise parameters that a calibration can fit: where each is in the sensor model, and its bounds."""
 
 from __future__ import annotations
 
@@ -23,21 +23,31 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "range_ppm": (1.0, 300.0),
     "angle_sigma_rad": (2e-6, 1e-3),
 }
+"""Bounds of each parameter, in the unit of its name; those of `orientation` are factors."""
 _OF_SIGMA = (0.05, 12.0)
-"""Bounds of a single sigma of the orientation, times that of the config."""
+"""Bounds of a single orientation sigma, as multiples of its value in the config."""
 _DEFAULT = {
     "stereo": ("parallax_sigma_px", "regularization_sigma_px", "regularization_step_px", ORIENTATION),
     "tls": ("range_sigma_m", "angle_sigma_rad"),
 }
+"""Parameters that are fitted if the user names none."""
 _ALLOWED = {
     "stereo": (*_DEFAULT["stereo"], *(f"{ORIENTATION}.{name}" for name in OrientationNoise.model_fields)),
     "tls": (*_DEFAULT["tls"], "range_ppm"),
 }
+"""Parameters that the user may name."""
 
 
 @dataclass(frozen=True)
-class Parameters:
-    """Parameters of one model, sought as their natural logarithms. names: k; low, high: (k,) bounds, in the parameters' units."""
+class NoiseParameters:
+    """The parameters of one sensor model that are fitted, and their bounds.
+
+    Attributes
+    ----------
+    base : The model before the calibration.
+    names : (k,) names of the parameters.
+    low, high : (k,) bounds, in the parameters' units. The search itself works on natural logarithms.
+    """
 
     base: Model
     names: tuple[str, ...]
@@ -45,7 +55,7 @@ class Parameters:
     high: FloatArray
 
     def model(self, values: Sequence[float] | FloatArray) -> Model:
-        """The base model with these values; all else, effects included, stays as it is."""
+        """Return the base model with these (k,) parameter values; everything else, effects included, stays unchanged."""
         found = dict(zip(self.names, (float(value) for value in values), strict=True))
         noise = self.base.noise
         plain: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(ORIENTATION)}
@@ -54,7 +64,7 @@ class Parameters:
         return self.base.model_copy(update={"noise": noise.model_copy(update=plain)})
 
     def meaning(self, name: str) -> str:
-        """What a parameter is, in the words of the config, without its unit."""
+        """Describe a parameter in the words of the config, without its unit."""
         if name == ORIENTATION:
             return "all sigmas of the orientation, as a multiple of the config's"
         section, _, key = name.rpartition(".")
@@ -63,12 +73,12 @@ class Parameters:
         return f"standard deviation: {words}" if section else words
 
     def values(self, logarithms: FloatArray) -> FloatArray:
-        """(..., k) values of logarithms, within the bounds."""
+        """Convert (..., k) natural logarithms to parameter values, clipped to the bounds."""
         return np.clip(np.exp(logarithms), self.low, self.high)
 
 
 def _orientation(base: OrientationNoise, found: dict[str, float]) -> OrientationNoise:
-    """The config's spreads times the common factor; those that are fitted singly have a sigma of their own."""
+    """Multiply the config's orientation sigmas by the common factor, and replace those that are fitted singly."""
     factor = found.get(ORIENTATION, 1.0)
     changed: dict[str, Any] = {}
     for name in type(base).model_fields:
@@ -78,42 +88,59 @@ def _orientation(base: OrientationNoise, found: dict[str, float]) -> Orientation
     return base.model_copy(update=changed)
 
 
-def parameters(base: Model, names: Sequence[str]) -> Parameters:
-    """The parameters of these names, or the usual ones of the sensor. Raises InputError for one that the model has not."""
-    chosen = tuple(names) or _usual(base)
+def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
+    """Return the parameters to fit.
+
+    Parameters
+    ----------
+    base : The sensor model.
+    names : Names from the config key `calibration.fit`; empty: the default ones of the sensor.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown or repeated, or the model gives a parameter no scale (its sigma is 0).
+    """
+    chosen = tuple(names) or _default_names(base)
     for name in chosen:
         if name not in _ALLOWED[base.sensor]:
             hint = nearest(name, _ALLOWED[base.sensor]) or f"allowed: {', '.join(_ALLOWED[base.sensor])}"
-            raise InputError(f"'{name}' is no noise parameter of the {base.sensor} sensor", where="calibration.fit", remedy=hint)
+            raise InputError(
+                f"'{name}' is not a noise parameter of the {base.sensor} sensor", where="calibration.fit", remedy=hint
+            )
     if len(set(chosen)) < len(chosen):
-        raise InputError("names a parameter twice", where="calibration.fit")
+        raise InputError("a parameter is listed twice", where="calibration.fit")
     bounds = np.array([_bounds(base, name) for name in chosen])
-    return Parameters(base, chosen, bounds[:, 0], bounds[:, 1])
+    return NoiseParameters(base, chosen, bounds[:, 0], bounds[:, 1])
 
 
-def _usual(base: Model) -> tuple[str, ...]:
+def _default_names(base: Model) -> tuple[str, ...]:
+    """Return the default parameters of the model's sensor, without the orientation factor where the model has no orientation
+    noise.
+    """
     names = _DEFAULT[base.sensor]
-    return names if not isinstance(base, StereoModel) or _moves(base) else names[:-1]
+    return names if not isinstance(base, StereoModel) or _has_orientation_noise(base) else names[:-1]
 
 
-def _moves(base: StereoModel) -> bool:
-    """Whether the model has noise of the orientation, which alone gives the factor a meaning."""
+def _has_orientation_noise(base: StereoModel) -> bool:
+    """Whether the model has orientation noise; without it the common factor has no effect."""
     orientation = base.noise.orientation
     return any(getattr(orientation, name).sigma > 0 for name in OrientationNoise.model_fields)
 
 
 def _bounds(base: Model, name: str) -> tuple[float, float]:
+    """Return the lower and upper bound of one parameter, or raise InputError if the model gives it no scale."""
     if not isinstance(base, StereoModel):
         return _BOUNDS[name]
     if name in _BOUNDS:
-        if name == ORIENTATION and not _moves(base):
+        if name == ORIENTATION and not _has_orientation_noise(base):
             raise InputError(
-                "the model has no noise of the orientation that a factor could change",
+                "the model has no orientation noise to scale",
                 where="calibration.fit",
-                remedy="give its sigmas, such as --set sensor=glendale_high",
+                remedy="set its sigmas, for example with --set sensor=glendale_high",
             )
         return _BOUNDS[name]
     sigma = getattr(base.noise.orientation, name.removeprefix(f"{ORIENTATION}.")).sigma
     if not sigma > 0:
-        raise InputError("its sigma in the model is 0, so there is no scale to seek it at", where=f"calibration.fit: {name}")
+        raise InputError("its sigma in the model is 0, so its scale is unknown", where=f"calibration.fit: {name}")
     return _OF_SIGMA[0] * sigma, _OF_SIGMA[1] * sigma

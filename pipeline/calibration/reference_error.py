@@ -1,4 +1,4 @@
-"""What the error of a reference that is made of points adds to differences from it, which is no noise of the instrument."""
+"""Simulate the error of a reference surface made of points: it adds to the differences, but is not noise of the instrument."""
 
 from __future__ import annotations
 
@@ -14,8 +14,14 @@ from scene.ray_casting.raycast import RayCaster
 
 @dataclass(frozen=True)
 class ReferenceError:
-    """sigma_m: standard deviation of each vertex along the sensor's rays; shared: whether points between the same vertices share
-    their errors, as they do of noise, not of relief between the vertices; eye: (3,) the sensor's place, wall frame, m."""
+    """Random error of the vertices of a reference surface.
+
+    Attributes
+    ----------
+    sigma_m : Standard deviation of each vertex along the sensor's rays, m.
+    shared : Whether points in one triangle share the vertices' errors: true for noise, false for relief between the vertices.
+    eye : (3,) position of the sensor, wall frame, m.
+    """
 
     sigma_m: float
     shared: bool
@@ -23,17 +29,27 @@ class ReferenceError:
 
     @classmethod
     def of(cls, measurement: Measurement) -> ReferenceError | None:
-        """Of a measurement whose reference is known to have one."""
+        """Return the error of a measurement's reference; None if it is unknown or zero."""
         if not isinstance(measurement, TlsMeasurement) or not measurement.reference_error_m:
             return None
         planes = measurement.planes
         return cls(measurement.reference_error_m, planes is None or planes.noise_dominates, measurement.viewpoint)
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Points (n, 3) at the distances that they have from a wall whose vertices are wrong; NaN stays.
+        """Shift points as if the wall's vertices had errors, so that their distances from the given wall contain these errors.
 
-        A range to the triangle between vertices with the weights w of its place is wrong by sum w e, as for `gap`; the point goes
-        along its ray by as much the other way.
+        With barycentric weights w of a point in its triangle, vertex errors e change the range to the triangle by sum w e, as in
+        `pipeline/gap`. The point is shifted by the opposite amount along its ray.
+
+        Parameters
+        ----------
+        points : (n, 3) points, wall frame, m; NaN stays NaN.
+        wall : The reference surface.
+        random : Source of the vertex errors.
+
+        Returns
+        -------
+        (n, 3) shifted points, m.
         """
         ray = points - self.eye
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)

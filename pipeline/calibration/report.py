@@ -1,4 +1,4 @@
-"""A calibration's report: the fitted noise, the measured epochs, and measured beside simulated maps."""
+"""Write the report of a calibration: the fitted noise, the measured epochs, and measured beside simulated maps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import yaml
 from matplotlib.figure import Figure
 from scipy import stats
 
-from pipeline.calibration.calibrate import Baseline, CalibrationResult
+from pipeline.calibration.calibrate import CalibrationResult, GreedyComparison
 from pipeline.calibration.parameters import ORIENTATION
 from pipeline.change.difference import statistics
 from pipeline.formats.files.atomic import write_text
@@ -22,14 +22,15 @@ from pipeline.report.plain_text import powers_of_ten
 from scene.geometry.mesh import FloatArray
 
 Pictures = Sequence[tuple[str, str, bytes]]
-"""Name of the file, caption, PNG."""
+"""File name, caption and PNG of each picture."""
 _MEASURED, _SIMULATED = FAMILY[:2]
 _COLOURS = "Red: rock is missing; blue: the surface stands further out; grey: no data; axes in m, wall frame."
 _SIGMAS = 3.0
+"""Range of the colour scale, in NMADs of the measured map."""
 _READ_IN = {"m": (" mm", 1e3), "rad": (" \N{MICRO SIGN}rad", 1e6), "px": (" px", 1.0), "ppm": (" ppm", 1.0)}
-"""Unit and factor by the suffix of a parameter's name."""
+"""Unit and factor for display, by the suffix of a parameter's name."""
 _LEAST_P = 0.01
-"""At or below which the model is said not to make such maps."""
+"""Significance level at or below which the report says that the model does not fit."""
 _INSTRUMENTS = {"stereo": "stereo pair", "tls": "laser scanner"}
 
 
@@ -41,7 +42,7 @@ class _Table:
 
 
 def summary(result: CalibrationResult) -> str:
-    """The result in a few lines of text."""
+    """Return the result as a few lines of text."""
     found = result.found
     lines = [f"{_maps(len(result.epochs))} of a {_INSTRUMENTS[result.sensor]}"]
     lines += [f"  {name:<26}{text}" for name, text in _values(result)]
@@ -51,81 +52,97 @@ def summary(result: CalibrationResult) -> str:
 
 
 def warnings(result: CalibrationResult) -> list[str]:
-    """What a reader has to know before using the values."""
-    found, error = result.found, result.material.reference_error
+    """Return sentences that a reader must know before using the values, such as inseparable parameters or a misfit."""
+    found, error = result.found, result.inputs.reference_error
     texts = []
     if error is not None:
         texts.append(
-            f"The reference is made of points that are off by {1e3 * error.sigma_m:.3g} mm each: that is simulated beside the "
-            "instrument's noise, and a wrong value goes into the range noise."
+            f"The reference is made of points with a standard deviation of {1e3 * error.sigma_m:.3g} mm. The simulation has "
+            "this error too; if the value is wrong, the fitted range noise is biased."
         )
     texts += [
-        f"{first} and {second} cannot be told apart by these maps (correlation {value:+.2f}): only their combination is known."
+        f"These maps cannot separate {first} from {second} (correlation {value:+.2f}); they determine only a combination."
         for first, second, value in result.inseparable()
     ]
     if found.misfit_p < _LEAST_P:
         worst = np.argsort(-np.abs(found.misfit))[:3]
         names = ", ".join(f"{result.statistics[place]} ({found.misfit[place]:+.1f} sigma)" for place in worst)
         texts.append(
-            f"The model cannot make such maps (p = {found.misfit_p:.3f}, below {_LEAST_P:g}); farthest off: {names}. "
-            "`scarpsim gap` may say why."
+            f"The model does not fit these maps (p = {found.misfit_p:.3f}, below {_LEAST_P:g}); largest misfits: {names}. "
+            "`scarpsim gap` may find the reason."
         )
     if not found.settled:
-        texts.append("The search did not settle: the values lie beyond the last simulations. Raise calibration.simulations.")
+        texts.append(
+            "The search did not converge: the values lie outside the last simulations. Increase calibration.simulations."
+        )
     low, high = np.log(result.parameters.low), np.log(result.parameters.high)
     for place, name in enumerate(result.parameters.names):
         if found.low[place] <= low[place] + 1e-6 or found.high[place] >= high[place] - 1e-6:
-            texts.append(f"{name} is not bounded by these maps: its interval ends where the search does.")
+            texts.append(f"These maps do not bound {name}: its interval ends at the limit of the search.")
     return texts
 
 
 def scale_m(result: CalibrationResult) -> float:
-    """NMAD of the last measured map in the windows, m: the scale of all maps."""
-    return max(statistics(result.windows.cut(result.material.maps[-1])).nmad, 1e-6)
+    """Return the NMAD of the last measured map in the windows, m, which scales the colours of all maps."""
+    return max(statistics(result.windows.cut(result.inputs.maps[-1])).nmad, 1e-6)
 
 
 def pictures(result: CalibrationResult, simulated: FloatArray | None) -> Pictures:
-    """All pictures. simulated: (h, w) a map of the whole wall, m, where there is one."""
-    material, sigma = result.material, scale_m(result)
-    none = np.zeros(material.grid.shape, dtype=np.int32)
+    """Draw all pictures of the report.
+
+    Parameters
+    ----------
+    result : The calibration.
+    simulated : (h, w) simulated map of the whole wall, m; None if there is none.
+    """
+    inputs, sigma = result.inputs, scale_m(result)
+    none = np.zeros(inputs.grid.shape, dtype=np.int32)
     shown: list[tuple[str, str, bytes]] = [
-        ("windows", "The last measured map and a simulated one in the windows that are compared, on one scale; white: no data.",
+        ("windows", "The last measured map and a simulated one in the compared windows, on one colour scale; white: no data.",
          _mosaics(result, sigma)),
-        ("measured", f"Measured: {material.names[-1]}, the whole map. {_COLOURS}",
-         difference_figure(material.maps[-1], material.grid, none, sigma, "Measured")),
+        ("measured", f"Measured: {inputs.names[-1]}, the whole map. {_COLOURS}",
+         difference_figure(inputs.maps[-1], inputs.grid, none, sigma, "Measured")),
     ]  # fmt: skip
     if simulated is not None:
-        caption = "Simulated with the calibrated noise by the whole simulation, on the same scale; no block falls in it."
-        shown.append(("simulated", caption, difference_figure(simulated, material.grid, none, sigma, "Simulated")))
-    mean = difference_figure(result.systematic, material.grid, none, sigma, "Mean over the epochs")
+        caption = "Full simulation with the calibrated noise and without rockfall, on the same colour scale."
+        shown.append(("simulated", caption, difference_figure(simulated, inputs.grid, none, sigma, "Simulated")))
+    mean = difference_figure(result.systematic, inputs.grid, none, sigma, "Mean over the epochs")
     shown.append(
         (
             "systematic",
-            "The systematic part: the mean of the measured maps over stable ground. It holds the reference's own errors.",
+            "The systematic part: the mean of the measured maps over stable ground. It contains errors of the reference.",
             mean,
         )
     )
     further = (
         (
             "distribution",
-            "Left: distribution of the differences in the windows. Right: their variogram, how much two pixels at a "
-            "distance differ.",
+            "Left: distribution of the differences in the windows. Right: their variogram, the difference of two pixels by "
+            "distance.",
             _size_and_variogram,
         ),
         (
             "statistics",
-            "All that is compared, measured (dots) over expected: size of the noise, variogram by distance, bending of the whole "
-            "wall, noise at edges and elsewhere, and by angle of incidence. Bars: two standard deviations of a simulated set.",
+            "All compared statistics, measured (dots) over expected: size of the noise, variogram by distance, bending of the "
+            "wall, noise at edges and elsewhere, and by incidence angle. Bars: two standard deviations of simulated maps.",
             _statistics,
         ),
-        ("epochs", "Median and standard deviation over the epochs; the line is their mean.", _over_time),
+        ("epochs", "Median and standard deviation of each epoch; the line is their mean.", _over_time),
     )
     shown += [(name, caption, picture(result)) for name, caption, picture in further]
     return shown
 
 
 def write_calibration_report(path: Path, result: CalibrationResult, shown: Pictures, config: Mapping[str, Any]) -> None:
-    """Write report.html, whole or not at all."""
+    """Write report.html, or nothing if it fails.
+
+    Parameters
+    ----------
+    path : File to write.
+    result : The calibration.
+    shown : Pictures from `pictures`.
+    config : The resolved config, which the page lists.
+    """
     page = template("calibration/report.html.jinja").render(
         title=f"Noise of a {_INSTRUMENTS[result.sensor]}, calibrated",
         answer=_answer(result),
@@ -143,23 +160,25 @@ def _maps(count: int) -> str:
 
 
 def _answer(result: CalibrationResult) -> str:
-    """The fitted values, for a reader who wants nothing else."""
+    """Return the fitted values with their intervals as one sentence."""
     values = [f"{result.parameters.meaning(name)}: {text}" for name, text in _values(result)]
     text = "; ".join(values)
     return f"{text[0].upper()}{text[1:]}; intervals of {percent(result.confidence, 0)}."
 
 
 def _sentence(result: CalibrationResult) -> str:
+    """Return the sentence on the maps, the size of their noise, and the effort of the search."""
     deviations = [each.size.standard_deviation * 1e3 for each in result.epochs]
-    ground = "drawn by the user" if result.material.drawn else "found by the program"
+    ground = "drawn by the user" if result.inputs.drawn else "found by the program"
     return (
         f"{_maps(len(deviations))}, standard deviation {np.mean(deviations):.1f} mm on average over stable ground "
-        f"{ground} ({percent(float(np.mean(result.material.stable)), 0)} of the map). Noise that gives the like was sought with "
+        f"{ground} ({percent(float(np.mean(result.inputs.stable)), 0)} of the map). The noise parameters were fitted with "
         f"{result.found.maps:,} simulated maps in {result.seconds:.0f} s."
     )
 
 
 def _values(result: CalibrationResult) -> list[tuple[str, str]]:
+    """Return each parameter's name, and its value and interval as text."""
     found = result.found
     columns = (np.exp(each) for each in (found.x, found.low, found.high))
     return [
@@ -169,7 +188,9 @@ def _values(result: CalibrationResult) -> list[tuple[str, str]]:
 
 
 def _with_interval(name: str, value: float, low: float, high: float) -> str:
-    """A parameter in the unit that people read it in; of the orientation the factor to the config's sigmas."""
+    """Format a value and its interval in the unit that people read it in; the orientation's is a factor of the
+    config's sigmas.
+    """
     unit, factor = _READ_IN.get(name.rpartition("_")[2], (" times the config's" if name == ORIENTATION else "", 1.0))
     return f"{factor * value:.4g}{unit}  ({factor * low:.4g} to {factor * high:.4g})"
 
@@ -181,7 +202,7 @@ def _tables(result: CalibrationResult) -> list[_Table]:
     tables = [
         _Table(f"Fitted values with intervals of {share}.", ["noise", "key", "value"], fitted),
         _Table(
-            "Correlations of the errors of the estimate: near 1 in magnitude, only a combination is known.",
+            "Correlations of the estimates' errors: near 1 in magnitude, the maps determine only a combination of the two.",
             ["", *names],
             _matrix(names, result.found.correlation),
         ),
@@ -189,8 +210,8 @@ def _tables(result: CalibrationResult) -> list[_Table]:
     ]
     if result.patterns is not None:
         caption = (
-            "Orientation: RMS of the map of one sigma in the left camera, mm, and cosines between the maps of two parameters "
-            "after registration: beyond 0.9 two parameters make the same pattern."
+            "Orientation: RMS of the map of a one-sigma error of the left camera, mm, and cosines between the maps of two "
+            "parameters after registration. Beyond 0.9, two parameters make the same pattern."
         )
         rows = _matrix(list(result.patterns.names), result.patterns.cosines)
         sized = [[row[0], f"{1e3 * size:.2f}", *row[1:]] for row, size in zip(rows, result.patterns.size_m, strict=True)]
@@ -200,18 +221,20 @@ def _tables(result: CalibrationResult) -> list[_Table]:
     return tables
 
 
-def _greedy(result: CalibrationResult, baseline: Baseline) -> _Table:
+def _greedy(result: CalibrationResult, baseline: GreedyComparison) -> _Table:
+    """Compare the costs of the greedy search and of this search in a table."""
     rows = [["one parameter at a time, by StD", str(baseline.result.tests), f"{baseline.cost:.0f}"]]
     rows += [
         [f"this search, after round {number}", str(maps), f"{cost:.0f}"] for number, (maps, cost) in enumerate(baseline.costs, 1)
     ]
-    caption = f"Two searches: cost of fresh simulations ({len(result.statistics)} statistics: that many is a perfect fit)."
+    caption = f"Two searches: cost from new simulations (a perfect fit has about {len(result.statistics)}, one per statistic)."
     if baseline.overtaken is not None:
-        caption += f" This search was nearer than the other's end after {_maps(baseline.overtaken)}."
+        caption += f" This search was nearer than the end of the other after {_maps(baseline.overtaken)}."
     return _Table(caption, ["search", "simulated maps", "cost"], rows)
 
 
 def _matrix(names: list[str], values: FloatArray) -> list[list[str]]:
+    """Return a matrix as table rows with signed numbers, each starting with its name."""
     return [[name, *(_signed(value) for value in row)] for name, row in zip(names, values, strict=True)]
 
 
@@ -220,6 +243,7 @@ def _signed(value: float) -> str:
 
 
 def _epochs(result: CalibrationResult) -> _Table:
+    """Describe the noise of each measured epoch, their mean and their trends in a table."""
     rows = []
     for each in result.epochs:
         p = each.normality.p_value
@@ -238,14 +262,15 @@ def _epochs(result: CalibrationResult) -> _Table:
         for name, found in (("median", result.median_trend), ("StD", result.std_trend))
         if found.per_epoch_m is not None and found.p_value is not None
     ]
-    caption = "The measured epochs over stable ground, mm; p: of a test for a normal distribution, of independent values alone. "
+    caption = "The measured epochs over stable ground, mm. p: test for a normal distribution, on independent values only. "
     caption += "Trend: " + ("; ".join(trends) if trends else "needs four epochs") + "."
     head = ["epoch", "median", "StD", "RMSE", "NMAD", "skewness", "excess kurtosis", "normal, p", "independent", "variogram"]
     return _Table(caption, head, rows)
 
 
 def _mosaics(result: CalibrationResult, sigma: float) -> bytes:
-    measured = result.windows.cut(result.material.maps[-1])
+    """Draw the measured and the simulated windows side by side."""
+    measured = result.windows.cut(result.inputs.maps[-1])
     figure = Figure(figsize=(11.0, 5.6), dpi=DPI, layout="constrained")
     for axes, windows, title in zip(figure.subplots(1, 2), (measured, result.predicted), ("Measured", "Simulated"), strict=True):
         image = axes.imshow(1e3 * _mosaic(windows), cmap="RdBu_r", vmin=-1e3 * _SIGMAS * sigma, vmax=1e3 * _SIGMAS * sigma)
@@ -258,7 +283,7 @@ def _mosaics(result: CalibrationResult, sigma: float) -> bytes:
 
 
 def _mosaic(windows: FloatArray) -> FloatArray:
-    """(k, n, n) windows as one picture with gaps, as square as may be."""
+    """Arrange (k, n, n) windows in one nearly square picture with gaps between them."""
     count, side = len(windows), windows.shape[1]
     columns = int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
@@ -270,9 +295,10 @@ def _mosaic(windows: FloatArray) -> FloatArray:
 
 
 def _size_and_variogram(result: CalibrationResult) -> bytes:
+    """Draw the distribution of the differences and their variogram, measured and simulated."""
     figure = Figure(figsize=(11.0, 4.2), dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
-    measured = np.concatenate([result.windows.cut(values).ravel() for values in result.material.maps])
+    measured = np.concatenate([result.windows.cut(values).ravel() for values in result.inputs.maps])
     sigma = 1e3 * statistics(measured).nmad
     edges = np.linspace(-6 * sigma, 6 * sigma, 121)
     for values, name, colour in ((measured, "measured", _MEASURED), (result.predicted, "simulated", _SIMULATED)):
@@ -307,6 +333,7 @@ def _size_and_variogram(result: CalibrationResult) -> bytes:
 
 
 def _statistics(result: CalibrationResult) -> bytes:
+    """Draw all summary statistics, measured over expected."""
     expected, scatter = result.found.surface.mean(result.found.x), np.sqrt(np.diag(result.found.surface.covariance))
     place = np.arange(len(expected))[::-1]
     figure = Figure(figsize=(11.0, 0.2 * len(expected) + 1.0), dpi=DPI, layout="constrained")
@@ -320,7 +347,7 @@ def _statistics(result: CalibrationResult) -> bytes:
 
 
 def _in_words(statistic: str) -> str:
-    """The name of a statistic (pipeline/calibration/signature.py) as a reader understands it."""
+    """Return the name of a summary statistic (pipeline/calibration/summary_statistics.py) in words."""
     group, name = statistic.split(".")
     if group == "variogram":
         return f"variogram at {name.removesuffix('px')} px"
@@ -328,6 +355,7 @@ def _in_words(statistic: str) -> str:
 
 
 def _over_time(result: CalibrationResult) -> bytes:
+    """Draw the median and the standard deviation of each epoch."""
     figure = Figure(figsize=(11.0, 3.2), dpi=DPI, layout="constrained")
     for axes, name, label in zip(
         figure.subplots(1, 2), ("median", "standard_deviation"), ("median, mm", "standard deviation, mm"), strict=True

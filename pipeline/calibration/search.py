@@ -1,22 +1,24 @@
-"""The search for noise parameters: which ones give simulated maps whose statistics are those of the measured maps.
+"""Search for the noise parameters whose simulated maps have the same summary statistics as the measured maps.
 
-The cost of parameters theta (their logarithms x) is the squared Mahalanobis distance of the statistics s (`signature`),
+The cost of parameters theta (their logarithms x) is the squared Mahalanobis distance of the statistics s (`summary_statistics`),
 
     J(x) = (s_obs - m(x))^T S^-1 (s_obs - m(x)),
 
-m the statistics' mean over simulations and S their covariance for so many epochs as were measured: indirect inference
-(Gourieroux, Monfort and Renault 1993), or a synthetic likelihood (Wood 2010). m is a quadratic polynomial fitted to simulations
-around the minimum, which rounds of simulations approach: the first over all bounds (Sobol points), each further one drawn
-around the last minimum with twice its covariance. J is minimised by SciPy's trust region (Branch, Coleman and Li 1999). A
-polynomial over all bounds can lead to where a parameter is too small to matter, and no way back shows there: a minimum that the
-misfit rejects is sought a second time from more points, and the better of the two is kept.
+with the mean m and the covariance S of the statistics over simulations of as many epochs as were measured. This is indirect
+inference (Gourieroux, Monfort and Renault 1993), or a synthetic likelihood (Wood 2010).
 
-Intervals. Every simulation of the last round is estimated like the measurement, by a surface that was fitted without it (five
-folds); what comes out minus what went in is the distribution of the estimate's error, bias included: a parametric bootstrap. To
-it is added, in quadrature, by how much the fast simulation in windows differs from the whole one (`MODEL_SIGMA`).
+m is a response surface: a quadratic polynomial fitted to simulations near the minimum. Rounds of simulations approach the
+minimum. The first covers all bounds (Sobol points); each later one draws around the last minimum with twice its standard
+deviations. J is minimised by SciPy's trust region method (Branch, Coleman and Li 1999). A polynomial over all bounds may lead to
+where a parameter is too small to matter, and the way out is then invisible. A minimum with a significant misfit is therefore
+searched for a second time, from more points, and the better of the two is kept.
 
-Where it fails: a parameter to which no statistic responds keeps the interval of its bounds; noise of another kind than the
-model's shows in `misfit_p`, the share of simulated sets that fit their own surface worse than the measurement does.
+Intervals come from a parametric bootstrap. Every simulation of the last round is estimated like the measurement, by a surface
+fitted without it (five folds). Estimate minus true value is the distribution of the estimate's error, bias included. The
+difference between the fast simulation in windows and the whole one (`MODEL_SIGMA`) is added in quadrature.
+
+Limits: a parameter to which no statistic responds gets an interval as wide as its bounds. Noise of another kind than the model's
+shows as a small `misfit_p`, the share of simulated sets that fit worse than the measurement does.
 """
 
 from __future__ import annotations
@@ -30,53 +32,72 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize, stats
 
-from pipeline.calibration.parameters import Parameters
+from pipeline.calibration.parameters import NoiseParameters
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
 MODEL_SIGMA = 0.003
-"""Standard deviation of the logarithm of a length that the simulation in windows gives against the whole simulation."""
+"""Standard deviation of the logarithmic ratio between lengths from the simulation in windows and from the whole simulation."""
 _FOLDS = 5
+"""Folds of the cross-validation that gives the errors of the estimate."""
 _APPROACHES = 3
+"""Rounds that approach the minimum, before the last round."""
 _MORE_ROUNDS = 2
+"""Largest number of repetitions of the last round, while the minimum lies outside its simulations."""
 _REJECTED = 0.01
+"""Significance level of the misfit below which the minimum is searched for a second time."""
 _DENSITIES = (1, 4)
-"""A minimum of misfit_p below `_REJECTED` is sought a second time, from four times as many points over all bounds."""
+"""Relative number of Sobol points over all bounds in the first and in the second search."""
 _WIDEN = 2.0
+"""Standard deviations of the drawn points over those of the estimate."""
 _LEAST_SPREAD = 0.03
+"""Smallest standard deviation of drawn points, in logarithms."""
 _SHRINK, _SHRINK_LIMITS = 0.5, (0.05, 0.9)
-"""Share of the diagonal in the covariance of the statistics, times their number over the degrees of freedom: few simulations know
-their variances, but not which combinations of them hardly vary."""
+"""Weight of the diagonal in the covariance of the statistics, per ratio of their number to the degrees of freedom, and its
+limits.
+
+Few simulations determine the variances, but not which combinations of statistics hardly vary.
+"""
 _LEAST_SETS = 30
-"""In a round of the approach."""
+"""Smallest number of simulated sets in a round of the approach."""
 OBSERVATION_S = 0.3
-"""What the plan of the progress takes for one simulated observation; a map is the difference of two."""
+"""Expected duration of one simulated observation, s, for the progress display; a map needs two."""
 
 Simulate = Callable[[FloatArray, int, KeyedRandom], FloatArray]
-"""Statistics (m,) of one set of epochs simulated with k parameter values."""
+"""A function of (k,) parameter values, a number of epochs and a random source that returns (m,) statistics of the
+simulated maps.
+"""
 
 
 @dataclass(frozen=True)
 class Simulations:
-    """Simulations: x (n, k) logarithms of the parameters, s (n, m) statistics."""
+    """Simulated statistics with their parameters: x (n, k) logarithms of the parameters, s (n, m) statistics."""
 
     x: FloatArray
     s: FloatArray
 
     def with_more(self, other: Simulations) -> Simulations:
+        """Append the simulations of another set."""
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
+        """Return the simulations of these rows (indices or a mask)."""
         return Simulations(self.x[rows], self.s[rows])
 
 
 @dataclass(frozen=True)
-class Surface:
-    """The mean of the statistics as a quadratic polynomial of z = (x - centre) / scale, and their scatter about it.
+class ResponseSurface:
+    """Response surface: the statistics' mean as a quadratic polynomial of z = (x - centre) / scale, and their covariance about
+    it.
 
-    coefficients: (terms, m); covariance: (m, m) of one simulated set; whitening: L^-1 with L L^T = covariance.
+    Attributes
+    ----------
+    centre, scale : (k,) mean and standard deviation of the logarithmic parameters it was fitted to.
+    coefficients : (terms, m) coefficients of the polynomial.
+    covariance : (m, m) covariance of the statistics of one simulated set.
+    whitening : (m, m) L^-1 with L L^T = covariance.
     """
 
     centre: FloatArray
@@ -86,8 +107,8 @@ class Surface:
     whitening: FloatArray
 
     @classmethod
-    def fit(cls, sample: Simulations) -> Surface:
-        """Least squares over a sample."""
+    def fit(cls, sample: Simulations) -> ResponseSurface:
+        """Fit the polynomial by least squares and estimate the covariance of its residuals, shrunk to the diagonal."""
         centre, scale = np.mean(sample.x, axis=0), np.maximum(np.std(sample.x, axis=0), 1e-6)
         design = _design((sample.x - centre) / scale)
         coefficients = np.asarray(np.linalg.lstsq(design, sample.s, rcond=None)[0], dtype=np.float64)
@@ -100,45 +121,64 @@ class Surface:
         return cls(centre, scale, coefficients, covariance, linalg.solve_triangular(factor, np.eye(len(factor)), lower=True))
 
     def mean(self, x: FloatArray) -> FloatArray:
-        """(m,) statistics to be expected of (k,) logarithms."""
+        """Return the (m,) expected statistics at (k,) logarithmic parameters."""
         return _design(((x - self.centre) / self.scale)[None])[0] @ self.coefficients
 
     def misfit(self, x: FloatArray, observed: FloatArray) -> FloatArray:
-        """(m,) whitened differences, whose squares add up to the cost."""
+        """Return the (m,) whitened residuals, whose squares add up to the cost."""
         return self.whitening @ (observed - self.mean(x))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """(m, k) of the whitened differences."""
+        """Return the (m, k) Jacobian of the whitened residuals."""
         return -self.whitening @ (_gradient((x - self.centre) / self.scale) @ self.coefficients).T / self.scale
 
     def minimum(self, observed: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """(k,) logarithms of least cost within bounds."""
+        """Minimise the cost within bounds.
+
+        Parameters
+        ----------
+        observed : (m,) statistics of the measurement.
+        start : (k,) logarithmic parameters to start at.
+        low, high : (k,) bounds.
+
+        Returns
+        -------
+        (k,) logarithmic parameters of least cost.
+        """
         found = optimize.least_squares(
             lambda x: self.misfit(x, observed), np.clip(start, low + 1e-9, high - 1e-9), lambda x: self.jacobian(x), (low, high)
         )
         return found.x
 
-    def spread(self, x: FloatArray) -> FloatArray:
-        """(k, k) covariance of the minimum, to first order."""
+    def covariance_at(self, x: FloatArray) -> FloatArray:
+        """Return the (k, k) covariance of the minimum, to first order."""
         jacobian = self.jacobian(x)
         return np.asarray(np.linalg.pinv(jacobian.T @ jacobian + 1e-6 * np.eye(len(x))), dtype=np.float64)
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a search found. All logarithms.
+class SearchResult:
+    """Result of a search; all parameters are natural logarithms.
 
-    x: (k,) the estimate, bias removed; low, high: (k,) of its interval; errors: (n, k) of the estimates of simulated sets;
-    correlation: (k, k) of these; surface: of the last round; cost: J at the minimum; misfit_p: see the module; misfit: (m,)
-    measured minus expected statistics in standard deviations; history: maps simulated and minimum, after each round;
-    settled: whether the minimum lies among the simulations of the last round.
+    Attributes
+    ----------
+    x : (k,) estimate, corrected for bias.
+    low, high : (k,) ends of its interval.
+    errors : (n, k) errors of the estimates of simulated sets.
+    surface : Response surface of the last round.
+    cost : Cost J at the minimum.
+    misfit_p : Share of simulated sets that fit worse than the measurement.
+    misfit : (m,) measured minus expected statistics, in standard deviations.
+    history : After each round, the number of maps simulated so far and the minimum.
+    maps : Number of simulated maps.
+    settled : Whether the search converged, that is, the minimum lies among the simulations of the last round.
     """
 
     x: FloatArray
     low: FloatArray
     high: FloatArray
     errors: FloatArray
-    surface: Surface
+    surface: ResponseSurface
     cost: float
     misfit_p: float
     misfit: FloatArray
@@ -148,17 +188,31 @@ class Found:
 
     @property
     def correlation(self) -> FloatArray:
-        """(k, k) of the errors of the estimate."""
+        """(k, k) correlation of the estimates' errors."""
         return np.atleast_2d(np.corrcoef(self.errors.T))
 
 
 class NoiseSearch:
-    """One search. simulate: see Simulate; epochs: of the measurement; random: keys the simulations by their number.
+    """Searches for the noise parameters of one measurement.
 
-    approached: (m,) statistics of every simulation in its order, with the number of maps simulated up to it.
+    Parameters
+    ----------
+    simulate : Simulates epochs and returns their statistics, see `Simulate`.
+    parameters : The parameters and their bounds.
+    epochs : Number of measured epochs.
+    random : Source of random numbers; the simulations are keyed by their number.
+    progress : Receives the progress.
+
+    Attributes
+    ----------
+    simulated, maps : Number of simulated sets and of simulated maps.
+    approached : For every simulation in order, the number of maps simulated so far and its (m,) statistics.
+    terms : Coefficients of the quadratic polynomial.
     """
 
-    def __init__(self, simulate: Simulate, parameters: Parameters, epochs: int, random: KeyedRandom, progress: Progress) -> None:
+    def __init__(
+        self, simulate: Simulate, parameters: NoiseParameters, epochs: int, random: KeyedRandom, progress: Progress
+    ) -> None:
         self.simulate, self.epochs, self.random, self.progress = simulate, epochs, random, progress
         self.parameters = parameters
         self.low, self.high = np.log(parameters.low), np.log(parameters.high)
@@ -167,8 +221,15 @@ class NoiseSearch:
         count = len(parameters.names)
         self.terms = 1 + count + count * (count + 1) // 2
 
-    def run(self, observed: FloatArray, simulations: int, confidence: float) -> Found:
-        """Approach the minimum and measure how well it is known. observed: (m,) statistics of the measurement."""
+    def run(self, observed: FloatArray, simulations: int, confidence: float) -> SearchResult:
+        """Find the minimum and its uncertainty, searching a second time if the misfit of the first minimum is significant.
+
+        Parameters
+        ----------
+        observed : (m,) statistics of the measurement.
+        simulations : Simulated sets in the last round.
+        confidence : Confidence level of the intervals.
+        """
         found = self._run_once(observed, simulations, confidence, _DENSITIES[0])
         for density in _DENSITIES[1:]:
             if found.misfit_p >= _REJECTED:
@@ -178,36 +239,41 @@ class NoiseSearch:
             found = replace(better, history=(*found.history, *again.history), maps=self.maps)
         return found
 
-    def _run_once(self, observed: FloatArray, simulations: int, confidence: float, density: int) -> Found:
+    def _run_once(self, observed: FloatArray, simulations: int, confidence: float, density: int) -> SearchResult:
+        """Approach the minimum, simulate the last round around it, and repeat that round while the minimum lies outside of it."""
         last = OBSERVATION_S * (self.epochs + 1) * simulations
         self.progress.plan({f"round {number}": 2 * OBSERVATION_S * self._round_size for number in range(2, _APPROACHES + 1)})
         self.progress.plan({"round 1": 2 * OBSERVATION_S * self._first_size(density), "last round": last})
-        x, spread, history = self._approach(observed, density)
+        x, covariance, history = self._approach(observed, density)
         for attempt in range(1 + _MORE_ROUNDS):
             stage = f"last round{' again' * attempt}"
             self.progress.plan({stage: last})
             with self.progress.stage(stage):
-                sample = self._sample(self._around(x, spread, simulations), self.epochs)
-            surface = Surface.fit(sample)
+                sample = self._sample(self._around(x, covariance, simulations), self.epochs)
+            surface = ResponseSurface.fit(sample)
             minimum = surface.minimum(observed, _nearest(surface, sample, observed), self.low, self.high)
             history.append((self.maps, minimum))
             inside = bool(np.abs((minimum - sample.x.mean(axis=0)) / sample.x.std(axis=0)).max() < _WIDEN)
-            x, spread = minimum, surface.spread(minimum)
+            x, covariance = minimum, surface.covariance_at(minimum)
             if inside:
                 break
-        return self._judged(observed, sample, surface, minimum, confidence, tuple(history), inside)
+        return self._with_interval_and_fit(observed, sample, surface, minimum, confidence, tuple(history), inside)
 
     @property
     def _round_size(self) -> int:
-        """Simulated sets of a round of the approach."""
+        """Simulated sets in a round of the approach."""
         return max(3 * self.terms, _LEAST_SETS)
 
     def _first_size(self, density: int) -> int:
-        """Simulated sets of the first round, Sobol points over all bounds: a power of 2."""
+        """Return the number of simulated sets in the first round: a power of 2, as Sobol points need."""
         return int(2 ** np.ceil(np.log2(density * self._round_size)))
 
     def _approach(self, observed: FloatArray, density: int) -> tuple[FloatArray, FloatArray, list[tuple[int, FloatArray]]]:
-        """Rounds with one later epoch, which is enough for the mean of the statistics; density: of the first round's points."""
+        """Approach the minimum in rounds.
+
+        The sets have one later epoch each, which suffices for the mean of the statistics. Returns the minimum, its covariance and
+        the history.
+        """
         size = self._round_size
         generator = np.random.default_rng(self.random.child("sobol").key)
         sobol = stats.qmc.Sobol(len(self.low), rng=generator).random(self._first_size(density))
@@ -217,31 +283,31 @@ class NoiseSearch:
             with self.progress.stage(f"round {number + 1}"):
                 sample = sample.with_more(self._sample(points, 1))
             near = sample.at(np.argsort(_distance(sample.s, observed))[:size])
-            surface = Surface.fit(near)
+            surface = ResponseSurface.fit(near)
             x = surface.minimum(observed, near.x[0], self.low, self.high)
-            x = np.clip(x, near.x.min(axis=0), near.x.max(axis=0))  # a polynomial holds where it was fitted
+            x = np.clip(x, near.x.min(axis=0), near.x.max(axis=0))  # a polynomial does not extrapolate
             history.append((self.maps, x))
-            spread = surface.spread(x)
+            covariance = surface.covariance_at(x)
             if number < _APPROACHES - 1:
-                spread = spread + np.diag(near.x[: self.terms].var(axis=0)) / 4
-                points = self._around(x, spread, size)
-        return x, spread, history
+                covariance = covariance + np.diag(near.x[: self.terms].var(axis=0)) / 4
+                points = self._around(x, covariance, size)
+        return x, covariance, history
 
-    def _around(self, x: FloatArray, spread: FloatArray, count: int) -> FloatArray:
-        """(count, k) points drawn around x with twice the standard deviations, within the bounds."""
+    def _around(self, x: FloatArray, covariance: FloatArray, count: int) -> FloatArray:
+        """Draw (count, k) points around x with twice the standard deviations of `covariance`, reflected into the bounds."""
         widest = (self.high - self.low) / 4
-        sigma = np.sqrt(np.diag(spread))
+        sigma = np.sqrt(np.diag(covariance))
         limited = np.clip(_WIDEN * sigma, _LEAST_SPREAD, widest) / np.maximum(sigma, 1e-12)
-        covariance = spread * np.outer(limited, limited)
+        spread = covariance * np.outer(limited, limited)
         draws = self.random.child("points", self.simulated).generator()
-        normal = draws.multivariate_normal(np.zeros(len(x)), covariance, count, check_valid="ignore")
+        normal = draws.multivariate_normal(np.zeros(len(x)), spread, count, check_valid="ignore")
         mirrored = x + normal
         mirrored = np.where(mirrored < self.low, 2 * self.low - mirrored, mirrored)
         mirrored = np.where(mirrored > self.high, 2 * self.high - mirrored, mirrored)
         return np.clip(mirrored, self.low, self.high)
 
     def _sample(self, points: FloatArray, epochs: int) -> Simulations:
-        """Simulate; points at which the pipeline gives up, as noise leaves nothing to register, drop out."""
+        """Simulate at each point; leave out points where the pipeline fails because noise leaves nothing to register."""
         used, found = [], []
         for number, x in enumerate(points):
             with suppress(InputError):
@@ -252,25 +318,25 @@ class NoiseSearch:
             self.maps += epochs
             self.progress.advance((number + 1) / len(points))
         if len(found) < len(points) / 2:
-            raise InputError("most simulations fail", where="calibration", remedy="simulate the site once to see why")
+            raise InputError("most simulations failed", where="calibration", remedy="run simulate on the site to see why")
         return Simulations(np.array(used), np.array(found))
 
-    def _judged(
+    def _with_interval_and_fit(
         self,
         observed: FloatArray,
         sample: Simulations,
-        surface: Surface,
+        surface: ResponseSurface,
         minimum: FloatArray,
         confidence: float,
         history: tuple[tuple[int, FloatArray], ...],
         settled: bool,
-    ) -> Found:
-        """The estimate with its interval from the errors of simulated sets, and how well the model fits at all."""
+    ) -> SearchResult:
+        """Compute the estimate's interval and the p-value of the misfit, from estimates of the simulated sets."""
         errors, costs = np.empty_like(sample.x), np.empty(len(sample.x))
         fold = np.arange(len(sample.x)) % _FOLDS
         for number in range(_FOLDS):
             kept = sample.at(fold != number)
-            without = Surface.fit(kept)
+            without = ResponseSurface.fit(kept)
             for row in np.flatnonzero(fold == number):
                 own = without.minimum(sample.s[row], _nearest(without, kept, sample.s[row]), self.low, self.high)
                 errors[row] = own - sample.x[row]
@@ -282,11 +348,26 @@ class NoiseSearch:
         x = np.clip(minimum - bias, self.low, self.high)
         scaled = (observed - surface.mean(minimum)) / np.sqrt(np.diag(surface.covariance))
         low, high = np.clip(x - half, self.low, self.high), np.clip(x + half, self.low, self.high)
-        return Found(x, low, high, errors, surface, cost, float(np.mean(costs >= cost)), scaled, history, self.maps, settled)
+        return SearchResult(
+            x, low, high, errors, surface, cost, float(np.mean(costs >= cost)), scaled, history, self.maps, settled
+        )
 
 
-def fresh_cost(search: NoiseSearch, surface: Surface, observed: FloatArray, x: FloatArray, sets: int = 4) -> float:
-    """The cost of parameters by sets simulated anew: of their mean, less what the sets' own scatter adds."""
+def cost_of_new_simulations(
+    search: NoiseSearch, surface: ResponseSurface, observed: FloatArray, x: FloatArray, sets: int = 4
+) -> float:
+    """Estimate the cost of parameters from new simulations.
+
+    It is the cost of their mean statistics, corrected for the scatter of that mean.
+
+    Parameters
+    ----------
+    search : Gives the simulator and the number of epochs.
+    surface : Gives the covariance of the statistics.
+    observed : (m,) statistics of the measurement.
+    x : (k,) logarithmic parameters.
+    sets : Number of simulated sets.
+    """
     source = replace(search.random, path=(*search.random.path, "fresh"))
     values = search.parameters.values(x)
     drawn = np.array([search.simulate(values, search.epochs, source.child(number)) for number in range(sets)])
@@ -295,23 +376,25 @@ def fresh_cost(search: NoiseSearch, surface: Surface, observed: FloatArray, x: F
 
 
 def _distance(s: FloatArray, observed: FloatArray) -> FloatArray:
-    """(n,) of simulated statistics to the observed ones, in units of the logarithms' own size: before any scatter is known."""
+    """Return the (n,) RMS differences of simulated from observed statistics, unweighted, for use before their covariance is
+    known.
+    """
     return np.sqrt(np.mean((s - observed) ** 2, axis=1))
 
 
-def _nearest(surface: Surface, sample: Simulations, observed: FloatArray) -> FloatArray:
-    """The parameters of the simulation whose statistics are nearest."""
+def _nearest(surface: ResponseSurface, sample: Simulations, observed: FloatArray) -> FloatArray:
+    """Return the parameters of the simulation whose statistics are nearest to the observed ones."""
     return sample.x[np.argmin(np.sum((surface.whitening @ (sample.s - observed).T) ** 2, axis=0))]
 
 
 def _design(z: FloatArray) -> FloatArray:
-    """(n, terms) 1, z_i, z_i z_j."""
+    """Return the (n, terms) design matrix of 1, z_i and z_i z_j."""
     i, j = np.triu_indices(z.shape[1])
     return np.concatenate([np.ones((len(z), 1)), z, z[:, i] * z[:, j]], axis=1)
 
 
 def _gradient(z: FloatArray) -> FloatArray:
-    """(k, terms) derivatives of one row of `_design`."""
+    """Return the (k, terms) derivatives of one row of `_design`."""
     k = len(z)
     i, j = np.triu_indices(k)
     unit = np.eye(k)

@@ -1,4 +1,4 @@
-"""The windows in which measured and simulated difference maps are compared, and the stable ground that they lie on."""
+"""Find the stable ground of difference maps, and choose the windows in which measured and simulated maps are compared."""
 
 from __future__ import annotations
 
@@ -17,16 +17,28 @@ from scene.geometry.mesh import FloatArray, IntArray
 
 BoolArray = NDArray[np.bool_]
 _LEAST_STABLE = 0.6
-"""Share of a window's pixels that have to be stable and known in every map."""
+"""Share of a window's pixels that must be stable and have data in every map."""
 _CHANGE_NMADS = 4.0
+"""Deviation, in NMADs, beyond which a cell or a pixel may be a change."""
 _CHANGE_CELL_PX = 5
+"""Side of a cell, pixels."""
 _CHANGE_LEAST_CELLS = 3
+"""Adjacent cells that make a change."""
 _BACKGROUND_CELLS = 15
+"""Side of the median filter that gives the background, cells."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """k square windows of side n on a raster. corner: (k, 2) row and column of their first pixels; stable: (k, n, n) bool."""
+    """k square windows with n pixels a side on a raster.
+
+    Attributes
+    ----------
+    grid : The raster.
+    corner : (k, 2) row and column of each window's first pixel.
+    side : n, pixels.
+    stable : (k, n, n) true on stable ground.
+    """
 
     grid: Grid
     corner: IntArray
@@ -34,12 +46,12 @@ class Windows:
     stable: BoolArray
 
     def cut(self, raster: NDArray[np.floating]) -> FloatArray:
-        """(k, n, n) of a raster (h, w), NaN where it is not stable."""
+        """Cut the windows (k, n, n) out of a raster (h, w), with NaN outside stable ground."""
         cut = np.stack([raster[row : row + self.side, column : column + self.side] for row, column in self.corner])
         return np.where(self.stable, cut, np.nan)
 
     def places(self) -> tuple[FloatArray, FloatArray]:
-        """(k, n, n) x and y of the pixels' centres, wall frame, m."""
+        """Return the x and y of the pixels' centres, wall frame, m: (k, n, n) each."""
         row = self.corner[:, 0, None, None] + np.arange(self.side)[None, :, None] + 0.5
         column = self.corner[:, 1, None, None] + np.arange(self.side)[None, None, :] + 0.5
         shape = (len(self.corner), self.side, self.side)
@@ -47,17 +59,17 @@ class Windows:
         return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
 
     def centres(self) -> FloatArray:
-        """(k, 2) x and y of the windows' middles, wall frame, m."""
+        """Return the (k, 2) x and y of the windows' centres, wall frame, m."""
         middle = self.corner + self.side / 2
         return np.stack([self.grid.x_min + middle[:, 1] * self.grid.gsd, self.grid.y_max - middle[:, 0] * self.grid.gsd], axis=1)
 
 
-def unchanged(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
-    """(h, w) where no map shows a change: what the program takes as stable where nobody drew it.
+def stable_ground(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
+    """Return the (h, w) mask of ground where no map shows a change, for use where the user drew no stable areas.
 
-    Medians over cells of 5 x 5 pixels, less their median over 15 x 15 cells, are compared with four of their NMADs; three or more
-    cells side by side that exceed it are a change, with a cell's margin around them; so are compact places of single pixels that
-    exceed four NMADs of all pixels. Single gross errors are not, nor thin strips along edges: they are noise.
+    Medians of cells of 5 x 5 pixels, minus their median over 15 x 15 cells, are compared with four of their NMADs. Three or more
+    adjacent cells that exceed it are a change, with a margin of one cell. So are compact patches of pixels that exceed four NMADs
+    of all pixels. Single gross errors, and thin strips along edges, count as noise.
     """
     stable = np.ones(maps[0].shape, dtype=bool)
     for values in maps:
@@ -78,7 +90,9 @@ def unchanged(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
 
 
 def _compact(values: NDArray[np.floating], background: FloatArray) -> BoolArray:
-    """(h, w) places of 3 x 3 or more pixels of one sign that all exceed the limit, with a margin of two pixels."""
+    """Return the (h, w) mask of patches, 3 x 3 pixels or larger, of one sign that all exceed the limit, with a margin of two
+    pixels.
+    """
     behind = np.repeat(np.repeat(background, _CHANGE_CELL_PX, axis=0), _CHANGE_CELL_PX, axis=1)
     departure = values - behind[: values.shape[0], : values.shape[1]]
     limit = _CHANGE_NMADS * statistics(departure).nmad
@@ -89,7 +103,7 @@ def _compact(values: NDArray[np.floating], background: FloatArray) -> BoolArray:
 
 
 def _cell_medians(values: NDArray[np.floating]) -> FloatArray:
-    """Medians of what is known in cells of some pixels; NaN where less than half is."""
+    """Return the medians of cells of 5 x 5 pixels; NaN where fewer than half of a cell's pixels have data."""
     rows, columns = (-(-size // _CHANGE_CELL_PX) * _CHANGE_CELL_PX for size in values.shape)
     padded = np.full((rows, columns), np.nan, dtype=np.float32)
     padded[: values.shape[0], : values.shape[1]] = values
@@ -101,15 +115,26 @@ def _cell_medians(values: NDArray[np.floating]) -> FloatArray:
 
 
 def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -> Windows:
-    """Windows spread evenly over the ground that is stable and known in all maps.
+    """Choose windows spread evenly over the ground that is stable and has data in all maps.
 
-    Of all places on a lattice of half a window that are stable enough, the first is the most stable and each further one the one
-    farthest from those before it (Gonzalez 1985), so that they reach the wall's ends, where deformations show.
+    The candidates lie on a lattice of half a window. The first window is the most stable one; each next one is the farthest from
+    those already chosen (Gonzalez 1985). The windows thus reach the ends of the wall, where deformations are largest.
+
+    Parameters
+    ----------
+    stable : (h, w) true on stable ground with data.
+    grid : The raster.
+    settings : Number and size of the windows.
+
+    Raises
+    ------
+    InputError
+        If the maps are smaller than a window, or no window is stable enough.
     """
     side = settings.window_px
     if min(grid.shape) < side:
         raise InputError(
-            f"the maps have {grid.height} x {grid.width} pixels",
+            f"a window of {side} pixels does not fit the maps of {grid.height} x {grid.width} pixels",
             where="calibration.window_px",
             allowed=f"up to {min(grid.shape)}",
         )
@@ -122,7 +147,7 @@ def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -
     row, column, share = row[good], column[good], share[good]
     if len(row) == 0:
         raise InputError(
-            f"no window of {side} x {side} pixels is stable and known in all maps",
+            f"no window of {side} x {side} pixels is stable and has data in all maps",
             where="calibration.stable_areas, calibration.window_px",
             remedy="draw larger areas, or take smaller windows or fewer maps",
         )

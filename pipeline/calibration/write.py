@@ -1,4 +1,4 @@
-"""The folder that `scarpsim calibrate` fills: calibrated.yaml, calibration.json, pictures and report.html."""
+"""Write the folder of a calibration: calibrated.yaml, calibration.json, pictures and report.html."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibration.calibrate import Baseline, CalibrationResult
-from pipeline.calibration.maps import noise_map
+from pipeline.calibration.calibrate import CalibrationResult, GreedyComparison
+from pipeline.calibration.noise_map import noise_map
 from pipeline.calibration.report import pictures, scale_m, write_calibration_report
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
@@ -26,20 +26,38 @@ MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "r
 
 
 def write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> Path:
-    """Write everything; returns the report's path. The folder appears when all of it is there; InputError where it is in use."""
+    """Write the result folder; it appears only when everything is in it.
+
+    Parameters
+    ----------
+    out : Folder to write.
+    config : The resolved config.
+    result : The calibration.
+    inputs : Paths that the maps were read from, for the record.
+
+    Returns
+    -------
+    Path of the report.
+
+    Raises
+    ------
+    InputError
+        If the folder is in use.
+    """
     with filling(out) as folder:
         _write(folder, config, result, inputs)
     return out / REPORT_FILE
 
 
 def _write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> None:
+    """Write all files into a folder."""
     write_text(out / MODEL_FILE, model_yaml(result))
     limit = SCALE_SIGMAS * scale_m(result)
-    write_geotiff(out / "systematic.tif", result.systematic, result.material.grid, description="mean of the measured maps")
+    write_geotiff(out / "systematic.tif", result.systematic, result.inputs.grid, description="mean of the measured maps")
     difference_style(out / "systematic.tif", limit)
-    whole = None if result.material.of_points else _whole_map(config, result)
+    whole = None if result.inputs.of_points else _whole_map(config, result)
     if whole is not None:
-        write_geotiff(out / "simulated.tif", whole, result.material.grid, description="simulated with the calibrated noise")
+        write_geotiff(out / "simulated.tif", whole, result.inputs.grid, description="simulated with the calibrated noise")
         difference_style(out / "simulated.tif", limit)
     shown = pictures(result, whole)
     for name, _, png in shown:
@@ -50,15 +68,15 @@ def _write(out: Path, config: SimulationConfig, result: CalibrationResult, input
 
 
 def _whole_map(config: SimulationConfig, result: CalibrationResult) -> FloatArray:
-    """One map of the whole wall by the whole simulation, on the measured maps' grid, m; NaN where those have no data."""
+    """Simulate one map of the whole wall on the measured maps' grid, m; NaN where those have no data."""
     site = result.simulated_site()
     random = KeyedRandom(config.seed).child("calibrate", "whole")
-    values = noise_map(config, site, site, RayCaster(site.mesh), random, result.material.grid)
-    return np.where(np.isnan(result.material.maps[-1]), np.float32(np.nan), values)
+    values = noise_map(config, site, site, RayCaster(site.mesh), random, result.inputs.grid)
+    return np.where(np.isnan(result.inputs.maps[-1]), np.float32(np.nan), values)
 
 
 def model_yaml(result: CalibrationResult) -> str:
-    """The calibrated sensor model as `simulate --set sensor=calibrated.yaml` reads it, each fitted value with its interval."""
+    """Return the calibrated sensor model as YAML for `simulate --set sensor=calibrated.yaml`, with the intervals as comments."""
     found, names = result.found, result.parameters.names
     share = result.confidence
     lines = [f"# Calibrated on {len(result.epochs)} difference map(s) by scarpsim calibrate; intervals of {100 * share:.0f} %."]
@@ -68,7 +86,7 @@ def model_yaml(result: CalibrationResult) -> str:
 
 
 def _yaml(values: dict[str, Any], depth: int) -> str:
-    """Nested mappings as block YAML; anything else on one line."""
+    """Format nested mappings as block YAML, and anything else on one line."""
     text = ""
     for key, value in values.items():
         if isinstance(value, dict) and value:
@@ -79,7 +97,7 @@ def _yaml(values: dict[str, Any], depth: int) -> str:
 
 
 def _rounded(value: Any) -> Any:
-    """The same with numbers of six digits; spreads of mean 0 as the number alone."""
+    """Round all numbers to six digits, and write orientation errors of mean 0 as their sigma alone."""
     if isinstance(value, dict):
         if set(value) == {"mean", "sigma"} and value["mean"] == 0:
             return _rounded(value["sigma"])
@@ -90,14 +108,14 @@ def _rounded(value: Any) -> Any:
 
 
 def to_dict(result: CalibrationResult) -> dict[str, Any]:
-    """The result as calibration.json holds it."""
+    """Return the result as `calibration.json` holds it."""
     found, names = result.found, result.parameters.names
     values = zip(names, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True)
     scatter = np.sqrt(np.diag(found.surface.covariance))
     expected = found.surface.mean(found.x)
     return {
         "sensor": result.sensor,
-        "reference_error_m": 0.0 if result.material.reference_error is None else result.material.reference_error.sigma_m,
+        "reference_error_m": 0.0 if result.inputs.reference_error is None else result.inputs.reference_error.sigma_m,
         "parameters": {name: {"value": value, "low": low, "high": high} for name, value, low, high in values},
         "confidence": result.confidence,
         "correlation": {"names": names, "matrix": found.correlation},
@@ -113,8 +131,8 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
         "epochs": [each.to_dict() for each in result.epochs],
         "trend": {"median": result.median_trend.to_dict(), "standard_deviation": result.std_trend.to_dict()},
         "stable": {
-            "drawn": result.material.drawn,
-            "share": float(np.mean(result.material.stable)),
+            "drawn": result.inputs.drawn,
+            "share": float(np.mean(result.inputs.stable)),
             "windows": len(result.windows.corner),
             "window_px": result.windows.side,
         },
@@ -128,7 +146,8 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _baseline(result: CalibrationResult, baseline: Baseline) -> dict[str, Any]:
+def _baseline(result: CalibrationResult, baseline: GreedyComparison) -> dict[str, Any]:
+    """Return the greedy search's part of `calibration.json`."""
     return {
         "parameters": dict(zip(result.parameters.names, np.exp(baseline.result.x), strict=True)),
         "simulated_maps": baseline.result.tests,

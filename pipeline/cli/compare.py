@@ -62,11 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.comparison.comparison import compare_sensors
     from pipeline.comparison.report import COMPARISON_FILE, summary, write_comparison
-    from pipeline.comparison.sensors_compared import contestants
+    from pipeline.comparison.sensor_setups import sensor_setups
     from pipeline.formats.files.atomic import empty_folder, new_folder
     from pipeline.report.progress import shown_progress
 
-    sensors = contestants(arguments.configs, arguments.overrides, arguments.seed, own_step=arguments.own_step)
+    sensors = sensor_setups(arguments.configs, arguments.overrides, arguments.seed, own_step=arguments.own_step)
     out = empty_folder(arguments.out or new_folder(Path("runs"), "compare"))
     sizes = tuple(arguments.sizes_m) if arguments.blocks == "sweep" else None
     with shown_progress(quiet=arguments.quiet) as progress:

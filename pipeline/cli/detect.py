@@ -47,11 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Answer:
     from pipeline.cli.train import load_keras
-    from pipeline.detection.products.run import BASELINE, CONFIDENCES, checked_confidences, detect
+    from pipeline.detection.products.run import BASELINE, CONFIDENCES, detect, sorted_confidences
     from pipeline.formats.files.atomic import check_place, new_folder
     from pipeline.report.progress import shown_progress
 
-    confidences = checked_confidences(arguments.confidence or CONFIDENCES)
+    confidences = sorted_confidences(arguments.confidence or CONFIDENCES)
     out = arguments.out or new_folder(Path("runs"), "detect")
     check_place(out)
     if arguments.model != BASELINE:

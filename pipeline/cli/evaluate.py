@@ -44,11 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.detection.products.run import CONFIDENCES, checked_confidences
+    from pipeline.detection.products.run import CONFIDENCES, sorted_confidences
     from pipeline.detection.products.score_files import as_text, assess, write
     from pipeline.formats.files.atomic import check_place
 
-    confidences = checked_confidences(arguments.confidence or CONFIDENCES)
+    confidences = sorted_confidences(arguments.confidence or CONFIDENCES)
     if arguments.out:
         check_place(arguments.out)
     kinds: tuple[Overlap, ...] = ("segm", "bbox") if arguments.iou == "both" else (arguments.iou,)

@@ -81,9 +81,9 @@ def _check_training(out: Path) -> None:
 
 def load_keras(*, quiet: bool) -> None:
     """Import Keras and its backend, and say before that this is what takes so long."""
-    from pipeline.detection.network.keras_backend import check_installed, keras_ready
+    from pipeline.detection.network.keras_backend import check_installed, import_keras
 
     backend = check_installed()
     if not quiet:
         print(f"loading {backend}, ten seconds and more", file=sys.stderr, flush=True)
-    keras_ready()
+    import_keras()

@@ -1,5 +1,4 @@
-"""Compare sensors on the same wall and the same blocks: noise maps and the share of blocks each detects (`scarpsim compare`).
+"""Compare sensors on the same wall and the same blocks: their noise, and which blocks each detects (`scarpsim compare`).
 
-Planning one survey is the work of `pipeline/planning`.
-Start with `comparison.py`.
+Planning a single survey is the task of `pipeline/planning`. Start with `comparison.py`.
 """

@@ -1,4 +1,6 @@
-"""The figures of a comparison: noise, level of detection, blocks seen, completeness, of each sensor and of measured epochs."""
+"""Compute the results of a comparison for each sensor and for measured epochs: noise, level of detection, detected blocks and
+completeness.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +13,16 @@ from numpy.typing import NDArray
 from pipeline.change.difference import DifferenceStatistics, statistics
 from pipeline.comparison.detection import (
     LEAST_CELL_PIXELS,
-    BlockSeen,
-    MeanTest,
-    blocks_seen,
+    BlockDetection,
+    BlockMeanTest,
+    detect_blocks,
     false_alarms,
     footprints,
     level_of_detection,
     wilson_interval,
 )
 from pipeline.comparison.detection_curve import DetectionCurve, detection_curve
-from pipeline.comparison.trial import Seen, Trial
+from pipeline.comparison.trial import SensorObservations, Trial
 from pipeline.noise.measured import MeasuredMaps
 from pipeline.noise.statistics import (
     Bin,
@@ -42,20 +44,30 @@ from scene.geometry.mesh import FloatArray
 Raster = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 _CELL_M = 0.5
-"""Cells of the level of detection."""
+"""Side of the cells for which the level of detection is computed, m."""
 _MOST_BINNED = 4_000_000
-"""Differences that are sorted by a covariate; of more a regular part is taken."""
+"""Largest number of differences sorted into bins of a covariate; of more, a regular subsample is used."""
 _VARIOGRAM_MAPS = 4
+"""Number of epochs that the variogram is computed from."""
 _EDGE_STEPS_PX = (0, 1, 2, 4, 8, 16, 32, 64)
+"""Bin edges of the distance from rock edges, pixels."""
 _SIZE_CLASSES = 8
+"""Number of classes of block size and of block depth."""
 
 
 @dataclass(frozen=True)
 class MapNoise:
-    """The noise of a stack of difference maps over stable ground.
+    """Noise of a stack of difference maps over stable ground.
 
-    stable: pooled over the epochs; per_epoch; tails, normality, histogram: of all; variogram, model: of the differences within
-    five NMAD; effective: independent pixels of the first map's stable ground, of `pixels`; level: (h, w) level of detection, m.
+    Attributes
+    ----------
+    stable : Statistics pooled over the epochs.
+    per_epoch : Statistics of each epoch.
+    tails, normality, histogram : Shape of the distribution.
+    variogram, model : Empirical variogram of the differences within five NMAD, and the fitted model.
+    effective : Number of independent pixels on the first map's stable ground, which has `pixels` pixels.
+    pixels : Stable pixels of the first map.
+    level : (h, w) level of detection of a pixel, m.
     """
 
     stable: DifferenceStatistics
@@ -71,12 +83,12 @@ class MapNoise:
 
     @property
     def median_level_m(self) -> float | None:
-        """Median over the map of the level of detection of a pixel, m; None where there is none."""
+        """Median over the map of a pixel's level of detection, m; None if no pixel has one."""
         known = self.level[~np.isnan(self.level)]
         return float(np.median(known)) if known.size else None
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the content as `comparison.json` holds it."""
         return {
             "stable": self.stable.to_dict(),
             "per_epoch": [each.to_dict() for each in self.per_epoch],
@@ -91,11 +103,15 @@ class MapNoise:
 
 
 @dataclass(frozen=True)
-class SizeInterval:
-    """Blocks whose size (or depth) lies in [low_m, high_m).
+class DetectionClass:
+    """Detection of the blocks whose size (or depth) lies in [low_m, high_m).
 
-    interval: 95 %, of the share seen; volume_error, volume_spread: median and NMAD of measured over true volume minus one, None
-    without blocks.
+    Attributes
+    ----------
+    low_m, high_m : Limits of the class, m.
+    blocks, seen : Number of blocks, and of those detected.
+    interval : 95 % confidence interval of the share detected.
+    volume_error, volume_spread : Median and NMAD of measured over true volume minus 1; None without blocks.
     """
 
     low_m: float
@@ -107,7 +123,7 @@ class SizeInterval:
     volume_spread: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON and CSV hold it."""
+        """Return the content as JSON and CSV hold it."""
         return {
             "low_m": self.low_m,
             "high_m": self.high_m,
@@ -121,24 +137,29 @@ class SizeInterval:
 
 
 @dataclass(frozen=True)
-class SeenBlocks:
-    """The blocks and how many were seen.
+class DetectionSummary:
+    """Which of the fallen blocks a sensor detected.
 
-    by_size, by_depth: curves over the blocks in view, None for fewer than ten, and classes of them; table: shares seen of them,
-    (sizes, depths), NaN without blocks; alarms of trials: footprints on stable ground that were taken for blocks.
+    Attributes
+    ----------
+    blocks : All blocks.
+    by_size, by_depth : Detection curves of the blocks in view; None for fewer than ten.
+    size_classes, depth_classes : The blocks in view by classes of size and of depth.
+    table : (sizes, depths) share detected by class of both; NaN without blocks.
+    alarms, trials : False alarms: of `trials` footprints placed on stable ground, `alarms` were taken for blocks.
     """
 
-    blocks: list[BlockSeen]
+    blocks: list[BlockDetection]
     by_size: DetectionCurve | None
     by_depth: DetectionCurve | None
-    size_classes: list[SizeInterval]
-    depth_classes: list[SizeInterval]
+    size_classes: list[DetectionClass]
+    depth_classes: list[DetectionClass]
     table: FloatArray
     alarms: int
     trials: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it; the blocks are in blocks.csv."""
+        """Return the content as `comparison.json` holds it; the blocks themselves are in blocks.csv."""
         return {
             "blocks": len(self.blocks),
             "in_view": sum(block.in_view for block in self.blocks),
@@ -154,19 +175,22 @@ class SeenBlocks:
 
 @dataclass(frozen=True)
 class SensorAssessment:
-    """All figures of one sensor.
+    """All results of one sensor.
 
     Attributes
     ----------
-    wall : DifferenceStatistics
-        Errors everywhere, within the niches too.
-    by : dict
-        Statistics against each covariate.
-    visible : float
-        Share of the wall that the sensor can see.
-    complete, complete_of_visible, complete_of_hidden : float
-        Share of pixels with data, mean over the epochs: of the whole wall, of what the sensor can see, and of what it cannot,
-        where triangles bridge a gap.
+    name, sensor : Name in the comparison; "stereo" or "tls".
+    noise : Noise over stable ground.
+    wall : Errors of the difference maps everywhere, niches included.
+    by : Statistics over stable ground by bins of each covariate.
+    detection : Detected blocks.
+    visible : Share of the wall that the sensor can see.
+    complete, complete_of_visible, complete_of_hidden : Share of pixels with data, mean over the epochs: of the whole wall, of the
+        part that the sensor can see, and of the part that it cannot, where triangles bridge a gap.
+    points : Points of the reference epoch.
+    scan_seconds : Duration of the measurement of one epoch, s; None for cameras.
+    seconds : Mean computing time of an epoch, s.
+    registration_rms_m : Mean RMS distance of ICP's inliers, m; None without ICP.
     """
 
     name: str
@@ -174,7 +198,7 @@ class SensorAssessment:
     noise: MapNoise
     wall: DifferenceStatistics
     by: dict[str, list[Bin]]
-    detection: SeenBlocks
+    detection: DetectionSummary
     visible: float
     complete: float
     complete_of_visible: float
@@ -185,7 +209,7 @@ class SensorAssessment:
     registration_rms_m: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the content as `comparison.json` holds it."""
         return {
             "name": self.name,
             "sensor": self.sensor,
@@ -204,8 +228,15 @@ class SensorAssessment:
         }
 
 
-def noise_of(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
-    """The noise of difference maps (e, h, w), m, NaN where not stable or without data."""
+def map_noise(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
+    """Compute the noise of a stack of difference maps.
+
+    Parameters
+    ----------
+    stable : (e, h, w) differences, m; NaN outside stable ground and without data.
+    gsd_m : Pixel size, m.
+    random : Source of the subsample for the normality test.
+    """
     found = variogram(np.stack([without_outliers(each) for each in stable[:_VARIOGRAM_MAPS]]), gsd_m)
     model = fit_variogram(found)
     known = ~np.isnan(stable[0])
@@ -225,28 +256,35 @@ def noise_of(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
 
 
 def _cell_px(stable: Raster, gsd_m: float) -> int:
-    """Side of the cells of the level of detection: half a metre, more where data is so sparse that few would fall into it."""
+    """Return the side of the level of detection's cells, pixels: half a metre, or more where the data is sparse."""
     per_pixel = max(float(np.mean(~np.isnan(stable))) * len(stable), 1e-6)
     enough = int(np.ceil(np.sqrt(2 * LEAST_CELL_PIXELS / per_pixel)))
     return min(max(round(_CELL_M / gsd_m), enough), max(stable.shape[1:]))
 
 
-def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> SensorAssessment:
-    """The figures of one sensor of a trial; `random` draws samples, footprints' places and resamples."""
+def assess(trial: Trial, seen: SensorObservations, random: KeyedRandom) -> SensorAssessment:
+    """Compute all results of one sensor.
+
+    Parameters
+    ----------
+    trial : The comparison, with the true changes.
+    seen : What this sensor observed.
+    random : Source of subsamples and of the footprints' places.
+    """
     gsd = trial.grid.gsd
-    random = random.child("compare", seen.contestant.name)
+    random = random.child("compare", seen.setup.name)
     stable = np.where(np.stack([epoch.stable for epoch in trial.epochs]), seen.changes, np.nan).astype(np.float32)
     errors = np.stack([change - epoch.change for change, epoch in zip(seen.changes, trial.epochs, strict=True)])
-    noise = noise_of(stable, gsd, random)
-    data, surface = ~np.isnan(seen.changes), trial.ground.found
+    noise = map_noise(stable, gsd, random)
+    data, surface = ~np.isnan(seen.changes), trial.wall.found
     in_view, hidden = seen.visible & surface, surface & ~seen.visible
     return SensorAssessment(
-        name=seen.contestant.name,
-        sensor=seen.contestant.sensor,
+        name=seen.setup.name,
+        sensor=seen.setup.sensor,
         noise=noise,
         wall=statistics(errors),
         by=_by_covariates(stable, trial, seen),
-        detection=_detection(trial, seen, stable, MeanTest(noise.model, noise.level, gsd), random),
+        detection=_detection(trial, seen, stable, BlockMeanTest(noise.model, noise.level, gsd), random),
         visible=float(np.mean(in_view[surface])),
         complete=float(np.mean(data[:, surface])),
         complete_of_visible=float(np.mean(data[:, in_view])) if in_view.any() else 0.0,
@@ -259,25 +297,25 @@ def assess(trial: Trial, seen: Seen, random: KeyedRandom) -> SensorAssessment:
 
 
 def assess_measured(found: MeasuredMaps, random: KeyedRandom) -> MapNoise:
-    """The noise of measured epochs over the stable areas as drawn; where none are, over all but gross differences."""
+    """Compute the noise of measured epochs over their stable areas; without such areas, over all but gross differences."""
     stable = (
         np.where(found.stable, found.maps, np.nan)
         if found.stable is not None
         else np.stack(list(map(without_outliers, found.maps)))
     )
-    return noise_of(stable.astype(np.float32), found.grid.gsd, random.child("measured", found.name))
+    return map_noise(stable.astype(np.float32), found.grid.gsd, random.child("measured", found.name))
 
 
-def _scan_seconds(seen: Seen) -> float | None:
-    """How long the instrument measures, all stations together; None for cameras."""
+def _scan_seconds(seen: SensorObservations) -> float | None:
+    """Return how long the scanner measures from all its stations, s; None for cameras."""
     looks = seen.reference.observations
     if looks[0].pulse_interval_s is None:
         return None
     return float(sum(each.depth.size * (each.pulse_interval_s or 0.0) for each in looks))
 
 
-def _by_covariates(stable: Raster, trial: Trial, seen: Seen) -> dict[str, list[Bin]]:
-    """Statistics of the stable differences against what they may depend on."""
+def _by_covariates(stable: Raster, trial: Trial, seen: SensorObservations) -> dict[str, list[Bin]]:
+    """Compute statistics of the stable differences by range, incidence angle, distance from edges, and albedo."""
     step = int(np.ceil(np.sqrt(stable.size / _MOST_BINNED)))
     part = stable[:, ::step, ::step]
 
@@ -290,23 +328,26 @@ def _by_covariates(stable: Raster, trial: Trial, seen: Seen) -> dict[str, list[B
     return {
         "range_m": against(seen.range_m),
         "incidence_rad": against(seen.incidence_rad, incidence),
-        "edge_m": against(trial.ground.edge_m, edge_bins),
-        "albedo": against(trial.ground.albedo),
+        "edge_m": against(trial.wall.edge_m, edge_bins),
+        "albedo": against(trial.wall.albedo),
     }
 
 
-def _detection(trial: Trial, seen: Seen, stable: Raster, test: MeanTest, random: KeyedRandom) -> SeenBlocks:
-    blocks: list[BlockSeen] = []
+def _detection(
+    trial: Trial, seen: SensorObservations, stable: Raster, test: BlockMeanTest, random: KeyedRandom
+) -> DetectionSummary:
+    """Test every block of every epoch, and the same footprints on stable ground."""
+    blocks: list[BlockDetection] = []
     alarms = trials = 0
     for number, (epoch, change) in enumerate(zip(trial.epochs, seen.changes, strict=True)):
-        blocks += blocks_seen(epoch.number, change, epoch.block, epoch.change, epoch.records, seen.visible, test)
+        blocks += detect_blocks(epoch.number, change, epoch.block, epoch.change, epoch.records, seen.visible, test)
         shapes = [shape for _, _, shape in footprints(epoch.block, epoch.change)]
         found, of = false_alarms(stable[number], shapes, test, random.child("alarms", number))
         alarms, trials = alarms + found, trials + of
     shown = [block for block in blocks if block.in_view]
     size, depth = (np.array([getattr(block, name) for block in shown]) for name in ("size_m", "depth_m"))
     hit = np.array([block.seen for block in shown], dtype=bool)
-    return SeenBlocks(
+    return DetectionSummary(
         blocks,
         detection_curve(size, hit),
         detection_curve(depth, hit),
@@ -319,15 +360,22 @@ def _detection(trial: Trial, seen: Seen, stable: Raster, test: MeanTest, random:
 
 
 def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
-    """Edges of classes of equal width in the logarithm over all the values."""
+    """Return the edges of classes of equal logarithmic width that cover all (k,) values."""
     if len(values) == 0:
         return np.array([0.01, 1.0])
     low, high = float(values.min()), float(values.max())
     return np.geomspace(low, max(high, low * 1.01) * (1 + 1e-9), classes + 1)
 
 
-def size_classes(blocks: list[BlockSeen], values: FloatArray, edges: FloatArray) -> list[SizeInterval]:
-    """The blocks by classes of one of their measures, (k,), m."""
+def size_classes(blocks: list[BlockDetection], values: FloatArray, edges: FloatArray) -> list[DetectionClass]:
+    """Sort blocks into classes by one of their measures and count those detected.
+
+    Parameters
+    ----------
+    blocks : The k blocks.
+    values : (k,) size or depth, m.
+    edges : Edges of the classes, m.
+    """
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     return [
         _class(float(edges[i]), float(edges[i + 1]), [blocks[k] for k in np.flatnonzero(place == i)])
@@ -335,16 +383,17 @@ def size_classes(blocks: list[BlockSeen], values: FloatArray, edges: FloatArray)
     ]
 
 
-def _class(low: float, high: float, blocks: list[BlockSeen]) -> SizeInterval:
+def _class(low: float, high: float, blocks: list[BlockDetection]) -> DetectionClass:
+    """Compute the share detected and the volume error of one class."""
     seen = sum(block.seen for block in blocks)
     ratio = np.array([block.measured_volume_m3 / block.volume_m3 - 1 for block in blocks if block.volume_m3 > 0])
     size = statistics(ratio)
     error = (size.median, size.nmad) if size.count else (None, None)
-    return SizeInterval(low, high, len(blocks), seen, wilson_interval(seen, len(blocks)), *error)
+    return DetectionClass(low, high, len(blocks), seen, wilson_interval(seen, len(blocks)), *error)
 
 
 def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
-    """(sizes, depths) share seen in each class of both, NaN without blocks."""
+    """Return the (sizes, depths) share detected in each class of both; NaN without blocks."""
     edges = class_edges(size), class_edges(depth)
     count, _, _ = np.histogram2d(size, depth, edges)
     seen, _, _ = np.histogram2d(size[hit], depth[hit], edges)
@@ -352,10 +401,12 @@ def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
 
 
 def shared_scale_m(noises: list[MapNoise]) -> float:
-    """The sigma of a colour scale for all: the largest NMAD over stable ground, so that nobody's noise saturates."""
+    """Return the standard deviation that scales the colours of all maps, m: the largest NMAD, so that no sensor's noise
+    saturates.
+    """
     return max((each.stable.nmad for each in noises if each.stable.count), default=1e-3) or 1e-3
 
 
 def grid_record(grid: Grid) -> dict[str, float]:
-    """Where the shared pixels lie, as JSON holds it."""
+    """Return the shared raster as `comparison.json` holds it."""
     return {"x_min_m": grid.x_min, "y_max_m": grid.y_max, "gsd_m": grid.gsd, "width_px": grid.width, "height_px": grid.height}

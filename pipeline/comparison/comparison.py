@@ -1,4 +1,4 @@
-"""`scarpsim compare` as one call: the trial, its figures, and measured epochs beside it."""
+"""Run `scarpsim compare`: simulate all sensors, compute their results, and add those of measured epochs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.comparison.assess import MapNoise, SensorAssessment, assess, assess_measured
-from pipeline.comparison.sensors_compared import Contestant
+from pipeline.comparison.sensor_setups import SensorSetup
 from pipeline.comparison.trial import Trial, compare
 from pipeline.noise.measured import MeasuredMaps, read_measured
 from pipeline.report.progress import Progress
@@ -17,12 +17,20 @@ from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 
 _FIGURES_S = 3.0
-"""What the plan of the progress takes for the figures of a sensor."""
+"""Expected time for the results of one sensor, s, for the progress display."""
 
 
 @dataclass(frozen=True)
-class ComparedSensors:
-    """A trial with its figures, and measured epochs with theirs. config: the first sensor's, as JSON types."""
+class ComparisonResult:
+    """Result of a comparison.
+
+    Attributes
+    ----------
+    trial : What was simulated.
+    found : Results of each sensor, in the same order.
+    measured : Measured epochs with their noise.
+    config : The first sensor's config, as JSON types.
+    """
 
     trial: Trial
     found: list[SensorAssessment]
@@ -30,23 +38,35 @@ class ComparedSensors:
     config: dict[str, Any]
 
     def noises(self) -> dict[str, MapNoise]:
-        """Noise by name, the measured epochs' last."""
+        """Return the noise by name, simulated sensors first."""
         return {each.name: each.noise for each in self.found} | {
             f"{maps.name} (measured)": noise for maps, noise in self.measured
         }
 
 
 def compare_sensors(
-    sensors: Sequence[Contestant],
+    sensors: Sequence[SensorSetup],
     measured: Sequence[Path] = (),
     epochs: int = 6,
     sizes_m: tuple[float, float] | None = (0.05, 0.8),
     progress: Progress | None = None,
-) -> ComparedSensors:
-    """Compare sensors as `pipeline.comparison.trial.compare` does, and put measured epochs beside them.
+) -> ComparisonResult:
+    """Simulate sensors on one wall with the same blocks and compare their results, with measured epochs for reference.
 
-    measured: folders as `read_measured` takes them, at the first config's GSD and registered by its ICP. They are read first, as
-    a mistake there should not cost a simulation.
+    Parameters
+    ----------
+    sensors : The sensors; the wall, blocks and seed are those of the first.
+    measured : Folders of measured epochs as `read_measured` takes them. They are read first, so that a mistake costs no
+        simulation;
+        the first config gives their GSD and ICP.
+    epochs : Number of epochs with rockfall.
+    sizes_m : Block sizes in the first and the last epoch, m; None: the blocks of the config.
+    progress : Receives the progress; None: nothing is shown.
+
+    Raises
+    ------
+    InputError
+        If the sizes, a measured folder or a sensor cannot be used.
     """
     if sizes_m is not None and not 0 < sizes_m[0] <= sizes_m[1]:
         raise InputError(f"got {sizes_m[0]:g} and {sizes_m[1]:g} m", where="--sizes-m", allowed="0 < smallest <= largest")
@@ -64,18 +84,19 @@ def compare_sensors(
             progress.advance(number / len(trial.seen))
             found.append(assess(trial, seen, random))
         beside = [(each, assess_measured(each, random)) for each in maps]
-    return ComparedSensors(trial, found, beside, config.model_dump(mode="json"))
+    return ComparisonResult(trial, found, beside, config.model_dump(mode="json"))
 
 
 def _check_given_once(folders: Sequence[Path]) -> None:
+    """Raise InputError for a folder that is given twice."""
     seen: set[str] = set()
     for folder in folders:
-        place = os.path.realpath(folder)  # Path.resolve raises at a loop
+        place = os.path.realpath(folder)  # Path.resolve raises at a loop of links
         if place in seen:
-            raise InputError("is given twice", where=f"--measured {folder}", remedy="name each folder once")
+            raise InputError("the folder is given twice", where=f"--measured {folder}", remedy="name each folder once")
         seen.add(place)
 
 
 def _own_names(names: Sequence[str]) -> list[str]:
-    """The names, numbered where several folders have one."""
+    """Return the names, numbered where several folders have the same."""
     return [name if names.count(name) == 1 else f"{name} {names[: at + 1].count(name)}" for at, name in enumerate(names)]

@@ -1,4 +1,6 @@
-"""What noise may depend on, pixel by pixel: range, incidence, distance from edges, albedo; and what a sensor can see at all."""
+"""Compute, for each pixel of the wall, what noise may depend on: range, incidence angle, distance from edges, albedo and
+visibility.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,25 @@ from scene.ray_casting.raycast import RayCaster
 BoolArray = NDArray[np.bool_]
 Raster = NDArray[np.float32]
 _EDGE_SLOPE = 4.0
-"""Rise over run between neighbouring pixels that makes an edge: the surface turns 76 degrees from the wall's plane."""
+"""Height difference of neighbouring pixels over their distance that makes an edge: a slope of 76 degrees from the
+wall's plane.
+"""
 _LEAST_STEP_M = 0.05
+"""Smallest height difference of an edge, m."""
 
 
 @dataclass(frozen=True)
-class Ground:
-    """The untouched wall at every pixel of a grid; all (h, w), NaN or False where there is no surface.
+class UntouchedWall:
+    """The untouched wall at every pixel of a raster.
 
-    points: (h, w, 3), normals: (h, w, 3) unit, wall frame, m; albedo; edge_m: distance in the wall's plane from the nearest edge,
-    where neighbouring pixels differ in z by more than four pixels and 5 cm; found: where there is a surface.
+    Attributes
+    ----------
+    grid : The raster.
+    points : (h, w, 3) points on the wall, wall frame, m; NaN without a surface.
+    normals : (h, w, 3) unit normals, wall frame.
+    albedo : (h, w) albedo; NaN without a surface.
+    edge_m : (h, w) distance in the wall's plane from the nearest edge, m.
+    found : (h, w) true where there is a surface.
     """
 
     grid: Grid
@@ -38,8 +49,8 @@ class Ground:
     found: BoolArray
 
 
-def ground(caster: RayCaster, grid: Grid) -> Ground:
-    """Look at the untouched wall (wall frame) along -z at every pixel centre."""
+def untouched_wall(caster: RayCaster, grid: Grid) -> UntouchedWall:
+    """Cast rays along -z onto the untouched wall (wall frame) at every pixel centre."""
     hits, point = caster.look_down(grid)
     valid, normal, albedo = hits.valid, hits.normal, hits.albedo
     dr.eval(valid, point, normal, albedo)
@@ -47,7 +58,7 @@ def ground(caster: RayCaster, grid: Grid) -> Ground:
     points = np.array(point).T.reshape(*grid.shape, 3)
     normals = np.array(normal, dtype=np.float32).T.reshape(*grid.shape, 3)
     points[~found] = np.nan
-    return Ground(
+    return UntouchedWall(
         grid,
         points,
         normals,
@@ -58,7 +69,19 @@ def ground(caster: RayCaster, grid: Grid) -> Ground:
 
 
 def edge_distance(heights: NDArray[np.floating], gsd_m: float) -> Raster:
-    """(h, w) distance, m, of each pixel's centre from the nearest one beside an edge; infinite where there is no edge."""
+    """Compute the distance of each pixel from the nearest edge.
+
+    An edge lies between neighbouring pixels whose heights differ by more than four pixel sizes and 5 cm.
+
+    Parameters
+    ----------
+    heights : (h, w) heights, m.
+    gsd_m : Pixel size, m.
+
+    Returns
+    -------
+    (h, w) distances, m, between pixel centres; infinite if there is no edge.
+    """
     limit = max(_EDGE_SLOPE * gsd_m, _LEAST_STEP_M)
     edge = np.zeros(heights.shape, dtype=bool)
     for axis in (0, 1):
@@ -71,22 +94,46 @@ def edge_distance(heights: NDArray[np.floating], gsd_m: float) -> Raster:
     return (gsd_m * ndimage.distance_transform_edt(~edge)).astype(np.float32)
 
 
-def range_and_incidence(on: Ground, viewpoints: Sequence[FloatArray]) -> tuple[Raster, Raster]:
-    """(h, w) mean distance from the viewpoints ((3,), wall frame), m, and mean angle between sight and normal, rad."""
+def range_and_incidence(wall: UntouchedWall, viewpoints: Sequence[FloatArray]) -> tuple[Raster, Raster]:
+    """Compute the mean range and the mean incidence angle over several viewpoints.
+
+    Parameters
+    ----------
+    wall : The wall at every pixel.
+    viewpoints : (3,) each, wall frame, m.
+
+    Returns
+    -------
+    (h, w) ranges, m, and (h, w) angles between line of sight and normal, rad.
+    """
     ranges, angles = [], []
     for viewpoint in viewpoints:
-        sight = viewpoint - on.points
+        sight = viewpoint - wall.points
         distance = np.linalg.norm(sight, axis=-1)
-        cosine = np.einsum("hwi,hwi->hw", sight, on.normals) / distance
+        cosine = np.einsum("hwi,hwi->hw", sight, wall.normals) / distance
         ranges.append(distance)
         angles.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return np.mean(ranges, axis=0).astype(np.float32), np.mean(angles, axis=0).astype(np.float32)
 
 
-def visible(on: Ground, caster: RayCaster, viewpoints: Sequence[FloatArray], *, every: bool) -> BoolArray:
-    """(h, w) where the surface is seen from every viewpoint, as a stereo pair needs it, or from any."""
-    places = Places(on.points[on.found], on.normals[on.found].astype(np.float64), on.albedo[on.found].astype(np.float64))
+def visible(wall: UntouchedWall, caster: RayCaster, viewpoints: Sequence[FloatArray], *, every: bool) -> BoolArray:
+    """Find the pixels of the wall that a sensor can see.
+
+    Parameters
+    ----------
+    wall : The wall at every pixel.
+    caster : The wall, for ray casting.
+    viewpoints : (3,) each, wall frame, m.
+    every : Whether a pixel must be visible from every viewpoint, as for a stereo pair, or from any.
+
+    Returns
+    -------
+    (h, w) mask.
+    """
+    places = Places(
+        wall.points[wall.found], wall.normals[wall.found].astype(np.float64), wall.albedo[wall.found].astype(np.float64)
+    )
     seen = np.stack([seen_from(caster, places, viewpoint) for viewpoint in viewpoints])
-    result = np.zeros(on.found.shape, dtype=bool)
-    result[on.found] = seen.all(axis=0) if every else seen.any(axis=0)
+    result = np.zeros(wall.found.shape, dtype=bool)
+    result[wall.found] = seen.all(axis=0) if every else seen.any(axis=0)
     return result

@@ -1,22 +1,21 @@
-"""Which blocks a difference map shows: the level of detection of a pixel and of a block, and the curve over block sizes.
+"""Decide which blocks a difference map shows, by comparing each block's mean change with its level of detection.
 
-A pixel's level of detection is what noise alone exceeds in 5 % of cases: the 95 % quantile of |difference| over stable pixels of
-all epochs, in square cells of the wall. It assumes no distribution.
+The level of detection of a pixel is what noise alone exceeds in 5 % of cases: the 95 % quantile of |difference| over the stable
+pixels of all epochs, in square cells of the wall. It assumes no distribution.
 
-A block of n pixels counts as seen where the mean D of its differences exceeds the level of detection of a mean,
+A block of n pixels is detected if the mean D of its differences exceeds the level of detection of a mean,
 
-    D > LoD = z s sqrt(V / C(0)),      z = 1.96,   s = level of detection of its pixels / z,
+    D > LoD = z s sqrt(V / C(0)),      z = 1.96,   s = level of detection of its pixels / z.
 
-with V the variance of a mean over just these pixels and C(0) that of a pixel, both from the variogram, which carries how far
-noise is alike (Rolstad et al. 2009), and s the noise around the block (root mean square over it), which carries that noise
-differs over the wall (Hugonnet et al. 2022). A block of which less than half has data, or fewer than four pixels, is not seen.
-The test is held against the truth: the same footprints, laid on stable ground, should be taken for blocks in 2.5 % of cases, and
-how often they are is reported.
+V is the variance of a mean over just these pixels and C(0) that of a single pixel. Both come from the variogram, which describes
+the spatial correlation of the noise (Rolstad et al. 2009). s is the noise around the block (root mean square over it), as noise
+varies over the wall (Hugonnet et al. 2022). A block with data on less than half of its pixels, or on fewer than four, is not
+detected. As a check of the test, the same footprints are placed on stable ground, where they should be taken for blocks in 2.5 %
+of cases; the observed rate is reported.
 
-Over the sizes x of the blocks in view the share seen follows P(x) = (1 - l) Phi((ln x - m) / w), by maximum likelihood; l is the
-share that no size makes visible, as the niche is hidden even where the block was not. `detection_curve` beside this file fits it.
-Blocks that fall out of the sensor's view
-are counted apart: no precision helps there, another station does.
+The share detected over the size x of the blocks in view follows P(x) = (1 - l) Phi((ln x - m) / w), fitted by maximum likelihood
+(`detection_curve.py`). l is the share that no size makes visible, because the niche is hidden even where the block was not.
+Blocks outside the sensor's view are counted separately: better precision does not help them, another station does.
 """
 
 from __future__ import annotations
@@ -37,19 +36,27 @@ from scene.geometry.mesh import WALL, IntArray
 BoolArray = NDArray[np.bool_]
 Z_95 = 1.96
 LEAST_PIXELS = 4
+"""Smallest number of pixels with data of a detected block."""
 LEAST_SHARE = 0.5
-"""Of a block's footprint that has to have data."""
+"""Smallest share of a block's footprint with data."""
 LEAST_CELL_PIXELS = 40
-"""Stable differences that a cell of the level of detection needs."""
+"""Smallest number of stable differences in a cell of the level of detection."""
 _PLACES = 10
-"""Where on the stable ground each footprint is laid."""
+"""Number of random places on stable ground for each footprint."""
 
 
 def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np.float32]:
-    """(h, w) m: the 95 % quantile of |difference| over the stable pixels of a square cell, of all epochs.
+    """Compute the level of detection of each pixel: the 95 % quantile of |difference| in its cell, over all epochs.
 
-    stable: (e, h, w) differences, m, NaN where not stable or without data. Cells with fewer than 40 take the median cell's value;
-    all NaN where no cell has so many.
+    Parameters
+    ----------
+    stable : (e, h, w) differences, m; NaN outside stable ground and without data.
+    cell_px : Side of a square cell, pixels.
+
+    Returns
+    -------
+    (h, w) level of detection, m. Cells with fewer than 40 differences get the median of the other cells; all NaN if there are
+    none.
     """
     _, height, width = stable.shape
     rows, columns = -(-height // cell_px), -(-width // cell_px)
@@ -66,14 +73,22 @@ def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np
 
 
 @dataclass(frozen=True)
-class BlockSeen:
-    """What a difference map shows of a block.
+class BlockDetection:
+    """One fallen block, and what a difference map shows of it.
 
-    size_m: (2 V)^(1/3) for the rock V that fell, the side of a cube that sat in the rock with half of its height, as
-    `scarpsim inspect` plans with; depth_m: true mean depth over its footprint; footprint_px: pixels of the map on
-    which it changed the wall; data_share: of these, with data; mean_m: of the differences there, None with too little data;
-    limit_m: level of detection of that mean; volume_m3, measured_volume_m3: true, and sum of the differences over the footprint;
-    in_view: whether the sensor saw at least half of the footprint before the block fell.
+    Attributes
+    ----------
+    epoch, label : Epoch in which it fell, and its label in that epoch.
+    size_m : (2 V)^(1/3) of the fallen volume V, m: the side of a cube that was half embedded in the rock, as in `scarpsim
+        inspect`.
+    depth_m : True mean depth over its footprint, m.
+    footprint_px : Pixels of the map on which it changed the wall.
+    data_share : Share of these pixels with data.
+    mean_m : Mean difference on these, m; None with too little data.
+    limit_m : Level of detection of that mean, m; None with too little data.
+    volume_m3, measured_volume_m3 : True volume, and sum of the differences over the footprint, m^3.
+    in_view : Whether the sensor saw at least half of the footprint before the block fell.
+    seen : Whether the block was detected.
     """
 
     epoch: int
@@ -90,20 +105,27 @@ class BlockSeen:
     seen: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON and CSV hold it."""
+        """Return the content as JSON and CSV hold it."""
         return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
-class MeanTest:
-    """The test of a block's mean: the noise's model and the level of detection of every pixel, (h, w), m."""
+class BlockMeanTest:
+    """Test whether the mean change over a footprint exceeds its level of detection.
+
+    Attributes
+    ----------
+    model : Variogram model of the noise.
+    level : (h, w) level of detection of every pixel, m.
+    gsd_m : Pixel size, m.
+    """
 
     model: VariogramModel
     level: NDArray[np.float32]
     gsd_m: float
 
     def limit_m(self, footprint: BoolArray, window: tuple[slice, slice]) -> float:
-        """The level of detection of the mean over a footprint (n, m), which lies in `window` of the map."""
+        """Return the level of detection, m, of the mean over a footprint (n, m) that lies in `window` of the map."""
         level = self.level[window][footprint].astype(np.float64)
         share = variance_of_mean(self.model, footprint, self.gsd_m) / self.model.sill_m2 if self.model.sill_m2 > 0 else 0.0
         return float(np.sqrt(np.mean(level**2) * share))
@@ -111,7 +133,18 @@ class MeanTest:
     def mean_and_limit(
         self, change: NDArray[np.floating], footprint: BoolArray, window: tuple[slice, slice]
     ) -> tuple[float | None, float | None]:
-        """Mean of the differences over the part of a footprint with data, m, and its limit; None where too little has data."""
+        """Compute the mean difference over a footprint, and its level of detection.
+
+        Parameters
+        ----------
+        change : (h, w) difference map, m.
+        footprint : (n, m) mask of the block's pixels.
+        window : Place of the footprint in the map.
+
+        Returns
+        -------
+        Mean and level of detection, m, over the pixels with data; None for both if too few have data.
+        """
         values = change[window]
         known = footprint & ~np.isnan(values)
         count = np.count_nonzero(known)
@@ -121,26 +154,32 @@ class MeanTest:
 
 
 def footprints(block: IntArray, true_change: NDArray[np.floating]) -> Iterator[tuple[int, tuple[slice, slice], BoolArray]]:
-    """Label, window of the map and footprint in it of each block: the pixels of its label where the wall receded."""
+    """Yield each block's label, window in the map, and footprint in that window: its pixels where the wall receded."""
     receded = np.where(true_change > 0, block, WALL)
     for label, window in enumerate(ndimage.find_objects(receded), start=1):
         if window is not None:
             yield label, window, receded[window] == label
 
 
-def blocks_seen(
+def detect_blocks(
     epoch: int,
     change: NDArray[np.floating],
     block: IntArray,
     true_change: NDArray[np.floating],
     records: Sequence[dict[str, Any]],
     visible: BoolArray,
-    test: MeanTest,
-) -> list[BlockSeen]:
-    """What the map `change` (h, w), m, of an epoch shows of each of its blocks.
+    test: BlockMeanTest,
+) -> list[BlockDetection]:
+    """Test each block of an epoch.
 
-    block, true_change: (h, w) labels and change of the wall as it really is, reference minus epoch, m; records: of blocks.json;
-    visible: (h, w) where the sensor sees the untouched wall.
+    Parameters
+    ----------
+    epoch : Number of the epoch.
+    change : (h, w) the sensor's difference map, m.
+    block, true_change : (h, w) true block labels and true change of the wall, reference minus epoch, m.
+    records : The blocks as blocks.json holds them.
+    visible : (h, w) where the sensor sees the untouched wall.
+    test : The test of a mean change.
     """
     found = {label: (window, footprint) for label, window, footprint in footprints(block, true_change)}
     nowhere = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), dtype=bool)
@@ -152,7 +191,7 @@ def blocks_seen(
         differences = change[window][footprint]
         mean, limit = test.mean_and_limit(change, footprint, window)
         result.append(
-            BlockSeen(
+            BlockDetection(
                 epoch=epoch,
                 label=record["label"],
                 size_m=float((2 * max(record["volume_m3"], 0.0)) ** (1 / 3)),
@@ -171,9 +210,21 @@ def blocks_seen(
 
 
 def false_alarms(
-    stable: NDArray[np.floating], shapes: Sequence[BoolArray], test: MeanTest, random: KeyedRandom
+    stable: NDArray[np.floating], shapes: Sequence[BoolArray], test: BlockMeanTest, random: KeyedRandom
 ) -> tuple[int, int]:
-    """How many footprints, laid at random on the stable ground of one map (h, w), would be taken for blocks; and of how many."""
+    """Place footprints at random on stable ground and count how many would be taken for blocks.
+
+    Parameters
+    ----------
+    stable : (h, w) differences of one map, m; NaN outside stable ground.
+    shapes : Footprints of the blocks.
+    test : The test of a mean change.
+    random : Source of the places.
+
+    Returns
+    -------
+    Number of false alarms, and of footprints with enough data.
+    """
     generator = random.generator()
     alarms = trials = 0
     for shape in [shape for shape in shapes for _ in range(_PLACES)]:
@@ -189,7 +240,7 @@ def false_alarms(
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's (1927) 95 % interval of a share."""
+    """Return Wilson's (1927) 95 % confidence interval of a share."""
     if trials == 0:
         return 0.0, 1.0
     share, factor = successes / trials, Z_95**2 / trials

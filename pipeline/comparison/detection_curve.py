@@ -1,21 +1,21 @@
-"""The curve of blocks seen over their size, and the size from which 95 % are seen with all that the blocks leave open about it.
+"""Fit the probability of detection over block size, and estimate the size from which 95 % of the blocks are detected.
 
-The share seen at size x is P(x) = (1 - l) Phi((ln x - m) / w), and the size looked for is
+The share detected at size x is P(x) = (1 - l) Phi((ln x - m) / w), with the lapse rate l. The size of interest has the logarithm
 
-    t = m + w Phi^-1(0.95 / (1 - l))   (its logarithm; none where l >= 0.05: no size is seen so often).
+    t = m + w Phi^-1(0.95 / (1 - l))   (none where l >= 0.05: no size reaches 95 %).
 
-Blocks of few sizes leave much of this open: where all small ones were missed and all large ones seen, every t between them is
-equally likely (complete separation), where all were seen every smaller one. So t is judged by its profile likelihood
+Blocks of few sizes determine t poorly. If all small blocks are missed and all large ones detected, every t between them is
+equally likely (complete separation); if all are detected, every smaller t is. Therefore t is estimated from its profile
+likelihood
 
     L(t) = max over w and l of the log-likelihood of the blocks, at m = t - w Phi^-1(0.95 / (1 - l)),
 
-on a grid of t, w and l, beside L(none), the maximum over l >= 0.05. The interval of 95 % is what lies within 2.51 of the
-maximum (Wilks 1938; somewhat more than his 1.92, as l often lies on its bound); it is open upwards where `none` lies within it,
-and at an end of the grid. The estimate is the middle of the maximum, which is flat under separation, and so lies in the interval
-always. Where no block fell of a size near the estimate, no number is given but the sizes between which it lies.
+on a grid of t, w and l, together with L(none), the maximum over l >= 0.05. The 95 % interval is the range within 2.51 of the
+maximum (Wilks 1938 has 1.92; the value is larger because l often lies on its bound). It is open upwards if `none` lies within it,
+and open at an end of the grid. The estimate is the middle of the maximum, which is flat under separation, so that it always lies
+in the interval. If no block has a size near the estimate, the sizes between which it lies are given instead of a number.
 
-Assumes that blocks are seen or missed independently. How often the interval holds the truth is tested in
-tests/pipeline/test_detection_curve.py.
+The fit assumes that blocks are detected independently. tests/pipeline/test_detection_curve.py checks the interval's coverage.
 """
 
 from __future__ import annotations
@@ -32,30 +32,42 @@ from scene.geometry.mesh import FloatArray
 
 BoolArray = NDArray[np.bool_]
 LEAST_BLOCKS = 10
+"""Smallest number of blocks for a fit."""
 SHARE = 0.95
+"""Share detected that defines the smallest block."""
 GAP = 1.5
-"""Neighbouring sizes farther apart than by this factor leave a gap: a number in it would be a guess."""
+"""Ratio of neighbouring sizes above which an estimate between them is not given as a number."""
 _WITHIN = 2.512
-"""Half the 97.5 % quantile of the chi-square distribution of one degree of freedom. With that of 95 % the intervals held the
-truth in 89 % of simulated cases where l is on its bound of 0 and 200 blocks fell."""
+"""Half the 97.5 % quantile of the chi-square distribution with one degree of freedom. With the 95 % quantile, the intervals
+covered the true value in only 89 % of simulated cases with l on its bound of 0 and 200 blocks.
+"""
 _FLAT = 0.02
 """Log-likelihoods this near to the maximum count as equal to it."""
 _STEP, _BEYOND = 0.025, 1.0
-"""Of the grid of ln t, and how far it goes beyond the sizes."""
+"""Step of the grid of ln t, and its extent beyond the block sizes."""
 _LEAST_CHANCE = 1e-9
-"""That a block is missed: keeps logarithms finite."""
+"""Smallest probability, to keep logarithms finite."""
 _WIDTHS, _COARSE, _FINE = (0.02, 1.5), 10, 60
+"""Range of w, and numbers of coarse and of fine steps."""
 _LAPSES = np.array([0.0, 0.005, 0.01, 0.02, 0.03, 0.04, 0.049])
+"""Lapse rates with which some size reaches 95 %."""
 _LAPSES_OF_NONE = np.array([0.051, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 0.9])
+"""Lapse rates with which no size does."""
 
 
 @dataclass(frozen=True)
 class DetectionCurve:
-    """P(x) = (1 - lapse) Phi((ln x - ln middle) / width), fitted to `count` blocks of sizes from smallest_m to largest_m.
+    """Fitted probability of detection P(x) = (1 - lapse) Phi((ln x - ln middle) / width).
 
-    seen: how many of them were; smallest_95_m: the size from which 95 % are seen, None where the blocks do not tell it to a
-    factor of 1.5: it then lies between between_m[0] and between_m[1] (None: below all sizes, or above all or nowhere), or, with
-    between_m None, the curve stays below 95 %. interval_m: of 95 %; an end is None where the blocks do not bound it.
+    Attributes
+    ----------
+    count, seen : Number of blocks, and of those detected.
+    smallest_m, largest_m : Range of the block sizes, m.
+    middle_m, width, lapse : Parameters of the curve.
+    smallest_95_m : Size from which 95 % are detected, m; None if the blocks determine it less well than to a factor of 1.5.
+    between_m : Block sizes between which it then lies, m. None at an end: below or above all sizes. None altogether if
+        `smallest_95_m` is given or the curve stays below 95 %.
+    interval_m : 95 % confidence interval of that size, m; an end is None where the blocks do not bound it.
     """
 
     count: int
@@ -70,18 +82,25 @@ class DetectionCurve:
     interval_m: tuple[float | None, float | None]
 
     def probability(self, size_m: FloatArray) -> FloatArray:
-        """The share seen at sizes, m."""
+        """Return the probability of detection at sizes, m."""
         return (1 - self.lapse) * special.ndtr((np.log(size_m) - np.log(self.middle_m)) / self.width)
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the content as JSON holds it."""
         return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
-class _Profile:
-    """The likeliest curve for each t. at: (n,) ln t; likelihood: (n,); parameters: (n, 3) m, w, l; none: likelihood and
-    parameters of the likeliest curve that never reaches the share."""
+class _ProfileLikelihood:
+    """Profile likelihood of ln t.
+
+    Attributes
+    ----------
+    at : (n,) values of ln t.
+    likelihood : (n,) maximum log-likelihood at each.
+    parameters : (n, 3) m, w and l of that maximum.
+    none, none_parameters : Log-likelihood and parameters of the likeliest curve that never reaches 95 %.
+    """
 
     at: FloatArray
     likelihood: FloatArray
@@ -91,10 +110,11 @@ class _Profile:
 
     @property
     def maximum(self) -> float:
+        """The largest log-likelihood."""
         return max(float(self.likelihood.max()), self.none)
 
     def interval(self) -> tuple[float, float]:
-        """Of t; minus infinity and infinity where it is open."""
+        """Return the 95 % interval of ln t; infinite where it is open."""
         limit = self.maximum - _WITHIN
         inside = np.flatnonzero(self.likelihood >= limit)
         if len(inside) == 0:
@@ -105,12 +125,12 @@ class _Profile:
         return low, high
 
     def _crossing(self, left: int, right: int, limit: float) -> float:
-        """Where the likelihood passes a limit between two neighbours of the grid."""
+        """Interpolate where the likelihood passes a limit between two neighbours of the grid."""
         (a, b), (p, q) = self.at[[left, right]], self.likelihood[[left, right]]
         return float(a + (b - a) * np.clip((limit - p) / (q - p), 0.0, 1.0))
 
     def likeliest(self) -> tuple[float, FloatArray]:
-        """t (infinite: none) and the parameters m, w, l there: the middle of what is as likely as the maximum."""
+        """Return ln t (infinite: never 95 %) and m, w, l at the middle of the flat maximum."""
         if self.none > self.likelihood.max() + _FLAT:
             return np.inf, self.none_parameters
         flat = np.flatnonzero(self.likelihood >= self.likelihood.max() - _FLAT)
@@ -119,7 +139,7 @@ class _Profile:
 
 
 def detection_curve(size_m: FloatArray, seen: BoolArray) -> DetectionCurve | None:
-    """Fit the curve to blocks of sizes (k,), m, seen or not (k,); None for fewer than ten blocks."""
+    """Fit the curve to blocks of sizes (k,), m, with their detections (k,); return None for fewer than ten blocks."""
     if len(size_m) < LEAST_BLOCKS:
         return None
     log_size = np.log(size_m)
@@ -142,7 +162,7 @@ def detection_curve(size_m: FloatArray, seen: BoolArray) -> DetectionCurve | Non
 
 
 def _gap_around(at: float, sizes: FloatArray) -> tuple[float, float] | None:
-    """The neighbours of t among the sizes (logarithms, in order) where they are far apart; None where not, and for no t."""
+    """Return the two sorted log sizes around t if they are far apart; None if they are not or t is infinite."""
     if not np.isfinite(at):
         return None
     place = int(np.searchsorted(sizes, at))
@@ -151,8 +171,10 @@ def _gap_around(at: float, sizes: FloatArray) -> tuple[float, float] | None:
     return (float(low), float(high)) if high - low > np.log(GAP) else None
 
 
-def _profile(log_size: FloatArray, seen: BoolArray) -> _Profile:
-    """The profile likelihood on a grid of ln t: over coarse widths first, then over fine ones where those are likely."""
+def _profile(log_size: FloatArray, seen: BoolArray) -> _ProfileLikelihood:
+    """Compute the profile likelihood on a grid of ln t, over coarse widths first and then over fine ones around the
+    likely ones.
+    """
     coarse = np.geomspace(*_WIDTHS, _COARSE)
     best = [_of_width(width, log_size, seen).maximum for width in coarse]
     likely = np.flatnonzero(np.array(best) > max(best) - 3 * _WITHIN)
@@ -162,7 +184,7 @@ def _profile(log_size: FloatArray, seen: BoolArray) -> _Profile:
     place = np.argmax([each.likelihood for each in found], axis=0)
     columns = np.arange(len(place))
     none = max(found, key=lambda each: each.none)
-    return _Profile(
+    return _ProfileLikelihood(
         found[0].at,
         np.stack([each.likelihood for each in found])[place, columns],
         np.stack([each.parameters for each in found])[place, columns],
@@ -171,8 +193,8 @@ def _profile(log_size: FloatArray, seen: BoolArray) -> _Profile:
     )
 
 
-def _of_width(width: float, log_size: FloatArray, seen: BoolArray) -> _Profile:
-    """The profile over lapses alone."""
+def _of_width(width: float, log_size: FloatArray, seen: BoolArray) -> _ProfileLikelihood:
+    """Compute the profile likelihood over the lapse rates for one width."""
     low, high = float(log_size.min()) - _BEYOND, float(log_size.max()) + _BEYOND
     at = np.linspace(low, high, int(np.ceil((high - low) / _STEP)) + 1)
     quantiles = special.ndtri(SHARE / (1 - _LAPSES))
@@ -186,13 +208,13 @@ def _of_width(width: float, log_size: FloatArray, seen: BoolArray) -> _Profile:
     beyond = found[len(_LAPSES) :]
     row, column = np.unravel_index(int(beyond.argmax()), beyond.shape)
     of_none = np.array([middle[column], width, _LAPSES_OF_NONE[row]])
-    return _Profile(at, likelihoods[place, columns], parameters, float(beyond[row, column]), of_none)
+    return _ProfileLikelihood(at, likelihoods[place, columns], parameters, float(beyond[row, column]), of_none)
 
 
 def _log_likelihoods(grid: FloatArray, width: float, lapses: FloatArray, log_size: FloatArray, seen: BoolArray) -> FloatArray:
-    """(lapses, n) of all blocks, for curves with their middles on an even grid (n,) that holds all sizes.
+    """Return the (lapses, n) log-likelihoods of curves with their middles on a regular grid (n,) that covers all sizes.
 
-    A block counts as parts of two at its neighbours on the grid, so that the sums over the blocks are convolutions.
+    A block counts in parts at its two neighbours on the grid, so that the sums over the blocks are convolutions.
     """
     number = len(grid)
     lag = (grid[1] - grid[0]) * np.arange(number - 1, -number, -1) / width
@@ -206,7 +228,7 @@ def _log_likelihoods(grid: FloatArray, width: float, lapses: FloatArray, log_siz
 
 
 def _shared_out(values: FloatArray, grid: FloatArray) -> FloatArray:
-    """(n,) how many values there are at each place of an even grid, each shared between its neighbours in proportion."""
+    """Return how many values (n,) there are at each node of a regular grid, each divided linearly between its two neighbours."""
     place = (values - grid[0]) / (grid[1] - grid[0])
     below = np.floor(place).astype(int)
     part = place - below
@@ -215,4 +237,5 @@ def _shared_out(values: FloatArray, grid: FloatArray) -> FloatArray:
 
 
 def _metres(logarithm: float) -> float | None:
+    """Convert a logarithm to metres; None if it is infinite."""
     return float(np.exp(logarithm)) if np.isfinite(logarithm) else None

@@ -1,4 +1,4 @@
-"""The pictures of a comparison of sensors: maps side by side on one scale, and curves with one colour a sensor; PNG bytes."""
+"""Draw the pictures of a comparison as PNG: maps side by side on one colour scale, and curves with one colour for each sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.comparison.assess import MapNoise, SensorAssessment, SizeInterval
+from pipeline.comparison.assess import DetectionClass, MapNoise, SensorAssessment
 from pipeline.comparison.detection_curve import DetectionCurve
 from pipeline.report.figures import (
     COLOURS,
@@ -34,19 +34,19 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import IntArray
 
 _WIDTH_IN = 13.0
-_SIZE_LABEL = "size of the block, ∛(2 V), m"
+_SIZE_LABEL = "block size, ∛(2 V), m"
 COVARIATES = {
     "range_m": ("mean range, m", 1.0),
-    "incidence_rad": ("angle of incidence, degrees", 180 / np.pi),
+    "incidence_rad": ("incidence angle, degrees", 180 / np.pi),
     "edge_m": ("distance from the nearest edge, m", 1.0),
     "albedo": ("albedo", 1.0),
 }
-"""Label and factor of what noise is shown against."""
+"""Axis label and display factor of each covariate."""
 
 
 @dataclass(frozen=True)
 class MapPanel:
-    """One map of a row: values (h, w), m; block: labels whose outlines are drawn, None without."""
+    """One map of a figure: values (h, w), m; block: labels whose outlines are drawn, or None."""
 
     title: str
     values: NDArray[np.floating]
@@ -55,7 +55,15 @@ class MapPanel:
 
 
 def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, signed: bool) -> bytes:
-    """Maps in rows of two on one colour scale: -limit_m to limit_m where `signed`, else 0 to limit_m."""
+    """Draw maps in rows of two on one colour scale.
+
+    Parameters
+    ----------
+    panels : The maps.
+    limit_m : End of the scale, m.
+    label : Label of the colour bar.
+    signed : Whether the scale begins at -limit_m or at 0.
+    """
     columns = min(len(panels), 2)
     rows = -(-len(panels) // columns)
     aspect = max(panel.grid.height / panel.grid.width for panel in panels)
@@ -83,7 +91,9 @@ def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, sign
 
 
 def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
-    """Histograms (dashed: normal, of the same median and NMAD), linear and logarithmic, and variograms with their models."""
+    """Draw histograms (dashed: normal with the same median and NMAD), linear and logarithmic, and variograms with
+    their models.
+    """
     figure = Figure(figsize=(_WIDTH_IN, 4.4), dpi=DPI, layout="constrained")
     linear, logarithmic, correlation = figure.subplots(1, 3)
     for colour, (name, noise) in zip(_colours(len(noises)), noises.items(), strict=True):
@@ -107,7 +117,7 @@ def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
 
 
 def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """NMAD over stable ground against range, incidence, distance from edges and albedo."""
+    """Draw the NMAD over stable ground against range, incidence angle, distance from edges, and albedo."""
     figure = Figure(figsize=(_WIDTH_IN, 6.4), dpi=DPI, layout="constrained")
     panels = figure.subplots(2, 2, sharey=True).ravel()
     for axes, (key, (label, factor)) in zip(panels, COVARIATES.items(), strict=True):
@@ -127,9 +137,10 @@ def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Share of blocks seen against size and depth (points: classes with 95 % intervals; lines: the curve), and volume errors.
+    """Draw the share of blocks detected against size and depth, and the volume errors.
 
-    The latter for classes of which at least half are seen: below, noise is as large as the volume.
+    Points are classes with 95 % intervals, lines the fitted curves. Volume errors are drawn for classes of which at least half
+    are detected; below, the noise is as large as the volume.
     """
     figure = Figure(figsize=(_WIDTH_IN, 4.4), dpi=DPI, layout="constrained")
     by_size, by_depth, volume = figure.subplots(1, 3)
@@ -149,8 +160,8 @@ def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
         dress(axes, label, "blocks seen, %")
     volume.axhline(0, color="0.3", linewidth=0.8, linestyle=":")
     volume.set_ylim(-100, 100)
-    dress(volume, _SIZE_LABEL, "error of the volume, %: median, NMAD")
-    volume.sharex(by_size)  # has no data where less than half of the blocks of every size are seen
+    dress(volume, _SIZE_LABEL, "volume error, %: median, NMAD")
+    volume.sharex(by_size)  # is empty if fewer than half of the blocks of every size are detected
     for axes in (by_size, by_depth):
         _metric(axes)
     _grid_and_legend(figure, [by_size, by_depth, volume])
@@ -158,7 +169,7 @@ def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def table_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Share of blocks seen by size and depth, one panel a sensor; white: no such block."""
+    """Draw the share of blocks detected by size and depth, one panel for each sensor; white: no such block."""
     figure = Figure(figsize=(_WIDTH_IN, 4.0), dpi=DPI, layout="constrained")
     row = np.atleast_1d(figure.subplots(1, len(found), sharey=True))
     for axes, each in zip(row, found, strict=True):
@@ -176,19 +187,20 @@ def table_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def scale_limit_m(sigma_m: float) -> float:
-    """Where the colours of difference maps end, m."""
+    """Return the end of the colour scale of difference maps, m."""
     return SCALE_SIGMAS * sigma_m
 
 
 def level_limit_m(noises: Sequence[MapNoise]) -> float:
-    """Where the colours of levels of detection end, m: at the 98 % quantile of the noisiest."""
+    """Return the end of the colour scale of levels of detection, m: the 98 % quantile of the noisiest sensor."""
     tops = [float(np.nanquantile(noise.level, 0.98)) for noise in noises if np.isfinite(noise.level).any()]
     return max(tops, default=1e-3) or 1e-3
 
 
 def _shares(
-    axes: Axes, classes: Sequence[SizeInterval], curve: DetectionCurve | None, colour: str, shift: float, name: str
+    axes: Axes, classes: Sequence[DetectionClass], curve: DetectionCurve | None, colour: str, shift: float, name: str
 ) -> None:
+    """Draw the share detected by class with intervals, and the fitted curve."""
     shown = [item for item in classes if item.blocks]
     middle = np.array([np.sqrt(item.low_m * item.high_m) * shift for item in shown])
     share = np.array([100 * item.seen / item.blocks for item in shown])
@@ -201,11 +213,12 @@ def _shares(
 
 
 def _colours(count: int) -> list[str]:
+    """Return one colour for each sensor."""
     return [FAMILY[number % len(FAMILY)] for number in range(count)]
 
 
 def _metric(axes: Axes, *, both: bool = False) -> None:
-    """A logarithmic axis of metres, or two, with plain numbers; linear as it is where nothing positive is drawn."""
+    """Make one axis, or both, logarithmic with plain numbers, unless nothing positive is drawn."""
     scales = [(axes.set_xscale, axes.xaxis), (axes.set_yscale, axes.yaxis)][: 1 + both]
     for (set_scale, axis), smallest in zip(scales, axes.dataLim.minpos, strict=False):
         if np.isfinite(smallest):
@@ -214,6 +227,7 @@ def _metric(axes: Axes, *, both: bool = False) -> None:
 
 
 def _grid_and_legend(figure: Figure, panels: Sequence[Axes]) -> None:
+    """Add grid lines to all panels and one legend to the figure."""
     for axes in panels:
         axes.grid(color="0.9", linewidth=0.6)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9, frameon=False)

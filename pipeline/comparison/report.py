@@ -1,4 +1,4 @@
-"""The folder that `scarpsim compare` fills: comparison.json, CSV tables, GeoTIFFs, pictures and report.html."""
+"""Write the folder of a comparison: comparison.json, CSV tables, GeoTIFFs, pictures and report.html."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from pipeline.comparison.assess import SensorAssessment, grid_record, shared_scale_m
-from pipeline.comparison.comparison import ComparedSensors
+from pipeline.comparison.comparison import ComparisonResult
 from pipeline.comparison.detection_curve import LEAST_BLOCKS, DetectionCurve
 from pipeline.comparison.figures import (
     MapPanel,
@@ -38,14 +38,15 @@ COMPARISON_FILE = "comparison.json"
 _NOTHING = "\N{EN DASH}"
 
 
-def write_comparison(out: Path, comparison: ComparedSensors) -> Path:
-    """Write everything; returns the report's path. The folder appears when all of it is there."""
+def write_comparison(out: Path, comparison: ComparisonResult) -> Path:
+    """Write the result folder, which appears only when everything is in it, and return the path of its report."""
     with filling(out) as folder:
         _write(folder, comparison)
     return out / "report.html"
 
 
-def _write(out: Path, comparison: ComparedSensors) -> None:
+def _write(out: Path, comparison: ComparisonResult) -> None:
+    """Write all files into a folder."""
     trial, found = comparison.trial, comparison.found
     sizes = _write_products(out, comparison)
     write_csv(out / "noise.csv", _noise_rows(comparison))
@@ -61,7 +62,7 @@ def _write(out: Path, comparison: ComparedSensors) -> None:
         "epochs": len(trial.epochs),
         "grid": grid_record(trial.grid),
         "sensors": [
-            {**each.to_dict(), "angular_step_rad": seen.contestant.angular_step_rad, "bytes": sizes[each.name]}
+            {**each.to_dict(), "angular_step_rad": seen.setup.angular_step_rad, "bytes": sizes[each.name]}
             for each, seen in zip(found, trial.seen, strict=True)
         ],
         "measured": [{"name": maps.name, "points": maps.points, "noise": noise.to_dict()} for maps, noise in comparison.measured],
@@ -83,12 +84,14 @@ def _write(out: Path, comparison: ComparedSensors) -> None:
 
 
 def answer(found: SensorAssessment) -> str:
-    """The sentence that people ask for: the smallest block that a sensor sees in 95 % of cases, and from which blocks."""
+    """Return the main result of a sensor as a sentence: the smallest block that it sees in 95 % of cases, and from
+    which blocks.
+    """
     curve = found.detection.by_size
     if curve is None:
         fell, in_view = len(found.detection.blocks), sum(block.in_view for block in found.detection.blocks)
         return (
-            f"{found.name}: {in_view} of the {fell} blocks that fell were in view, too few to say which sizes are seen; "
+            f"{found.name}: {in_view} of the {fell} blocks that fell were in view, too few for a detection curve; "
             f"{LEAST_BLOCKS} are needed."
         )
     blocks = f"{curve.seen} of {curve.count} blocks in view were seen, sizes {_sizes(curve.smallest_m, curve.largest_m)}"
@@ -96,46 +99,46 @@ def answer(found: SensorAssessment) -> str:
 
 
 def _smallest(curve: DetectionCurve) -> str:
-    """What the curve says of the smallest block that is seen in 95 % of cases."""
+    """Describe the estimate of the smallest block."""
     if curve.smallest_95_m is not None:
         return f"the smallest block seen in 95 % of cases, of those in view, has a size of {_cm(curve.smallest_95_m)}"
     if curve.between_m is None:
-        return f"no size is seen in 95 % of cases; {percent(curve.lapse, 0)} of the blocks in view stay unseen at any size"
+        return f"no size is seen in 95 % of cases; {percent(curve.lapse, 0)} of the blocks in view are missed at any size"
     low, high = curve.between_m
     if low is None:
-        return (
-            f"the smallest block seen in 95 % of cases is smaller than {_cm(curve.smallest_m)}: none of such a size fell in view"
-        )
+        return f"the smallest block seen in 95 % of cases is smaller than {_cm(curve.smallest_m)}; no such block fell in view"
     if high is None:
-        return f"the smallest block seen in 95 % of cases is larger than {_cm(curve.largest_m)}: none of such a size fell in view"
-    return f"the smallest block seen in 95 % of cases lies between {_cm(low)} and {_cm(high)}: no block of that size fell in view"
+        return f"the smallest block seen in 95 % of cases is larger than {_cm(curve.largest_m)}; no such block fell in view"
+    return f"the smallest block seen in 95 % of cases lies between {_cm(low)} and {_cm(high)}; no such block fell in view"
 
 
 def _interval(low_m: float | None, high_m: float | None) -> str:
-    """The interval of 95 % of a size; None: these blocks do not bound it."""
+    """Describe the confidence interval of the smallest block's size; None: the blocks do not bound it."""
     low = "no lower bound" if low_m is None else f"from {_cm(low_m)}"
     high = "no upper bound" if high_m is None else f"to {_cm(high_m)}"
     return f"95 % interval {low} {high}" if low_m is not None and high_m is not None else f"95 % interval: {low}, {high}"
 
 
 def _sizes(low_m: float, high_m: float) -> str:
+    """Format a range of sizes, or one size where both ends read alike."""
     return _cm(low_m) if _cm(low_m) == _cm(high_m) else f"{_cm(low_m)} to {_cm(high_m)}"
 
 
 def _cm(size_m: float) -> str:
+    """Format a length in centimetres."""
     return f"{100 * size_m:.1f} cm"
 
 
-def summary(comparison: ComparedSensors) -> str:
-    """The main figures as lines of text."""
-    steps = [(seen.contestant.name, seen.contestant.angular_step_rad) for seen in comparison.trial.seen]
+def summary(comparison: ComparisonResult) -> str:
+    """Return the main results as lines of text."""
+    steps = [(seen.setup.name, seen.setup.angular_step_rad) for seen in comparison.trial.seen]
     lines = [f"{name}: angular step {_step(step)}" for name, step in steps if step is not None]
     lines += [f"{name}: stable ground {noise.stable.summary()}" for name, noise in comparison.noises().items()]
     return "\n".join(lines + [answer(each) for each in comparison.found])
 
 
 def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows with the first one's keys as the header; None is empty. Nothing is written where there are no rows."""
+    """Write rows as a CSV file, with the keys of the first row as the header and None as an empty cell; no rows: no file."""
     rows = list(rows)
     if not rows:
         return
@@ -146,8 +149,8 @@ def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     write_text(path, text.getvalue())
 
 
-def _write_products(out: Path, comparison: ComparedSensors) -> dict[str, dict[str, int]]:
-    """Write maps, level of detection and the reference's points of each sensor; returns files' sizes by sensor, bytes."""
+def _write_products(out: Path, comparison: ComparisonResult) -> dict[str, dict[str, int]]:
+    """Write each sensor's maps, level of detection and reference points; return the file sizes by sensor, bytes."""
     trial, sizes = comparison.trial, {}
     limit = scale_limit_m(shared_scale_m(list(comparison.noises().values())))
     for seen, each in zip(trial.seen, comparison.found, strict=True):
@@ -164,12 +167,12 @@ def _write_products(out: Path, comparison: ComparedSensors) -> dict[str, dict[st
 
 
 def _shown(trial: Trial) -> int:
-    """The epoch in the pictures: the middle one, whose blocks are neither all seen nor all missed."""
+    """Return the number of the epoch in the pictures: the middle one, of which some blocks are seen and some are missed."""
     return trial.epochs[len(trial.epochs) // 2].number
 
 
-def pictures(comparison: ComparedSensors) -> dict[str, bytes]:
-    """The report's pictures as PNG, by the names of their files."""
+def pictures(comparison: ComparisonResult) -> dict[str, bytes]:
+    """Draw the report's pictures as PNG, by file name."""
     trial, found, noises = comparison.trial, comparison.found, comparison.noises()
     number = _shown(trial)
     epoch = trial.epochs[number - 1]
@@ -191,8 +194,8 @@ def pictures(comparison: ComparedSensors) -> dict[str, bytes]:
     }
 
 
-def _rows(comparison: ComparedSensors, sizes: Mapping[str, Mapping[str, int]]) -> list[tuple[str, list[str]]]:
-    """The table of the report: a title and one text a sensor, the measured epochs last."""
+def _rows(comparison: ComparisonResult, sizes: Mapping[str, Mapping[str, int]]) -> list[tuple[str, list[str]]]:
+    """Return the rows of the report's table: a title and one text for each sensor, then for each measurement."""
     noises, found = list(comparison.noises().values()), comparison.found
     blank = [_NOTHING] * len(comparison.measured)
 
@@ -208,7 +211,7 @@ def _rows(comparison: ComparedSensors, sizes: Mapping[str, Mapping[str, int]]) -
         ("Beyond 3 NMAD (normal: 0.27 %)", [percent(each.tails.beyond_3_nmad, 2) for each in noises]),
         ("Excess kurtosis", [f"{each.tails.excess_kurtosis:.1f}" for each in noises]),
         (
-            "Test of a normal distribution on independent pixels: p",
+            "Test for a normal distribution on independent pixels: p",
             [p_value_in_words(each.normality.p_value) for each in noises],
         ),
         ("Variogram (StD and range)", [each.model.summary() for each in noises]),
@@ -229,7 +232,7 @@ def _rows(comparison: ComparedSensors, sizes: Mapping[str, Mapping[str, int]]) -
         ("Hidden wall with data (bridged by triangles)", simulated([percent(each.complete_of_hidden) for each in found])),
         (
             "Angular step, azimuth by zenith",
-            simulated([_step(seen.contestant.angular_step_rad) for seen in comparison.trial.seen]),
+            simulated([_step(seen.setup.angular_step_rad) for seen in comparison.trial.seen]),
         ),
         ("Points of the reference", [f"{each.points:,}" for each in found] + measured_points),
         ("Time to measure", simulated([_seconds(each.scan_seconds) for each in found])),
@@ -244,15 +247,17 @@ def _rows(comparison: ComparedSensors, sizes: Mapping[str, Mapping[str, int]]) -
 
 
 def _step(step_rad: tuple[float, float] | None) -> str:
+    """Format angular steps in mrad."""
     return _NOTHING if step_rad is None else " by ".join(f"{1e3 * step:.3g}" for step in step_rad) + " mrad"
 
 
 def _share(found: SensorAssessment, field: str) -> str:
-    """How many of the blocks have a field set."""
+    """Count the blocks for which a field is true, of all blocks."""
     return f"{sum(getattr(block, field) for block in found.detection.blocks)} of {len(found.detection.blocks)}"
 
 
-def _noise_rows(comparison: ComparedSensors) -> Iterable[dict[str, Any]]:
+def _noise_rows(comparison: ComparisonResult) -> Iterable[dict[str, Any]]:
+    """Yield the rows of noise.csv."""
     for name, noise in comparison.noises().items():
         for number, each in enumerate([noise.stable, *noise.per_epoch]):
             yield {
@@ -266,22 +271,26 @@ def _noise_rows(comparison: ComparedSensors) -> Iterable[dict[str, Any]]:
 
 
 def _covariate_rows(found: Sequence[SensorAssessment]) -> Iterable[dict[str, Any]]:
+    """Yield the rows of by_covariate.csv."""
     for each in found:
         for name, bins in each.by.items():
             yield from ({"sensor": each.name, "covariate": name, **item.to_dict()} for item in bins)
 
 
 def _class_rows(found: Sequence[SensorAssessment]) -> Iterable[dict[str, Any]]:
+    """Yield the rows of detection.csv."""
     for each in found:
         for name, classes in (("size", each.detection.size_classes), ("depth", each.detection.depth_classes)):
             yield from ({"sensor": each.name, "by": name, **item.to_dict()} for item in classes)
 
 
 def _seconds(seconds: float | None) -> str:
+    """Format a duration."""
     if seconds is None:
         return _NOTHING
     return f"{seconds:.2g} s" if seconds < 10 else duration(seconds)
 
 
 def _megabytes(size: int) -> str:
+    """Format a file size."""
     return f"{size / 1e6:.1f} MB"

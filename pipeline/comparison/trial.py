@@ -1,7 +1,7 @@
-"""Several sensors in front of one wall, from which the same blocks fall: what their difference maps are good for.
+"""Simulate several sensors in front of one wall from which the same blocks fall.
 
-Wall, blocks, pixels and seed are the same for all; each sensor has its own place, noise, reconstruction and registration. What
-changed is known, so noise is measured where nothing fell (stable ground, 10 cm from any block) and errors everywhere.
+Wall, blocks, raster and seed are the same for all; each sensor has its own place, noise, reconstruction and registration. The
+true changes are known, so that noise can be evaluated on stable ground (10 cm from any block) and errors everywhere.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.change.difference import SurfaceRaster, cast_raster, difference, raster_grid, surface_raster
-from pipeline.comparison.covariates import Ground, ground, range_and_incidence, visible
-from pipeline.comparison.sensors_compared import Contestant
+from pipeline.comparison.covariates import UntouchedWall, range_and_incidence, untouched_wall, visible
+from pipeline.comparison.sensor_setups import SensorSetup
 from pipeline.registration.register import register_to
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import Look, look, reconstruct
@@ -36,17 +36,27 @@ from sensors.models.placement import check_in_front
 
 Raster = NDArray[np.float32]
 _MARGIN_M = 0.1
-"""From blocks to stable ground: more than a reconstruction blurs."""
+"""Distance of stable ground from blocks, m; larger than the blur of a reconstruction."""
 _LEAST_CHANGE_M = 1e-4
-"""Smaller changes of the true wall are the ray caster's rounding."""
+"""Smaller true changes, m, are rounding errors of the ray caster."""
 _CROWDING = 0.15
-"""Share of the wall that the blocks of an epoch may take with the room around them."""
+"""Largest share of the wall that the blocks of an epoch, with the space around them, may take."""
 _SIZE_SPREAD, _SMALLEST_SHARE = 0.15, 0.5
+"""Standard deviation and minimum of the block sizes of an epoch, as shares of their mean."""
 
 
 @dataclass(frozen=True)
 class TrueEpoch:
-    """What really happened before an epoch. block: (h, w) labels; change: (h, w), m, 0 where nothing fell; stable: (h, w)."""
+    """The true change of the wall before an epoch.
+
+    Attributes
+    ----------
+    number : Number of the epoch, from 1.
+    records : The blocks as blocks.json holds them.
+    block : (h, w) block labels.
+    change : (h, w) change, reference minus epoch, m; 0 where nothing fell.
+    stable : (h, w) true on stable ground.
+    """
 
     number: int
     records: list[dict[str, Any]]
@@ -56,12 +66,22 @@ class TrueEpoch:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What one sensor saw. site: with its viewpoints; changes: (e, h, w) difference maps, m; points: of the reference and of each
-    epoch; seconds: to simulate each epoch without carving; registration_rms_m: of each epoch, none without ICP; reference: the
-    first look; range_m, incidence_rad, visible: (h, w) of the untouched wall."""
+class SensorObservations:
+    """What one sensor observed.
 
-    contestant: Contestant
+    Attributes
+    ----------
+    setup : The sensor.
+    site : The simulated site, with the sensor's viewpoints.
+    changes : (e, h, w) difference maps, m.
+    points : Number of points of the reference and of each epoch.
+    seconds : Computing time of each epoch without carving, s.
+    registration_rms_m : RMS distance of ICP's inliers in each epoch, m; empty without ICP.
+    reference : The reference observation.
+    range_m, incidence_rad, visible : (h, w) range, m, incidence angle, rad, and visibility of the untouched wall.
+    """
+
+    setup: SensorSetup
     site: SensorSite
     changes: Raster
     points: tuple[int, ...]
@@ -75,22 +95,40 @@ class Seen:
 
 @dataclass(frozen=True)
 class Trial:
-    """All that was simulated: the wall at every pixel of the shared grid, the epochs as they were and as each sensor saw them."""
+    """The simulation behind a comparison.
+
+    Attributes
+    ----------
+    grid : Raster that all difference maps share.
+    wall : The untouched wall at every pixel.
+    epochs : The true changes.
+    seen : What each sensor observed.
+    """
 
     grid: Grid
-    ground: Ground
+    wall: UntouchedWall
     epochs: list[TrueEpoch]
-    seen: list[Seen]
+    seen: list[SensorObservations]
 
 
 def compare(
-    sensors: Sequence[Contestant], epochs: int, sizes_m: tuple[float, float] | None, progress: Progress | None = None
+    sensors: Sequence[SensorSetup], epochs: int, sizes_m: tuple[float, float] | None, progress: Progress | None = None
 ) -> Trial:
-    """Observe the wall of the first sensor's config before and after rocks fall, `epochs` times, with every sensor.
+    """Observe one wall before and after rockfall with every sensor.
 
-    sizes_m: blocks of epoch k have sides about s_k, which grow geometrically from the first to the second, so that the smallest
-    visible block is bracketed; None: the blocks of the config. Raises InputError where the sensors do not face the same side of
-    the wall, and for whatever is wrong with wall, sensors and blocks.
+    Parameters
+    ----------
+    sensors : The sensors; the first one's config gives wall and blocks.
+    epochs : Number of epochs with rockfall.
+    sizes_m : Block sizes in the first and the last epoch, m. They grow geometrically in between, so that the smallest visible
+        size
+        is bracketed. None: the blocks of the config.
+    progress : Receives the progress; None: nothing is shown.
+
+    Raises
+    ------
+    InputError
+        If the sensors do not face the same side of the wall, or wall, sensors or blocks cannot be simulated.
     """
     progress = progress or Progress()
     numbers = range(1, epochs + 1)
@@ -102,7 +140,7 @@ def compare(
         _check_one_frame(sensors, sites)
         caster = RayCaster(as_observed(config, sites[0].mesh))
         grid = raster_grid(sites[0].mesh.bounds, config.difference)
-        untouched, on = cast_raster(caster, grid), ground(caster, grid)
+        untouched, wall = cast_raster(caster, grid), untouched_wall(caster, grid)
     runs = []
     for each, site in zip(sensors, sites, strict=True):
         with progress.stage(f"{each.name}: epoch 0"):
@@ -118,15 +156,27 @@ def compare(
                 _true_epoch(number, block_records(blocks, carved.removed_volume_m3), untouched, cast_raster(after, grid))
             )
         for run in runs:
-            with progress.stage(f"{run.contestant.name}: epoch {number}"):
+            with progress.stage(f"{run.setup.name}: epoch {number}"):
                 run.observe(after, keyed)
-    return Trial(grid, on, truths, [run.seen(on, caster) for run in runs])
+    return Trial(grid, wall, truths, [run.seen(wall, caster) for run in runs])
 
 
 def rockfalls(
     config: RockfallConfig, bounds: FloatArray, epochs: int, sizes_m: tuple[float, float] | None
 ) -> list[RockfallConfig]:
-    """The blocks of each epoch: the config's, or with sides that grow from epoch to epoch, as many of them as have room."""
+    """Return the rockfall settings of each epoch.
+
+    Parameters
+    ----------
+    config : The rockfall of the config.
+    bounds : (2, 3) bounding box of the wall, m.
+    epochs : Number of epochs.
+    sizes_m : Block sizes of the first and the last epoch, m; None: the config's blocks in each epoch.
+
+    Returns
+    -------
+    One setting for each epoch, with as many blocks as have room.
+    """
     if sizes_m is None:
         return [config] * epochs
     area = float(np.prod((bounds[1] - bounds[0])[:2]))
@@ -138,32 +188,34 @@ def rockfalls(
     return result
 
 
-def _check_one_frame(sensors: Sequence[Contestant], sites: Sequence[SensorSite]) -> None:
+def _check_one_frame(sensors: Sequence[SensorSetup], sites: Sequence[SensorSite]) -> None:
+    """Raise InputError if a sensor faces another side of the wall than the first one."""
     for each, site in zip(sensors, sites, strict=True):
         if not np.allclose(site.frame.matrix, sites[0].frame.matrix, atol=1e-9):
             raise InputError(
-                f"does not face the side of the wall that {sensors[0].name} faces",
+                f"faces another side of the wall than {sensors[0].name}",
                 where=each.name,
-                remedy="compare sensors that look at the same face",
+                remedy="compare sensors that face the same side",
             )
 
 
 def _true_epoch(number: int, records: list[dict[str, Any]], before: SurfaceRaster, after: SurfaceRaster) -> TrueEpoch:
+    """Compute the true change and the stable ground from the wall before and after the rockfall."""
     change = difference(before, after)
     change = np.where(np.abs(change) < _LEAST_CHANGE_M, 0.0, change).astype(np.float32)
-    touched = (after.block != WALL) | (change != 0)  # NaN is not 0: holes of the wall are not stable either
+    touched = (after.block != WALL) | (change != 0)  # holes of the wall (NaN) are not stable either
     reach = round(_MARGIN_M / before.grid.gsd)
     distance = ndimage.distance_transform_edt(~touched) if touched.any() else np.full(touched.shape, np.inf)
     return TrueEpoch(number, records, after.block, change, distance > reach)
 
 
 class _SensorRun:
-    """One sensor's observations, epoch by epoch."""
+    """Observes the epochs of one sensor."""
 
-    def __init__(self, contestant: Contestant, site: SensorSite, caster: RayCaster, grid: Grid, random: KeyedRandom) -> None:
-        self.contestant, self.site, self.config = contestant, site, contestant.config
+    def __init__(self, setup: SensorSetup, site: SensorSite, caster: RayCaster, grid: Grid, random: KeyedRandom) -> None:
+        self.setup, self.site, self.config = setup, site, setup.config
         for where, viewpoint in site.viewpoints.items():
-            check_in_front(caster, viewpoint, f"{contestant.name}: {where}")
+            check_in_front(caster, viewpoint, f"{setup.name}: {where}")
         self.first = look(self.config, reference_sensor(self.config, site), caster, random.child("epoch", 0, "observe"))
         keyed = random.child("epoch", 0, "register")
         surface, self.target = reference_and_target(self.config, reconstruct(self.config, self.first), caster.mesh, keyed)
@@ -174,7 +226,7 @@ class _SensorRun:
         self.rms_m: list[float] = []
 
     def observe(self, after: RayCaster, keyed: KeyedRandom) -> None:
-        """Observe, reconstruct, register and difference, as `pipeline.run.epoch` does."""
+        """Observe, reconstruct, register and subtract one epoch, as `pipeline.run.epoch` does."""
         began = time.perf_counter()
         seen = look(self.config, self.site, after, keyed.child("observe"))
         surface = reconstruct(self.config, seen)
@@ -186,12 +238,12 @@ class _SensorRun:
         self.points.append(_count(seen))
         self.seconds.append(time.perf_counter() - began)
 
-    def seen(self, on: Ground, caster: RayCaster) -> Seen:
-        """What has been observed, with what it may depend on."""
+    def seen(self, wall: UntouchedWall, caster: RayCaster) -> SensorObservations:
+        """Return everything observed so far, with the covariates of the untouched wall."""
         viewpoints = list(self.site.viewpoints.values())
-        distance, incidence = range_and_incidence(on, viewpoints)
-        return Seen(
-            self.contestant,
+        distance, incidence = range_and_incidence(wall, viewpoints)
+        return SensorObservations(
+            self.setup,
             self.site,
             np.stack(self.changes),
             tuple(self.points),
@@ -200,9 +252,10 @@ class _SensorRun:
             self.first,
             distance,
             incidence,
-            visible(on, caster, viewpoints, every=self.contestant.sensor == "stereo"),
+            visible(wall, caster, viewpoints, every=self.setup.sensor == "stereo"),
         )
 
 
 def _count(seen: Look) -> int:
+    """Count the points of an observation, further returns included."""
     return sum(int(each.valid.sum()) + (0 if each.further is None else len(each.further.cell)) for each in seen.observations)

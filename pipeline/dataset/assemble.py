@@ -1,7 +1,8 @@
-"""From the shards to what people open: annotations.json of each split, the card, the checksums. One shard in memory at a time.
+"""Assemble a data set from its shards (records of single epochs): annotations.json of each split, the data set card and the
+checksums.
 
-All that is written here depends on the shards and dataset.json alone, so that an interrupted set ends in the bytes of an
-undisturbed one.
+The shards are read one at a time. The result depends on the shards and dataset.json only, so that an interrupted job ends with
+the same bytes as an undisturbed one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any, TextIO
 
 from pipeline.change.annotate import BLOCK_CATEGORY
 from pipeline.dataset.card import README, write_card
-from pipeline.dataset.folder import CHECKSUMS, Damage, found_damage, tile_files
+from pipeline.dataset.folder import CHECKSUMS, Damage, file_damage, tile_files
 from pipeline.dataset.plan import SPLITS, Split
 from pipeline.dataset.records import SHARDS, Record, read_dataset_file, read_shard, shard_name
 from pipeline.dataset.statistics import SetStatistics
@@ -26,25 +27,29 @@ ANNOTATIONS = "annotations.json"
 
 
 @dataclass
-class Assembled:
-    """How much a set holds, by split, and what is amiss with it."""
+class AssembledSet:
+    """Number of images and annotations by split, and warnings about the set."""
 
     images: dict[str, int] = field(default_factory=dict)
     annotations: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
 
-def assemble(folder: Path, *, complete: bool) -> Assembled:
-    """Write annotations.json of each split, the card and the checksums of a set whose shards are there.
+def assemble(folder: Path, *, complete: bool) -> AssembledSet:
+    """Write annotations.json of each split, the data set card and the checksums.
 
-    complete=False: put together those that are, of an interrupted set. Image and annotation ids count from 1 through train, val
-    and test, so that no two of a set are the same.
+    Image and annotation ids count from 1 through train, val and test, so that they are unique in the set.
+
+    Parameters
+    ----------
+    folder : Folder of the set.
+    complete : Whether all shards are there; False assembles those of an interrupted job.
     """
     dataset = read_dataset_file(folder)
     statistics = SetStatistics()
     digests: dict[str, str] = {}
-    writer = _Ids()
-    result = Assembled()
+    writer = _LastIds()
+    result = AssembledSet()
     for split in SPLITS:
         records = (record for record in shards(folder, dataset) if record["epoch"]["split"] == split)
         first = next(records, None)
@@ -67,24 +72,28 @@ def assemble(folder: Path, *, complete: bool) -> Assembled:
 
 
 def shards(folder: Path, dataset: Record) -> Iterator[Record]:
-    """The epochs' records that are there, in the order of the plan."""
+    """Yield the epochs' records that are there, in the order of the plan."""
     for name in _shard_names(dataset):
         record = read_shard(folder, name)
         if record is not None:
             yield record
 
 
-def whole_shards(folder: Path, dataset: Record) -> Iterator[Record]:
-    """All epochs' records; raises InputError where one is missing or damaged."""
+def complete_shards(folder: Path, dataset: Record) -> Iterator[Record]:
+    """Yield the records of all epochs; raise InputError if one is missing or damaged."""
     for name in _shard_names(dataset):
         record = read_shard(folder, name)
         if record is None:
-            raise InputError("is missing or damaged", where=str(folder / SHARDS / name), remedy="verify its set")
+            raise InputError(
+                "the file is missing or damaged",
+                where=str(folder / SHARDS / name),
+                remedy="run scarpsim dataset verify on its set",
+            )
         yield record
 
 
-def assembled_damages(folder: Path) -> list[Damage]:
-    """What is missing or damaged of the files that `assemble` writes, the list of checksums among them."""
+def assembled_damage(folder: Path) -> list[Damage]:
+    """Return what is missing or damaged of the files that `assemble` writes, including the list of checksums."""
     path = folder / CHECKSUMS
     if not path.is_file():
         return [Damage(Path(CHECKSUMS), "a folder" if path.is_dir() else "missing")]
@@ -93,12 +102,14 @@ def assembled_damages(folder: Path) -> list[Damage]:
     known = _known_digests(folder)
     if any(listed.get(name, "") != (digest or listed.get(name)) for name, digest in known.items()):
         return [Damage(Path(CHECKSUMS), "damaged")]
-    others = [name for name in listed if not name.startswith(f"{SHARDS}/") and not name.endswith(".tif")]  # shards know theirs
-    return [each for name in others for each in found_damage(folder, name, listed[name], CHECKSUMS)]
+    others = [
+        name for name in listed if not name.startswith(f"{SHARDS}/") and not name.endswith(".tif")
+    ]  # shards hold the checksums of tiles
+    return [each for name in others for each in file_damage(folder, name, listed[name], CHECKSUMS)]
 
 
 def _known_digests(folder: Path) -> dict[str, str]:
-    """What the list of checksums has to hold as far as the shards tell: tiles and shards with their checksums, "" of the rest."""
+    """Return the names that the list of checksums must hold, with the checksums known from the shards ("": unknown)."""
     dataset = read_dataset_file(folder)
     found: dict[str, str] = {README: ""}
     for record in shards(folder, dataset):
@@ -108,24 +119,27 @@ def _known_digests(folder: Path) -> dict[str, str]:
 
 
 @dataclass
-class _Ids:
-    """The last ids given."""
+class _LastIds:
+    """The last image and annotation ids given."""
 
     image: int = 0
     annotation: int = 0
 
 
 def _shard_names(dataset: Record) -> Iterator[str]:
+    """Yield the names of all planned shards."""
     for source, indices in dataset["epochs"].items():
         yield from (shard_name(source, index) for index in indices)
 
 
 def _chained(first: Record, rest: Iterator[Record]) -> Iterator[Record]:
+    """Yield the first record, then the rest."""
     yield first
     yield from rest
 
 
 def _info(dataset: Record, split: Split, complete: bool) -> dict[str, Any]:
+    """Return COCO's `info` section."""
     return {
         "description": f"Rockfall blocks in difference maps: {dataset['name']}, {split}",
         "version": dataset["fingerprint"],
@@ -139,11 +153,13 @@ def _write_coco(
     file: TextIO,
     info: dict[str, Any],
     records: Iterator[Record],
-    ids: _Ids,
+    ids: _LastIds,
     statistics: SetStatistics,
     digests: dict[str, str],
 ) -> None:
-    """Stream a split: the annotations as they come, then the images."""
+    """Stream the annotations.json of a split: annotations as they come, then the images; count statistics and checksums on the
+    way.
+    """
     head = {"info": info, "licenses": [], "categories": [BLOCK_CATEGORY]}
     file.write(_compact(head)[:-1] + ',"annotations":[')
     images = []
@@ -163,6 +179,7 @@ def _write_coco(
 
 
 def _image(record: Record, tile: Record, number: int) -> dict[str, Any]:
+    """Return COCO's entry of a tile."""
     return {
         "id": number,
         **tile["image"],
@@ -174,7 +191,7 @@ def _image(record: Record, tile: Record, number: int) -> dict[str, Any]:
 
 
 def _cell(record: Record) -> dict[str, Any]:
-    """What images and annotations say of where they come from."""
+    """Return the keys of images and annotations that say which epoch they come from."""
     epoch = record["epoch"]
     return {
         "sensor": epoch["sensor"],
@@ -188,4 +205,5 @@ def _cell(record: Record) -> dict[str, Any]:
 
 
 def _compact(value: Any) -> str:
+    """Format JSON without spaces."""
     return json.dumps(value, allow_nan=False, separators=(",", ":"))

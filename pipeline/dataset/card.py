@@ -1,4 +1,4 @@
-"""The data set card: README.md of the folder and its pictures. The same set gives the same bytes."""
+"""Write the data set card: README.md of the folder and its pictures. The same set gives the same bytes."""
 
 from __future__ import annotations
 
@@ -44,12 +44,11 @@ validity mask (a TIFF transparency mask of one bit a pixel: `rasterio.open(f).da
 pixel scale give its place on the wall in the wall frame (x along the wall, y up the wall, metres), as do `x_min_m`, `y_max_m` and
 `gsd_m` of the image's entry; `row` and `column` are its first pixel in the epoch's difference map.
 
-An annotation has beside COCO's keys: `size_m` (the block's three axes), `volume_m3` (rock removed), `measured_volume_m3` and
-`depth_m` (volume and mean depth that the epoch's map shows of the whole block), `signal_to_noise` (of the matched filter, which
-knows the niche's shape: docs/validation), `ignore` (1 where that is below the config's annotation.ignore_below: training leaves
-the block out of its loss, evaluations count it; `iscrowd` stays 0), `share_in_tile` (of the block's pixels; less than 1 where the
-tile's edge cuts it), `shape`, `sensor`, `wall`, `noise`, `size_class`, `seed`, `epoch` (index in the plan),
-`source`.
+In addition to COCO's keys, an annotation has `size_m` (the block's three axes), `volume_m3` (rock removed),
+`measured_volume_m3` and `depth_m` (volume and mean depth that the epoch's map shows of the whole block), `signal_to_noise` (of
+a matched filter that knows the niche's shape), `ignore` (1 where that is below the config's annotation.ignore_below: training
+leaves the block out of its loss, evaluations count it; `iscrowd` stays 0), `share_in_tile` (of the block's pixels; less than 1
+at a tile's edge), `shape`, `sensor`, `wall`, `noise`, `size_class`, `seed`, `epoch` (index in the plan) and `source`.
 """
 
 
@@ -58,12 +57,22 @@ _SURFACES = {
     "vertices": "the wall's own vertices, each measured by the pair (vertices: the thesis's method 2)",
     "colmap": "depth maps fused by COLMAP (colmap)",
 }
+"""Description of each way to make a surface."""
 
 
 def write_card(
     folder: Path, dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str], *, complete: bool
 ) -> list[str]:
-    """Write README.md and the pictures; digests: of the files so far, by name. Returns the names of what was written."""
+    """Write README.md and its pictures, and return the names of the written files.
+
+    Parameters
+    ----------
+    folder : Folder of the set.
+    dataset : Content of dataset.json.
+    statistics : Statistics of the set.
+    digests : Checksums of the other files, by name.
+    complete : Whether the set is complete.
+    """
     from pipeline.dataset.figures import noise_figure, sizes_figure
 
     pictures = {
@@ -80,25 +89,27 @@ def write_card(
 def _readme(
     dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str], pictures: list[str], complete: bool
 ) -> Iterator[str]:
+    """Yield the parts of README.md."""
     tiles = sum(cell.tiles for cell in statistics.cells.values())
     annotations = sum(cell.annotations for cell in statistics.cells.values())
     yield f"# {dataset['name']}\n"
     if not complete:
-        yield "**Incomplete: an interrupted job. The command below goes on with it.**\n"
+        yield "**Incomplete: the job was interrupted. The command below continues it.**\n"
     yield f"Simulated difference maps of rock walls with annotated rockfalls: {tiles:,} tiles, {annotations:,} annotations.\n"
     yield from _table(statistics)
-    yield "Noise: mean over the epochs of the StD of the difference map outside the blocks. S/N > 4: blocks that stand out of"
-    yield "the noise to the matched filter, which knows their shape: about what any detector could find, whatever its training."
+    yield "Noise: mean over the epochs of the StD of the difference map outside the blocks. S/N > 4: blocks that a matched filter"
+    yield "with their known shape separates from the noise, which is about what any detector could find."
     yield "Niche / box: the share of its bounding box that a niche fills, on average.\n"
     yield from _surfaces(dataset, statistics)
     yield from (f"![{_in_words(name)}]({name})\n" for name in pictures)
-    yield "In the samples red is missing rock, blue a surface that stands further out; the colours end at six times the noise."
+    yield "In the samples, red is missing rock, blue a surface that stands further out; the colours end at six times the noise."
     yield "Black outlines are the annotated masks, grey is no data.\n"
     yield from (_split_rules(dataset), _TILES, _loading(statistics))
     yield from _making(dataset, statistics, digests)
 
 
 def _table(statistics: SetStatistics) -> Iterator[str]:
+    """Yield the lines of the table with one row for each combination."""
     yield "| split | sensor | wall | noise | size | epochs | tiles | blocks a tile | noise, mm | S/N > 4, % | niche / box, % |"
     yield "|---|---|---|---|---|---|---|---|---|---|---|"
     for key in sorted(statistics.cells, key=lambda cell: (SPLITS.index(cell[0]), cell[1:])):
@@ -112,7 +123,7 @@ def _table(statistics: SetStatistics) -> Iterator[str]:
 
 
 def _surfaces(dataset: dict[str, Any], statistics: SetStatistics) -> Iterator[str]:
-    """How the surfaces are made, and where ray-traced samples are too coarse for the smallest blocks."""
+    """Describe how the surfaces are made, with warnings where ray-traced samples are too coarse for the smallest blocks."""
     yield (
         "Surfaces: " + "; ".join(f"{words}, of {', '.join(whose)}" for words, whose in _reconstructions(dataset).items()) + ".\n"
     )
@@ -120,7 +131,7 @@ def _surfaces(dataset: dict[str, Any], statistics: SetStatistics) -> Iterator[st
 
 
 def _reconstructions(dataset: dict[str, Any]) -> dict[str, list[str]]:
-    """The sensors' walls by how their surfaces are made."""
+    """Return sensors and walls by the description of their surfaces."""
     found: dict[str, list[str]] = {}
     for source in dataset["sources"].values():
         for sensor in source["config"]["sensors"]:
@@ -131,25 +142,26 @@ def _reconstructions(dataset: dict[str, Any]) -> dict[str, list[str]]:
 
 
 def _in_words(picture: str) -> str:
-    """What a picture shows, for those who cannot see it."""
+    """Return the alternative text of a picture."""
     name = Path(picture).stem
     words = {"sizes": "Histograms of the blocks' sizes", "noise": "Histograms of the epochs' noise"}
     return words.get(name) or f"Sample tiles ({name.removeprefix('samples_')}) with their annotations outlined"
 
 
 def _loading(statistics: SetStatistics) -> str:
-    """How to load what is there: its first split, at one level of its noise."""
+    """Return the loading examples for the first split and noise level of the set."""
     filled = (key for key, found in statistics.cells.items() if found.tiles)
     first = min(filled, key=lambda key: SPLITS.index(key[0]), default=("train", "", "", "usual", ""))
     return _LOADING.format(split=first[0], noise=first[3])
 
 
 def _split_rules(dataset: dict[str, Any]) -> str:
+    """Describe how the splits are separated."""
     shares = sorted({source["config"]["validation_region"] for source in dataset["sources"].values()})
     told = ", ".join(f"{100 * share:.0f} %" for share in shares)
     apart = (
-        "Training and validation tiles come from different epochs, and from different parts of a wall: the right\n"
-        f"end of each wall ({told} of its columns of tiles) is for validation alone. No tile of one overlaps a tile of the other."
+        "Training and validation tiles come from different epochs and from different parts of a wall: the right\n"
+        f"end of each wall ({told} of its columns of tiles) is for validation only, so that their tiles never overlap."
     )
     together = "Training and validation tiles come from different epochs, but not everywhere from different parts of a wall."
     rest = "Test tiles come from\nepochs of their own, from the whole wall."
@@ -157,28 +169,31 @@ def _split_rules(dataset: dict[str, Any]) -> str:
 
 
 def _making(dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str]) -> Iterator[str]:
+    """Describe how the set was made, with versions and checksums."""
     yield "## How it was made\n"
     for name, source in dataset["sources"].items():
         yield f"    {source['command'] or 'scarpsim dataset dataset.json --out DIR'}\n"
         versions = ", ".join(f"{key} {value}" for key, value in source["versions"].items())
         yield f"Source {name}, seed {source['config']['seed']}; {versions}.\n"
     if len(dataset["sources"]) == 1:
-        yield "`scarpsim dataset dataset.json --out DIR` makes it again, to the byte; the resolved config is in dataset.json.\n"
+        yield "`scarpsim dataset dataset.json --out DIR` makes the same bytes again; the resolved config is in dataset.json.\n"
     yield "## Checksums\n"
-    yield "`sha256sum -c checksums.sha256` checks every file, `scarpsim dataset verify .` also makes damaged tiles again.\n"
+    yield "`sha256sum -c checksums.sha256` checks every file; `scarpsim dataset verify .` also repairs damaged tiles.\n"
     listing = "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()) if name.endswith(".tif"))
     yield "| what | SHA-256 |\n|---|---|"
-    yield f"| the list of all tiles | {hashlib.sha256(listing.encode()).hexdigest()} |"
+    yield f"| list of all tiles | {hashlib.sha256(listing.encode()).hexdigest()} |"
     yield from (f"| {name} | {digest} |" for name, digest in sorted(digests.items()) if name.endswith(".json"))
     yield ""
 
 
 def _sizes(statistics: SetStatistics) -> dict[str, Any]:
+    """Return the histogram of block sizes by size class."""
     names = dict.fromkeys(key[4] for key in statistics.cells)
     return {name: sum(cell.sizes for key, cell in statistics.cells.items() if key[4] == name) for name in names}
 
 
 def _noise(statistics: SetStatistics) -> dict[str, list[float]]:
+    """Return the noise of each epoch, m, by sensor and noise level."""
     names = dict.fromkeys((key[1], key[3]) for key in statistics.cells)
     return {
         f"{sensor}, {noise}": [
@@ -189,7 +204,7 @@ def _noise(statistics: SetStatistics) -> dict[str, list[float]]:
 
 
 def _samples(folder: Path, statistics: SetStatistics) -> Iterator[tuple[str, bytes]]:
-    """A picture for each sensor: levels of noise down, classes of sizes across."""
+    """Yield a picture for each sensor, with noise levels as rows and size classes as columns."""
     from pipeline.dataset.figures import SampleTile, samples_figure
     from pipeline.dataset.loaders import masks_of
     from pipeline.formats.rasters.geotiff import read_tiff

@@ -1,7 +1,7 @@
-"""The epochs of a set on Dask's distributed: local processes, or the scheduler at an address. Queue and retries are Dask's.
+"""Make the epochs of a set on Dask's distributed: on local processes, or on a scheduler at an address.
 
-Local processes speak TLS with keys that exist in memory for one job alone, so that no other user of the machine can hand them
-work; there is no dashboard. A scheduler of the user's is as open or closed as the user set it up.
+Dask provides the queue and the retries. Local processes use TLS with keys that exist in memory for one job only, so that no other
+user of the machine can give them work; there is no dashboard. The user's own scheduler is as open as the user set it up.
 """
 
 from __future__ import annotations
@@ -20,30 +20,36 @@ from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-from pipeline.dataset import standstill
-from pipeline.dataset.worker import Order, fill_run
+from pipeline.dataset import watchdog
+from pipeline.dataset.worker import EpochOrder, make_and_store_run
 from scene.common.errors import InputError, OutsideError
 from scene.common.extras import how_to_install
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
 
-Run = list[Order]
+Run = list[EpochOrder]
+"""Epochs that a worker makes in one go."""
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables that limit the threads of numerical libraries."""
 _CONNECT_S = 20
+"""Time limit of a connection, s."""
 _LOOK_S, _LOST_S, _EMPTY_S = 5.0, 15.0, 45.0
-"""How often it is asked who works, how long nobody may, and how long a scheduler of the user's may have no workers."""
+"""Interval, s, at which workers are checked; time after which missing local workers, and missing workers of a user's scheduler,
+end the job, s.
+"""
 _CLOSE_S = 20.0
+"""Time limit for closing, s."""
 _STARTS = 3
-"""Times that local workers are started, all of which died."""
+"""Number of times that local workers are started if all have died."""
 _LONGEST_RUN = 8
-"""Epochs that a worker makes before it reports; what a killed worker costs at most."""
+"""Largest number of epochs in a run: a killed worker loses at most one run."""
 _RUNS_EACH = 2
-"""For each worker at least, so that the last to finish is not far behind."""
+"""Smallest number of runs for each worker, so that all finish at about the same time."""
 
 
-def runs(orders: Sequence[Order], workers: int) -> list[Run]:
-    """Orders in runs of neighbours that share a stage, which a worker then sets up once; of equal lengths within a stage."""
+def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
+    """Divide orders into runs of equal length that share a stage, so that a worker sets up the stage once."""
     longest = min(max(len(orders) // (_RUNS_EACH * workers), 1), _LONGEST_RUN)
     found = []
     for _, same in groupby(orders, key=lambda order: (order.source, order.stage)):
@@ -57,29 +63,42 @@ class _LostError(Exception):
     """All workers, or the scheduler, are gone."""
 
 
-def fill_on_cluster(orders: list[Order], count: int, scheduler: str) -> Iterator[dict[str, Any]]:
-    """What each order took, in the order in which they are done; count: local workers, or scheduler: an address.
+def make_on_cluster(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[dict[str, Any]]:
+    """Make and store epochs on a cluster, and yield what each took, in the order in which they finish.
 
-    Local workers share the cores; those of a scheduler have as many threads as Dask gave them, and must see the folder under the
-    same path. Raises InputError for a scheduler that does not answer; OutsideError for an epoch whose workers die again and
-    again, and where nobody is left to work.
+    Local workers share the cores. Workers of a scheduler use the threads that Dask gave them, and must see the folder under the
+    same path.
+
+    Parameters
+    ----------
+    orders : The epochs.
+    count : Number of local workers.
+    scheduler : Address of a scheduler; "": local workers.
+
+    Raises
+    ------
+    InputError
+        If the scheduler does not answer, or Dask is not installed.
+    OutsideError
+        If workers die repeatedly at one epoch, or none is left.
     """
     _require_distributed("--scheduler" if scheduler else "--workers")
     starts = 1 if scheduler else _STARTS
     for start in range(1, starts + 1):
         finished: set[int] = set()
         try:
-            for number, taken in _fill(orders, count, scheduler):
+            for number, taken in _make(orders, count, scheduler):
                 finished.add(number)
                 yield taken
             return
         except _LostError as lost:
             if start == starts:
-                raise OutsideError(f"{lost}; what was finished is kept, the same command goes on") from None
+                raise OutsideError(f"{lost}; finished epochs are kept, run the same command to continue") from None
         orders = [order for number, order in enumerate(orders) if number not in finished]
 
 
 def _require_distributed(where: str) -> None:
+    """Raise InputError if Dask's distributed is not installed."""
     try:
         import cryptography  # noqa: F401
         import distributed  # noqa: F401
@@ -88,11 +107,11 @@ def _require_distributed(where: str) -> None:
         raise InputError(problem, where=where, remedy=how_to_install("dataset")) from None
 
 
-def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The index in `orders` of each that is done, and what it took."""
+def _make(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield the index in `orders` of each epoch that is done, and what it took."""
     with ExitStack() as stack:
         if not scheduler:
-            stack.enter_context(standstill.workers_watched(standstill.STUCK_S))
+            stack.enter_context(watchdog.watch_workers(watchdog.STALLED_S))
         cluster = None if scheduler else _local(stack, count)
         client = _client(stack, cluster) if cluster else _remote(stack, scheduler)
         threads = 0 if scheduler else _threads_each(count)
@@ -100,7 +119,7 @@ def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int
         given = runs([replace(order, threads=threads) for order in orders], count or max(len(client.nthreads()), 1))
         keys = [f"epochs-{run[0].job}-{run[0].source}-{run[0].index:06d}" for run in given]
         run_of = dict(zip(keys, given, strict=True))
-        work = partial(standstill.unless_stuck, fill_run, standstill.STUCK_S) if cluster else fill_run
+        work = partial(watchdog.run_with_watchdog, make_and_store_run, watchdog.STALLED_S) if cluster else make_and_store_run
         for future, taken in _results(client, client.map(work, given, key=keys), cluster):
             for order, each in zip(run_of[future.key], taken, strict=True):
                 yield index[order.source, order.index], each
@@ -109,7 +128,9 @@ def _fill(orders: list[Order], count: int, scheduler: str) -> Iterator[tuple[int
 def _results(
     client: Client, futures: list[Future], cluster: LocalCluster | None
 ) -> Iterator[tuple[Future, list[dict[str, Any]]]]:
-    """Each future with its result as it is done; nobody keeps it, as Dask would make the epochs of a dead worker again for it."""
+    """Yield each future with its result as it finishes, and release it: Dask would otherwise repeat the epochs of
+    dead workers.
+    """
     from distributed import KilledWorker, wait
 
     pending, at_work = set(futures), time.monotonic()
@@ -124,7 +145,7 @@ def _results(
                 raise _LostError(lost) from None
             continue
         except KilledWorker as error:
-            remedy = "see that each has 2.5 GB of memory or more, then the same command goes on"
+            remedy = "give each worker at least 2.5 GB of memory and run the same command to continue"
             raise OutsideError(f"workers died while making {error.task}; {remedy}") from None
         except CancelledError:
             raise _LostError("the scheduler is gone") from None
@@ -136,37 +157,40 @@ def _results(
 
 
 def _lost(client: Client, cluster: LocalCluster | None) -> tuple[str, float]:
-    """Who is gone, in words ("": nobody), and how long that may be so, s: workers of a user's cluster come and go."""
+    """Return who is gone, in words ("": nobody), and how long to wait for it, s: workers of a user's cluster come and go."""
     if cluster:
         return "" if _has_workers(cluster) else "all workers have died", _LOST_S
     try:
         workers = client.sync(client.scheduler.ncores, callback_timeout=_LOOK_S)
     except (OSError, TimeoutError):
-        return "the scheduler does not answer any more", _LOST_S
+        return "the scheduler no longer answers", _LOST_S
     return "" if workers else "the scheduler has no workers", _EMPTY_S
 
 
 def _has_workers(cluster: LocalCluster) -> bool:
-    """Whether the scheduler runs and a worker's process lives; Dask starts killed ones again, but not one killed at its start."""
+    """Whether the scheduler runs and a worker lives. Dask restarts killed workers, but not one that is killed while starting."""
     return cluster.scheduler.status.name == "running" and any(nanny.is_alive() for nanny in list(cluster.workers.values()))
 
 
 def _threads_each(count: int) -> int:
+    """Return the number of threads for each local worker."""
     return max(1, len(os.sched_getaffinity(0)) // count)
 
 
 def _local(stack: ExitStack, count: int) -> LocalCluster:
-    """Workers on this machine, one thread of Dask's each. Dask's memory limit is off: it takes the ray tracer's for a leak."""
+    """Start workers on this machine, with one Dask thread each. Dask's memory limit is off: it takes the ray tracer's memory for
+    a leak.
+    """
     import dask
     from distributed import LocalCluster, Security
 
-    stack.enter_context(_script_kept_from_workers())
+    stack.enter_context(_workers_without_user_script())
     stack.enter_context(
         dask.config.set(
             {
                 "distributed.nanny.pre-spawn-environ": dict.fromkeys(_POOLS, str(_threads_each(count))),
                 "distributed.worker.memory.spill": False,
-                "distributed.scheduler.http.routes": [],  # what is left of the dashboard's server tells nothing
+                "distributed.scheduler.http.routes": [],  # no pages on the dashboard's server
                 "distributed.worker.http.routes": [],
             }
         )
@@ -176,22 +200,22 @@ def _local(stack: ExitStack, count: int) -> LocalCluster:
             n_workers=count,
             threads_per_worker=1,
             memory_limit=0,
-            loop=stack.enter_context(_deaf_loop()),
+            loop=stack.enter_context(_loop_without_interrupts()),
             security=Security.temporary(),
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             silence_logs=logging.CRITICAL,
         )
     except (RuntimeError, OSError, TimeoutError) as error:
-        raise _LostError(f"the workers do not start ({error})") from None
+        raise _LostError(f"the workers did not start ({error})") from None
     stack.callback(_closed, cluster)
     return cluster
 
 
 @contextmanager
-def _script_kept_from_workers() -> Iterator[None]:
-    """Within it new processes do not run the user's script, which would make the set once more in each of them.
+def _workers_without_user_script() -> Iterator[None]:
+    """Keep processes that start in this block from running the user's script, which would make the set once more in each of them.
 
-    Processes that are spawned import the main module by its name or file; nothing that a worker does is in it.
+    Spawned processes import the main module by its name or file, but no worker needs anything from it.
     """
     main = sys.modules["__main__"]
     held: dict[str, Any] = {name: vars(main)[name] for name in ("__spec__", "__file__") if name in vars(main)}
@@ -204,6 +228,7 @@ def _script_kept_from_workers() -> Iterator[None]:
 
 
 def _client(stack: ExitStack, cluster: LocalCluster) -> Client:
+    """Connect to the local workers."""
     from distributed import Client
 
     client = Client(cluster)
@@ -212,10 +237,11 @@ def _client(stack: ExitStack, cluster: LocalCluster) -> Client:
 
 
 @contextmanager
-def _deaf_loop() -> Iterator[Any]:
-    """An event loop in a thread that no interrupt reaches, nor the processes that are started from it.
+def _loop_without_interrupts() -> Iterator[Any]:
+    """Provide an event loop in a thread that ignores Ctrl-C, as do the processes started from it.
 
-    A Ctrl-C goes to all processes of a terminal; this one hears it and stops the workers, each of which would print a traceback.
+    Ctrl-C goes to all processes of a terminal. Only this process handles it and stops the workers, which would else print
+    tracebacks.
     """
     from distributed.utils import LoopRunner
 
@@ -234,17 +260,19 @@ def _deaf_loop() -> Iterator[Any]:
 
 
 def _closed(each: LocalCluster | Client) -> None:
-    """Stop it; the outcome is known, so that nothing that goes wrong here may take its place.
+    """Close a cluster or client, ignoring errors, as the outcome of the job is already known.
 
-    A worker that does not end in time, on a busy machine, ends with this process. A client that is just giving up a connection
-    fails with a RuntimeError of asyncio's timeouts, that of a scheduler that is gone with an OSError.
+    A worker that does not end in time ends with this process. A client that is giving up a connection raises a RuntimeError of
+    asyncio, one of a lost scheduler an OSError.
     """
     with suppress(OSError, RuntimeError):
         each.close(timeout=_CLOSE_S)
 
 
 def _remote(stack: ExitStack, address: str) -> Client:
-    """The user's scheduler; for tls:// Dask takes the certificates from its own configuration (docs/reference/data_sets.md)."""
+    """Connect to the user's scheduler. For tls://, Dask's own configuration gives the
+    certificates (docs/reference/data_sets.md).
+    """
     from distributed import Client
 
     try:
@@ -253,7 +281,7 @@ def _remote(stack: ExitStack, address: str) -> Client:
         raise InputError(
             f"no scheduler answers at '{address}' ({error})",
             where="--scheduler",
-            remedy="give the address that it printed, and for tls:// the certificates (docs/reference/data_sets.md)",
+            remedy="use the address that it printed; tls:// also needs certificates (docs/reference/data_sets.md)",
         ) from None
     stack.callback(_closed, client)
     return client

@@ -1,4 +1,4 @@
-"""Merging finished sets into one, and splitting one: tiles and shards are copied, the rest is put together anew."""
+"""Merge finished sets into one, and split one into several: tiles and shards are copied, the other files are assembled again."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pipeline.dataset.assemble import assemble, whole_shards
+from pipeline.dataset.assemble import assemble, complete_shards
 from pipeline.dataset.folder import tile_files
 from pipeline.dataset.records import SHARDS, Record, read_dataset_file, shard_name, write_dataset_file, write_shard
 from pipeline.dataset.run import DatasetSummary
@@ -20,43 +20,63 @@ from pipeline.formats.files.lock import is_free, locked
 from scene.common.errors import InputError, nearest
 
 KEYS = ("sensor", "noise", "size", "wall", "split")
+"""Properties of an epoch by which a set can be split."""
 
 
 def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
-    """Merge finished sets into a new one; ids are given anew, and a set's files get its fingerprint before their names.
+    """Merge finished sets into a new one.
 
-    Raises InputError for an unfinished set, two sets of one source, and a folder in use.
+    Ids are assigned again, and each file name gets the fingerprint of its set as a prefix.
+
+    Parameters
+    ----------
+    folders : Two or more finished sets.
+    out : New folder.
+
+    Raises
+    ------
+    InputError
+        If a set is unfinished, two sets hold the same epochs, or the folder is in use.
     """
     if len(folders) < 2:
-        raise InputError(f"needs two folders or more, got {len(folders)}", where="scarpsim dataset merge")
+        raise InputError(f"two or more folders are needed, got {len(folders)}", where="scarpsim dataset merge")
     sets = [(folder, _finished(folder)) for folder in folders]
     sources: dict[str, Any] = {}
     epochs: dict[str, list[int]] = defaultdict(list)
     for folder, dataset in sets:
         for source, indices in dataset["epochs"].items():
             if set(epochs[source]) & set(indices):
-                raise InputError("holds epochs that an earlier one holds too", where=str(folder), remedy="give each set once")
+                raise InputError("an earlier set has the same epochs", where=str(folder), remedy="give each set once")
             epochs[source] = sorted({*epochs[source], *indices})
             sources[source] = {**dataset["sources"][source], "prefix": f"{source}_"}
     with locked(_new(out)), _all_or_nothing(out):
         for folder, dataset in sets:
-            for record in whole_shards(folder, dataset):
+            for record in complete_shards(folder, dataset):
                 _copy(folder, out, record, dataset["sources"][record["source"]]["prefix"], f"{record['source']}_")
         name = "-".join(dict.fromkeys(dataset["name"] for _, dataset in sets))
         return _finish(out, name, sources, dict(epochs))
 
 
 def split_dataset(folder: Path, out: Path, keys: Sequence[str]) -> list[DatasetSummary]:
-    """Make a set of its own of every combination of `keys` (sensor, noise, size, wall, split) that a finished set holds.
+    """Make one set for each combination of properties in a finished set.
 
-    The sets are folders of `out`, named after their combination. Raises InputError for an unknown key and a folder in use.
+    Parameters
+    ----------
+    folder : The finished set.
+    out : Folder of the new sets, which are named after their combination.
+    keys : Properties: sensor, noise, size, wall, split.
+
+    Raises
+    ------
+    InputError
+        If a key is unknown or the folder is in use.
     """
     for key in keys:
         if key not in KEYS:
             raise InputError(f"unknown key '{key}'", where="--by", allowed=", ".join(KEYS), remedy=nearest(key, KEYS))
     dataset = _finished(folder)
     found: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
-    for record in whole_shards(folder, dataset):
+    for record in complete_shards(folder, dataset):
         name = "_".join(record["epoch"][key] for key in keys)
         found[name][record["source"]].append(record["epoch"]["index"])
     with _all_or_nothing(out):
@@ -65,7 +85,7 @@ def split_dataset(folder: Path, out: Path, keys: Sequence[str]) -> list[DatasetS
 
 @contextmanager
 def _all_or_nothing(out: Path) -> Iterator[None]:
-    """Remove what the block wrote into `out` where it ends with wrong input."""
+    """Remove what the block wrote into `out` if it ends with an InputError."""
     missing = [each for each in (out, *out.parents) if not each.exists()]
     with noting() as written:
         try:
@@ -73,36 +93,39 @@ def _all_or_nothing(out: Path) -> Iterator[None]:
         except InputError:
             remove_written(out, written)
             for each in missing:
-                with suppress(OSError):  # holds what others put there
+                with suppress(OSError):  # contains files of others
                     each.rmdir()
             raise
 
 
 def _part(folder: Path, out: Path, name: str, dataset: Record, epochs: dict[str, list[int]]) -> DatasetSummary:
+    """Copy some epochs of a set into a new one."""
     sources = {source: dataset["sources"][source] for source in epochs}
     with locked(_new(out)):
-        for record in whole_shards(folder, {"epochs": epochs}):
+        for record in complete_shards(folder, {"epochs": epochs}):
             prefix = sources[record["source"]]["prefix"]
             _copy(folder, out, record, prefix, prefix)
         return _finish(out, name, sources, {source: list(indices) for source, indices in epochs.items()})
 
 
 def _finished(folder: Path) -> Record:
+    """Read dataset.json, and raise InputError if the set is not finished."""
     dataset = read_dataset_file(folder)
     if not dataset["complete"]:
-        remedy = "run the command that makes it again"
-        raise InputError("is not finished", where=str(folder), remedy=remedy)
+        remedy = "run the command that makes it once more"
+        raise InputError("the set is not finished", where=str(folder), remedy=remedy)
     return dataset
 
 
 def _new(out: Path) -> Path:
+    """Return the folder, or raise InputError if it is in use."""
     if out.exists() and not is_free(out):
-        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
+        raise InputError("the path exists and is not an empty folder", where=f"--out {out}", remedy="choose another --out")
     return out
 
 
 def _copy(folder: Path, out: Path, record: Record, before: str, after: str) -> None:
-    """Copy an epoch's tiles and its shard; the tiles' names change their prefix."""
+    """Copy an epoch's tiles and shard, replacing the prefix of the tiles' names."""
     old = [name for name, _ in tile_files(record)]
     for tile in record["tiles"]:
         image = tile["image"]
@@ -116,11 +139,12 @@ def _copy(folder: Path, out: Path, record: Record, before: str, after: str) -> N
         target.parent.mkdir(parents=True, exist_ok=True)
         note(target)
         if not source.is_file() or sha256(shutil.copyfile(source, target)) != digest:
-            raise InputError("is missing or damaged", where=str(source), remedy="verify its set")
+            raise InputError("the file is missing or damaged", where=str(source), remedy="run scarpsim dataset verify on its set")
     write_shard(out, shard, record)
 
 
 def _finish(out: Path, name: str, sources: dict[str, Any], epochs: dict[str, list[int]]) -> DatasetSummary:
+    """Assemble a merged or split set."""
     write_dataset_file(out, name, sources, epochs)
     assembled = assemble(out, complete=True)
     write_dataset_file(out, name, sources, epochs, complete=True)

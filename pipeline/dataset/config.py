@@ -1,4 +1,4 @@
-"""The config of a data set: a matrix of walls, sensors, levels of noise and sizes of blocks, and how many epochs of each."""
+"""The config of a data set: combinations of walls, sensors, noise levels and block sizes, and how many epochs of each."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from sensors.models.sensor_model import StereoModel, TlsModel
 
 DATASET_FILE = "dataset.json"
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9.-]*$", max_length=40)]
-"""A word that can stand in a file name, between underscores."""
+"""A word that can be part of a file name, between underscores."""
 
 
 _Factor = Annotated[float, Field(ge=0)]
 
 
 class ScaledModel(Config):
-    """A sensor model, all of whose noise is multiplied by a factor. In a file `model` may be a bundled name or a file."""
+    """A sensor model whose noise is multiplied by a factor. In a file, `model` may be a bundled name or a path."""
 
     model: SensorModel
     scale: _Factor | dict[str, _Factor] = Field(1.0, description="factor of every sigma and mean of the noise, one or by wall")
@@ -39,11 +39,11 @@ class ScaledModel(Config):
     @model_validator(mode="after")
     def _has_an_orientation(self) -> Self:
         if self.scaled == "orientation" and self.model.sensor != "stereo":
-            raise ValueError("scaled: orientation is of a stereo pair; a laser scanner has none (scaled: all)")
+            raise ValueError("a laser scanner has no orientation noise to scale; use scaled: all")
         return self
 
     def on(self, wall: str) -> StereoModel | TlsModel:
-        """The model with its noise scaled for a wall."""
+        """Return the model with its noise scaled for a wall."""
         factor = self.scale[wall] if isinstance(self.scale, dict) else self.scale
         sigmas = {key: value for key, value in self.model.noise.model_dump().items() if key not in _NO_SIGMA}
         values = {key: _scaled(value, factor) for key, value in sigmas.items() if self.scaled in ("all", key)}
@@ -52,76 +52,79 @@ class ScaledModel(Config):
 
 
 _NO_SIGMA = {"regularization_step_px", "orientation_drawn"}
+"""Noise keys that are no sizes and stay unscaled."""
 
 
 def _scaled(value: Any, factor: float) -> Any:
+    """Multiply all numbers of a nested mapping."""
     if isinstance(value, Mapping):
         return {key: _scaled(inner, factor) for key, inner in value.items()}
     return value * factor
 
 
 class NoiseLevel(Config):
-    """The sensors' models at one level of noise."""
+    """The sensor models at one level of noise."""
 
     stereo: ScaledModel | None = Field(None, description="model of the stereo pair")
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")
 
     def of(self, sensor: SensorName) -> ScaledModel | None:
+        """Return the model of a sensor."""
         return self.stereo if sensor == "stereo" else self.tls
 
 
 class SizeClass(Config):
-    """Blocks of one class of sizes."""
+    """Blocks of one size class."""
 
-    blocks_per_m2: float = Field(
-        gt=0, le=1e6, description="blocks on the area of the wall; gives rockfall.count, whatever that says"
-    )
+    blocks_per_m2: float = Field(gt=0, le=1e6, description="blocks per area of the wall; replaces rockfall.count")
     rockfall: RockfallConfig = RockfallConfig()
 
 
 class Part(Config):
-    """A part of the matrix: every combination of its walls, noise, sizes and of the sensors, each with as many epochs."""
+    """A part of the set: all combinations of its walls, noise levels, size classes and the sensors, with equally many epochs
+    each.
+    """
 
     walls: tuple[Name, ...] = Field(min_length=1, description="names of walls")
-    noise: tuple[Name, ...] = Field(min_length=1, description="names of levels of noise")
-    sizes: tuple[Name, ...] = Field(min_length=1, description="names of classes of sizes")
-    train: int = Field(0, ge=0, le=9999, description="epochs for training, of each combination")
-    val: int = Field(0, ge=0, le=9999, description="epochs for validation, of each combination")
-    test: int = Field(0, ge=0, le=9999, description="epochs for testing, of each combination")
+    noise: tuple[Name, ...] = Field(min_length=1, description="names of noise levels")
+    sizes: tuple[Name, ...] = Field(min_length=1, description="names of size classes")
+    train: int = Field(0, ge=0, le=9999, description="training epochs of each combination")
+    val: int = Field(0, ge=0, le=9999, description="validation epochs of each combination")
+    test: int = Field(0, ge=0, le=9999, description="test epochs of each combination")
 
 
 class DatasetConfig(Config):
-    """A data set of tiles of difference maps."""
+    """Config of a data set of difference map tiles."""
 
     name: str = Field("rockfall", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name of the data set")
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
     sensors: tuple[SensorName, ...] = Field(("stereo", "tls"), min_length=1, description="sensors that observe every epoch")
     walls: dict[Name, SimulationConfig] = Field(
         min_length=1,
-        description="walls and the sensors before them, by name; in a file `{site: name or file, set: [key=value, ...]}`",
+        description="walls and the sensors in front of them, by name; in a file `{site: name or file, set: [key=value, ...]}`",
     )
-    noise: dict[Name, NoiseLevel] = Field(min_length=1, description="levels of noise, by name")
-    sizes: dict[Name, SizeClass] = Field(min_length=1, description="classes of sizes, by name")
-    parts: tuple[Part, ...] = Field(min_length=1, description="what the matrix holds")
+    noise: dict[Name, NoiseLevel] = Field(min_length=1, description="noise levels, by name")
+    sizes: dict[Name, SizeClass] = Field(min_length=1, description="size classes, by name")
+    parts: tuple[Part, ...] = Field(min_length=1, description="combinations in the set")
     tiles: TileConfig = TileConfig()
     annotation: AnnotationConfig = AnnotationConfig()
     validation_region: float = Field(
         0.43,
         ge=0,
         lt=1,
-        description="share of a wall's columns of tiles, at its right end, for validation alone: training tiles come from the "
-        "rest, each from epochs of their own; 0: told by epoch only",
+        description="share of a wall's columns of tiles, at its right end, that is for validation only; training tiles come from "
+        "the rest and from other epochs; 0: separated by epoch only",
     )
     references: int = Field(
-        1, ge=1, le=999, description="reference epochs of each wall, sensor and noise, taken in turn by the epochs"
+        1, ge=1, le=999, description="reference epochs of each wall, sensor and noise level; the epochs use them in turn"
     )
-    truth: bool = Field(False, description="the true difference of each tile too, in a folder `truth`")
+    truth: bool = Field(False, description="also write the true difference of each tile, in a folder `truth`")
 
     @field_validator("sensors")
     @classmethod
     def _each_once(cls, sensors: tuple[SensorName, ...]) -> tuple[SensorName, ...]:
         if len(set(sensors)) < len(sensors):
-            raise ValueError("names a sensor twice")
+            raise ValueError("a sensor is listed twice")
         return sensors
 
     @model_validator(mode="after")
@@ -132,13 +135,13 @@ class DatasetConfig(Config):
             for kind, names in known.items():
                 unknown = [name for name in getattr(part, kind) if name not in names]
                 if unknown:
-                    hint = nearest(unknown[0], names) or f"known are {', '.join(names)}"
-                    raise ValueError(f"parts.{number}.{kind} names '{unknown[0]}', which is not under {kind}; {hint}")
+                    hint = nearest(unknown[0], names) or f"defined: {', '.join(names)}"
+                    raise ValueError(f"parts.{number}.{kind}: '{unknown[0]}' is not defined under {kind}; {hint}")
             if not part.train + part.val + part.test:
-                raise ValueError(f"parts.{number} has no epochs: give train, val or test a number")
+                raise ValueError(f"parts.{number} has no epochs; set train, val or test")
             found = {(wall, noise, size) for wall in part.walls for noise in part.noise for size in part.sizes}
             if cells & found:
-                raise ValueError(f"parts.{number} holds {' '.join(min(cells & found))} a second time")
+                raise ValueError(f"parts.{number} repeats the combination {' '.join(min(cells & found))}")
             cells |= found
             self._models_are_there(number, part)
         return self
@@ -151,32 +154,51 @@ class DatasetConfig(Config):
                     raise ValueError(f"parts.{number} needs noise.{noise}.{sensor}, a model with `sensor: {sensor}`")
                 missing = [wall for wall in part.walls if isinstance(model.scale, dict) and wall not in model.scale]
                 if missing:
-                    raise ValueError(f"noise.{noise}.{sensor}.scale has no factor for the wall {missing[0]}")
+                    raise ValueError(f"noise.{noise}.{sensor}.scale has no factor for wall {missing[0]}")
                 _scales(model, part.walls, f"noise.{noise}.{sensor}.scale")
 
 
 def _scales(model: ScaledModel, walls: Sequence[str], key: str) -> None:
+    """Raise ValueError if a scale puts a noise parameter outside its bounds."""
     for wall in walls:
         try:
             model.on(wall)
         except ValidationError as error:
             wrong = error.errors()[0]
             name = ".".join(map(str, wrong["loc"]))
-            raise ValueError(f"{key} takes {name} out of its bounds on the wall {wall}: {wrong['msg']}") from None
+            raise ValueError(f"{key} puts {name} outside its bounds on wall {wall}: {wrong['msg']}") from None
 
 
 def load_dataset_config(path: Path, overrides: Sequence[str | Override] = (), seed: int | None = None) -> DatasetConfig:
-    """Read a data set's config and resolve what it names: sites, sensor models. Paths are relative to the file's folder.
+    """Read a data set's config and resolve the sites and sensor models that it names.
 
-    The dataset.json of a finished set is a config too: that set again, to the byte. Raises InputError for whatever is wrong.
+    The dataset.json of a finished set is a config too; it makes the same bytes again.
+
+    Parameters
+    ----------
+    path : Config file. Paths in it are relative to its folder.
+    overrides : `--set` options.
+    seed : Replaces the seed of the config.
+
+    Raises
+    ------
+    InputError
+        If anything in the config is wrong.
     """
     return dataset_config(load_yaml(path), overrides, seed, path)
 
 
 def dataset_config(values: Any, overrides: Sequence[str | Override], seed: int | None, path: Path) -> DatasetConfig:
-    """`load_dataset_config` of values that are read already; path: of their file, or what errors call them."""
+    """Resolve a data set's config from values already read.
+
+    Parameters
+    ----------
+    values : Content of a config file.
+    overrides, seed : As in `load_dataset_config`.
+    path : The file, or how errors should call it.
+    """
     if not isinstance(values, dict):
-        raise InputError("is not a mapping of keys", where=str(path), remedy="start from configs/datasets/small.yaml")
+        raise InputError("the file is not a mapping of keys", where=str(path), remedy="start from configs/datasets/small.yaml")
     if "sources" in values and "fingerprint" in values:
         values = _only_source(values, path)
     values = apply_overrides(values, overrides)
@@ -191,17 +213,20 @@ def dataset_config(values: Any, overrides: Sequence[str | Override], seed: int |
 
 
 def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the config in the dataset.json of a set that was not merged."""
     sources = values["sources"]
     configs = [each.get("config") for each in sources.values() if isinstance(each, dict)] if isinstance(sources, dict) else []
     if len(configs) > 1:
-        raise InputError(f"is of a set merged of {len(configs)}", where=str(path), remedy="make each of its sources")
+        raise InputError(f"the set was merged from {len(configs)} sets", where=str(path), remedy="make each of them")
     if not configs or not isinstance(configs[0], dict):
-        raise InputError("is damaged: it holds no config", where=str(path), remedy="take the config that the set was made with")
+        raise InputError(
+            "the file is damaged: it has no config", where=str(path), remedy="use the config that the set was made with"
+        )
     return dict(configs[0])
 
 
 def _wall(values: Any, where: str, folder: Path) -> Any:
-    """The simulation's values that a wall's entry stands for; entries that are no `{site, set}` are such values already."""
+    """Return the simulation config that a wall's entry `{site, set}` stands for; other entries are such configs already."""
     if not (isinstance(values, dict) and "site" in values):
         return values
     wrong = sorted(set(values) - {"site", "set"})
@@ -215,7 +240,7 @@ def _wall(values: Any, where: str, folder: Path) -> Any:
 
 
 def _with_models(level: Any, folder: Path) -> Any:
-    """A level of noise with the sensor models that it names by name or file written out."""
+    """Replace names and files of sensor models in a noise level by their content."""
     if not isinstance(level, dict):
         return level
     result = dict(level)

@@ -1,4 +1,4 @@
-"""One epoch of a data set, as `simulate` makes it, and its tiles. A pure function of (config, seed, index)."""
+"""Simulate one epoch of a data set and cut it into tiles. The result depends only on config, seed and index of the epoch."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.dataset.config import DatasetConfig
 from pipeline.dataset.plan import (
     PlannedEpoch,
-    blocks_on,
-    check_filled,
+    block_count,
+    check_tiles_filled,
     random_of_epoch,
     random_of_reference,
     random_of_wall,
-    region,
     simulation_of,
+    tile_region,
 )
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch, observe_epoch, observe_reference
@@ -32,13 +32,20 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import WALL
 
 _DRAWS = 5
-"""Times that an epoch's blocks are drawn before the set-up is at fault."""
+"""Number of times that an epoch's blocks are drawn if they find no room."""
 
 
 @dataclass(frozen=True)
 class EpochStage:
-    """What the epochs of one wall, sensor, noise and reference share. true: raster of the untouched wall, on request; spacing_m:
-    of ray-traced samples on the wall, None of a surface of the wall's own vertices."""
+    """Set-up shared by the epochs of one wall, sensor, noise level and reference.
+
+    Attributes
+    ----------
+    site : Wall and sensor.
+    reference : The reference epoch.
+    spacing_m : Spacing of ray-traced samples on the wall, m; None if the surface consists of the wall's own vertices.
+    true : Raster of the untouched wall; None unless the config asks for true differences.
+    """
 
     site: SensorSite
     reference: ReferenceEpoch
@@ -48,7 +55,7 @@ class EpochStage:
 
 @dataclass(frozen=True)
 class EpochTile:
-    """A tile of an epoch with its annotations (COCO's, without ids) and, on request, the true difference (size, size), m."""
+    """A tile of an epoch, its annotations (as COCO's, without ids), and its true difference (size, size), m, or None."""
 
     tile: Tile
     annotations: list[dict[str, Any]]
@@ -57,17 +64,17 @@ class EpochTile:
 
 @dataclass(frozen=True)
 class MadeEpoch:
-    """record: what describes the epoch (JSON types); tiles: those that belong to the set."""
+    """A simulated epoch: its record (JSON types), and the tiles that belong to the set."""
 
     record: dict[str, Any]
     tiles: list[EpochTile]
 
 
-class Stages:
-    """The stage that a worker has set up: wall, frame, ray-tracing scene and reference epoch.
+class StageCache:
+    """Keeps the stage that a worker has set up last: wall, frame, ray-tracing scene and reference epoch.
 
-    One at a time: plans keep epochs of a stage together, and a stage takes a good part of a worker's memory. made: how many so
-    far.
+    It keeps only one, which already takes much of a worker's memory; plans put the epochs of a stage next to each other. `made`
+    counts the stages set up so far.
     """
 
     def __init__(self, config: DatasetConfig) -> None:
@@ -77,15 +84,16 @@ class Stages:
         self.made = 0
 
     def of(self, epoch: PlannedEpoch, progress: Progress) -> EpochStage:
-        """The stage of an epoch; a new one takes the place of the last."""
+        """Return the stage of an epoch, setting it up if it is not the last one."""
         if self._kept is None or self._key != epoch.stage:
-            self._kept = None  # before the new one is made, so that there are never two
+            self._kept = None  # free the memory before the new one is made
             self._kept, self._key = _set_up(self._config, epoch, progress), epoch.stage
             self.made += 1
         return self._kept
 
 
 def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> EpochStage:
+    """Prepare the site and observe the reference epoch."""
     simulation = simulation_of(config, epoch)
     with progress.stage("wall"):
         site = prepare_site(simulation, epoch.sensor, random_of_wall(config, epoch.wall))
@@ -97,17 +105,27 @@ def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> E
     return EpochStage(site, replace(reference, seen=None), spacing, true)
 
 
-def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progress: Progress) -> MadeEpoch:
-    """Carve, observe and cut an epoch of the plan.
+def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: StageCache, progress: Progress) -> MadeEpoch:
+    """Simulate an epoch of the plan and cut its tiles.
 
-    Raises InputError for what is wrong with the wall, the blocks or the tiles, naming the epoch.
+    Parameters
+    ----------
+    config : Config of the set.
+    epoch : The planned epoch.
+    stages : Keeps the set-up between epochs.
+    progress : Receives the progress.
+
+    Raises
+    ------
+    InputError
+        If the wall, the blocks or the tiles cannot be made; it names the epoch.
     """
     try:
         stage = stages.of(epoch, progress)
         grid = stage.reference.raster.grid
-        where = region(epoch.split, config.validation_region, grid, config.tiles)
-        check_filled(epoch.split, where, grid, config.tiles)
-        simulation = with_count(simulation_of(config, epoch), blocks_on(config, epoch.size, grid))
+        where = tile_region(epoch.split, config.validation_region, grid, config.tiles)
+        check_tiles_filled(epoch.split, where, grid, config.tiles)
+        simulation = with_count(simulation_of(config, epoch), block_count(config, epoch.size, grid))
         found, draw = _observed(config, simulation, epoch, stage, progress)
     except InputError as error:
         raise InputError(str(error), where=epoch.name) from None
@@ -115,30 +133,38 @@ def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: Stages, progr
         truth = None if stage.true is None else true_difference(stage.true, found)
         cut = [tile for tile in _cut(config, found, grid, truth) if where.holds(tile.tile.column, config.tiles.size_px)]
     if not cut:
-        raise no_tile(config, epoch, found.difference, grid)
+        raise no_tile_error(config, epoch, found.difference, grid)
     return MadeEpoch({**_record(config, epoch, found, simulation), "draw": draw, "spacing_m": stage.spacing_m}, cut)
 
 
-def no_tile(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np.float32], grid: Grid) -> InputError:
-    """What to say where the wall fills the tiles, but the sensor does not. values: (h, w) of the difference map, m."""
+def no_tile_error(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np.float32], grid: Grid) -> InputError:
+    """Return the error for an epoch whose difference map has too little data for any tile.
+
+    Parameters
+    ----------
+    config : Config of the set.
+    epoch : The planned epoch.
+    values : (h, w) its difference map, m.
+    grid : Raster of the map.
+    """
     every = config.tiles.model_copy(update={"minimum_valid_share": 0.0})
-    where = region(epoch.split, config.validation_region, grid, config.tiles)
+    where = tile_region(epoch.split, config.validation_region, grid, config.tiles)
     blank = np.zeros(values.shape, np.int32)
     cut = [tile for tile in tiles(values, blank, grid, every) if where.holds(tile.column, every.size_px)]
     best, whole = max(tile.valid_share for tile in cut), np.count_nonzero(np.isfinite(values)) / values.size
     return InputError(
-        f"no tile has enough data: the fullest of {len(cut)} has it in {100 * best:.0f} % of its pixels, "
+        f"no tile has enough data: the best of {len(cut)} tiles has data in {100 * best:.0f} % of its pixels, "
         f"the whole map in {100 * whole:.0f} %",
         where=epoch.name,
         allowed=f"{100 * config.tiles.minimum_valid_share:.0f} % (tiles.minimum_valid_share)",
-        remedy="let the sensor see more of the wall (place, field of view), use a coarser difference.gsd_m, or lower the share",
+        remedy="show the sensor more of the wall (place, field of view), use a coarser difference.gsd_m, or lower the share",
     )
 
 
 def _observed(
     config: DatasetConfig, simulation: SimulationConfig, epoch: PlannedEpoch, stage: EpochStage, progress: Progress
 ) -> tuple[LaterEpoch, int]:
-    """The epoch, and the draw that it came from: where blocks find no room all are drawn anew, a few times."""
+    """Simulate the epoch, drawing its blocks again if they find no room; return it with the number of the draw."""
     for draw in range(1, _DRAWS + 1):
         try:
             random = random_of_epoch(config, epoch, draw)
@@ -150,15 +176,17 @@ def _observed(
 
 
 def with_count(simulation: SimulationConfig, count: int) -> SimulationConfig:
+    """Return the simulation with another number of blocks."""
     return simulation.model_copy(update={"rockfall": simulation.rockfall.model_copy(update={"count": count})})
 
 
 def true_difference(wall: SurfaceRaster, epoch: LaterEpoch) -> NDArray[np.float32]:
-    """(h, w) m, NaN where there is no wall: the wall before minus the wall after, without any sensor."""
+    """Return the (h, w) true change of the wall, m, without any sensor; NaN where there is no wall."""
     return difference(wall, surface_raster(epoch.carved.mesh, wall.grid))
 
 
 def _cut(config: DatasetConfig, epoch: LaterEpoch, grid: Grid, truth: NDArray[np.float32] | None) -> Iterator[EpochTile]:
+    """Cut the difference map into tiles with annotations."""
     labels = np.where(np.isnan(epoch.difference), np.int32(WALL), epoch.raster.block)
     whole = np.bincount(labels.ravel(), minlength=len(epoch.blocks) + 1)
     size = config.tiles.size_px
@@ -168,7 +196,7 @@ def _cut(config: DatasetConfig, epoch: LaterEpoch, grid: Grid, truth: NDArray[np
 
 
 def _window(raster: NDArray[np.float32], row: int, column: int, size: int) -> NDArray[np.float32]:
-    """A square of a raster, NaN beyond its edge."""
+    """Return a square of a raster, with NaN beyond its edge."""
     window = raster[row : row + size, column : column + size]
     return np.pad(window, [(0, size - length) for length in window.shape], constant_values=np.nan)
 
@@ -176,7 +204,7 @@ def _window(raster: NDArray[np.float32], row: int, column: int, size: int) -> ND
 def _described(
     annotation: dict[str, Any], blocks: list[dict[str, Any]], whole: NDArray[np.intp], config: DatasetConfig
 ) -> dict[str, Any]:
-    """A COCO annotation with what is known of its block; lengths in m, volumes in m3."""
+    """Add what is known of its block to a COCO annotation; lengths in m, volumes in m^3."""
     block = blocks[annotation["block"] - 1]
     ratio = block["signal_to_noise"]
     return annotation | {
@@ -192,6 +220,7 @@ def _described(
 
 
 def _record(config: DatasetConfig, epoch: PlannedEpoch, found: LaterEpoch, simulation: SimulationConfig) -> dict[str, Any]:
+    """Return the epoch's description for its shard."""
     return {
         "epoch": epoch.to_dict(),
         "seed": config.seed,

@@ -1,4 +1,4 @@
-"""The pictures of a data set card: sizes of blocks, noise of the epochs, sample tiles; each as PNG bytes."""
+"""Draw the pictures of a data set card as PNG: block sizes, noise of the epochs, and sample tiles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,15 @@ _BINS = 40
 
 @dataclass(frozen=True)
 class SampleTile:
-    """values: (h, w) differences, m; blocks: (h, w) bool, the annotated masks; sigma_m: the noise of its epoch."""
+    """A tile to draw.
+
+    Attributes
+    ----------
+    title : Title of the panel.
+    values : (h, w) differences, m.
+    blocks : (h, w) true within annotated masks.
+    sigma_m : Noise of its epoch, m.
+    """
 
     title: str
     values: NDArray[np.floating]
@@ -30,7 +38,7 @@ class SampleTile:
 
 
 def sizes_figure(counts: Mapping[str, NDArray[np.integer]], edges: NDArray[np.floating]) -> bytes:
-    """Histograms of block sizes by class, counts per bin between `edges`, m, which grow by equal factors."""
+    """Draw histograms of block sizes by class: counts for each bin between logarithmic `edges`, m."""
     figure, axes = _axes()
     for number, (name, values) in enumerate(counts.items()):
         axes.stairs(values, edges, fill=True, alpha=0.35, color=FAMILY[number % len(FAMILY)], label=name)
@@ -39,12 +47,12 @@ def sizes_figure(counts: Mapping[str, NDArray[np.integer]], edges: NDArray[np.fl
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    _dress(axes, "size of a block (mean of its three axes), m", "annotations")
+    _dress(axes, "block size (mean of its three axes), m", "annotations")
     return png_bytes(figure)
 
 
 def noise_figure(noise: Mapping[str, Sequence[float]]) -> bytes:
-    """Histograms of the epochs' noise, m, by sensor and level."""
+    """Draw histograms of the epochs' noise, m, by sensor and level."""
     figure, axes = _axes()
     values = {name: 1e3 * np.asarray(each) for name, each in noise.items()}
     high = max((float(each.max()) for each in values.values() if each.size), default=1.0)
@@ -59,7 +67,7 @@ def noise_figure(noise: Mapping[str, Sequence[float]]) -> bytes:
 
 
 def samples_figure(rows: Sequence[Sequence[SampleTile]]) -> bytes:
-    """Sample tiles, each on a scale of +-6 of its epoch's sigma, the annotated masks outlined."""
+    """Draw sample tiles with colours to +-6 sigma of their epoch, and the outlines of annotated masks."""
     columns = max(len(row) for row in rows)
     figure = Figure(figsize=(3.1 * columns, 3.3 * len(rows)), dpi=_DPI, layout="constrained")
     grid = np.atleast_2d(figure.subplots(len(rows), columns, squeeze=False))
@@ -78,11 +86,13 @@ def samples_figure(rows: Sequence[Sequence[SampleTile]]) -> bytes:
 
 
 def _axes() -> tuple[Figure, Axes]:
+    """Return a figure with one panel."""
     figure = Figure(figsize=(7.5, 3.6), dpi=_DPI, layout="constrained")
     return figure, figure.subplots()
 
 
 def _dress(axes: Axes, x_label: str, y_label: str) -> None:
+    """Label the axes and add the legend."""
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(y_label, fontsize=9)
     axes.tick_params(labelsize=8)

@@ -1,4 +1,4 @@
-"""The folder of a data set on disk: what is in it, and whether that is whole.
+"""The folder of a data set on disk: its files, and whether they are complete.
 
     dataset.json            configs, seed, versions, whether it is complete
     shards/                 a record of each epoch: its tiles with their checksums, its annotations
@@ -6,8 +6,8 @@
     README.md, card/        the data set card
     checksums.sha256        as sha256sum reads it
 
-An epoch counts as done when its shard has its final name, which is after all of its tiles have theirs. Files are written into a
-staging folder of the job and renamed; a later job removes the staging folders of dead ones, whose workers may live on a while.
+An epoch is done when its shard has its final name, which is after all of its tiles have theirs. Files are written into a staging
+folder of the job and then renamed. A later job removes the staging folders of dead jobs, whose workers may live on for a while.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STAGING, CHECKSUMS, TRUTH = ".staging", "checksums.sha256", "truth"
 
 
 def fingerprint(config: DatasetConfig) -> str:
-    """What tells sets apart: a hash of the resolved config and of the files that its walls and cameras are read from."""
+    """Return a hash that identifies a set: of the resolved config, and of the files of its walls and cameras."""
     digest = hashlib.sha256(config.model_dump_json().encode())
     for wall in config.walls.values():
         meshes = [*wall.wall.files] if isinstance(wall.wall, ImportedWall) else []
@@ -44,7 +44,7 @@ def fingerprint(config: DatasetConfig) -> str:
 
 
 def tile_files(record: Record) -> Iterator[tuple[str, str]]:
-    """The files of an epoch, relative to the data set's folder, and their checksums."""
+    """Yield the files of an epoch, relative to the data set's folder, with their checksums."""
     split = PurePosixPath(record["epoch"]["split"])
     for tile in record["tiles"]:
         yield str(split / tile["image"]["file_name"]), tile["sha256"]
@@ -54,27 +54,40 @@ def tile_files(record: Record) -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class Damage:
-    """What is wrong with an epoch's files. file: relative to the data set's folder; problem: missing, damaged, a folder."""
+    """A damaged file of a data set. file: relative to the set's folder; problem: "missing", "damaged" or "a folder"."""
 
     file: Path
     problem: str
 
     @property
     def is_missing_shard(self) -> bool:
-        """Whether the epoch has not been made so far."""
+        """Whether this is the record of an epoch that has not been made."""
         return self.problem == "missing" and self.file.parent.name == SHARDS
 
 
-def damages(folder: Path, name: str) -> list[Damage]:
-    """What is missing or damaged of an epoch, every byte of its tiles read; empty where all is well."""
+def epoch_damage(folder: Path, name: str) -> list[Damage]:
+    """Return what is missing or damaged of an epoch, after reading every byte of its tiles."""
     record = read_shard(folder, name)
     if record is None:
-        return found_damage(folder, f"{SHARDS}/{name}", "", name)
-    return [each for file, digest in tile_files(record) for each in found_damage(folder, file, digest, f"{SHARDS}/{name}")]
+        return file_damage(folder, f"{SHARDS}/{name}", "", name)
+    return [each for file, digest in tile_files(record) for each in file_damage(folder, file, digest, f"{SHARDS}/{name}")]
 
 
-def found_damage(folder: Path, file: str, digest: str, where: str) -> list[Damage]:
-    """What is wrong with a file that the file `where` of the set names; raises InputError for one elsewhere."""
+def file_damage(folder: Path, file: str, digest: str, where: str) -> list[Damage]:
+    """Check one file of a data set.
+
+    Parameters
+    ----------
+    folder : Folder of the set.
+    file : The file, relative to `folder`.
+    digest : Its SHA-256.
+    where : The file of the set that names it, for errors.
+
+    Raises
+    ------
+    InputError
+        If the file lies outside the folder.
+    """
     path = inside(folder, file, folder / where)
     if path.is_dir():
         return [Damage(Path(file), "a folder")]
@@ -84,39 +97,42 @@ def found_damage(folder: Path, file: str, digest: str, where: str) -> list[Damag
 
 
 def require_no_folders(folder: Path, damage: list[Damage]) -> None:
-    """Raise InputError where a folder stands in the place of a file that is to be made again."""
+    """Raise InputError if a folder is in the place of a file that is to be made again."""
     for each in damage:
         if (folder / each.file).is_dir():
-            raise InputError("is a folder where a file of the set belongs", where=str(folder / each.file), remedy="move it away")
+            raise InputError(
+                "a folder is in the place of a file of the set", where=str(folder / each.file), remedy="move it away"
+            )
 
 
 def require_own_folders(folder: Path) -> None:
-    """Raise InputError where something else stands in the place of a folder of a job; a split may be a link to one."""
+    """Raise InputError if something else is in the place of a folder of a job; a split may be a link to a folder."""
     for name in (STAGING, SHARDS, *SPLITS):
         if name not in SPLITS or not (folder / name).is_dir():
             require_own_folder(folder / name)
 
 
 def discard_unbegun(folder: Path) -> None:
-    """Remove what a job has written that ended before its first epoch was made; what others put there stays."""
+    """Remove what a job wrote that ended before its first epoch was made; files of others stay."""
     if any((folder / SHARDS).glob("*.json")):
         return
     _remove_staging(folder)
     own = [folder / name for name in (SHARDS, *(f"{split}/{TRUTH}" for split in SPLITS), *SPLITS)]
     for each in own:
-        with suppress(OSError):  # is not there, or holds tiles
+        with suppress(OSError):  # does not exist, or contains tiles
             each.rmdir()
     if not any(each.exists() for each in own):
         (folder / DATASET_FILE).unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what dead jobs left under temporary names."""
+    """Remove temporary files of dead jobs."""
     _remove_staging(folder)
     for part in folder.rglob(".*.part*"):
         part.unlink(missing_ok=True)
 
 
 def _remove_staging(folder: Path) -> None:
-    if (folder / STAGING).is_dir():  # rmtree waits for ever at a pipe
+    """Remove the staging folders."""
+    if (folder / STAGING).is_dir():  # rmtree would wait forever at a pipe
         shutil.rmtree(folder / STAGING, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""A finished data set as NumPy arrays and as tf.data. Imports no part of the simulation: training is a process without it."""
+"""Read a finished data set as NumPy arrays or as tf.data, for training without any part of the simulation."""
 
 from __future__ import annotations
 
@@ -20,15 +20,22 @@ if TYPE_CHECKING:
     import tensorflow as tf
 
 FILTERS = ("sensor", "wall", "noise", "size_class")
+"""Keys by which tiles can be selected."""
 
 
 @dataclass(frozen=True)
 class Sample:
     """A tile of h x w pixels with k blocks.
 
-    image: (h, w) float32, reference minus epoch, m, 0 where there is no data; valid: (h, w) bool; boxes: (k, 4) float32, x, y,
-    width, height in pixels from the top-left corner; masks: (k, h, w) bool; truth: (h, w) float32, m, NaN where there is no wall,
-    None in a set without it; record: the image's entry in annotations.json; annotations: the blocks' entries.
+    Attributes
+    ----------
+    image : (h, w) float32 difference, reference minus epoch, m; 0 without data.
+    valid : (h, w) bool, true where there is data.
+    boxes : (k, 4) float32 x, y, width and height, pixels from the top-left corner.
+    masks : (k, h, w) bool masks of the blocks.
+    truth : (h, w) float32 true difference, m, NaN where there is no wall; None in a set without it.
+    record : The image's entry in annotations.json.
+    annotations : The blocks' entries in annotations.json.
     """
 
     image: NDArray[np.float32]
@@ -41,13 +48,23 @@ class Sample:
 
 
 class Tiles(Sequence[Sample]):
-    """One split of a data set, read tile by tile; several filters all have to match.
+    """One split of a data set, read tile by tile.
 
-    Tiles("sets/rockfall_9/train", sensor="stereo", noise="low")
+        Tiles("sets/rockfall_9/train", sensor="stereo", noise="low")
+
+    Parameters
+    ----------
+    folder : Folder of a split: train, val or test.
+    filters : Values of sensor, wall, noise or size_class that a tile must have.
+
+    Raises
+    ------
+    InputError
+        If a filter is unknown or no tile matches.
     """
 
     def __init__(self, folder: Path | str, **filters: str) -> None:
-        """folder: train, val or test of a set; filters: sensor, wall, noise, size_class. InputError where nothing matches."""
+        """Read the list of tiles and keep those that match all filters; see the class."""
         self.folder = Path(folder)
         for key in filters:
             if key not in FILTERS:
@@ -68,7 +85,7 @@ class Tiles(Sequence[Sample]):
         return len(self.records)
 
     def __getitem__(self, index: Any) -> Any:
-        """The sample of this index, read from disk; of a slice a list of samples."""
+        """Read a sample from disk; a slice gives a list of samples."""
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
         record = self.records[index]
@@ -87,22 +104,25 @@ class Tiles(Sequence[Sample]):
         )
 
     def path_of(self, record: dict[str, Any]) -> Path:
-        """The file of a tile."""
+        """Return the path of a tile's file."""
         return self._path(record["file_name"])
 
     def _path(self, name: Any) -> Path:
+        """Return the path of a file that annotations.json names; raise InputError if it is outside the folder."""
         return inside(self.folder, name, self.folder / "annotations.json")
 
     def __iter__(self) -> Iterator[Sample]:
         return (self[index] for index in range(len(self)))
 
     def shuffled(self, seed: int) -> Iterator[Sample]:
-        """All samples once, in an order that depends on `seed` alone; another seed for each pass gives another order."""
+        """Yield all samples once, in an order that depends on `seed` only; use another seed for each pass."""
         return (self[int(index)] for index in np.random.default_rng(seed).permutation(len(self)))
 
     def tf_dataset(self) -> tf.data.Dataset:
-        """A tf.data.Dataset of dictionaries: image (h, w, 1) float32, valid (h, w, 1) bool, boxes (k, 4) float32, masks
-        (k, h, w) bool, image_id int64."""
+        """Return a tf.data.Dataset of dictionaries.
+
+        Its keys are image (h, w, 1) float32, valid (h, w, 1) bool, boxes (k, 4) float32, masks (k, h, w) bool and image_id int64.
+        """
         import tensorflow as tf
 
         height, width = self.records[0]["height"], self.records[0]["width"]
@@ -118,7 +138,7 @@ class Tiles(Sequence[Sample]):
 
 
 def masks_of(annotations: Sequence[dict[str, Any]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(k, h, w) the masks of COCO annotations."""
+    """Decode the (k, h, w) masks of COCO annotations."""
     if not annotations:
         return np.zeros((0, *shape), dtype=bool)
     decoded = coco_mask.decode([each["segmentation"] for each in annotations])
@@ -126,6 +146,7 @@ def masks_of(annotations: Sequence[dict[str, Any]], shape: tuple[int, ...]) -> N
 
 
 def _for_tensorflow(sample: Sample) -> dict[str, Any]:
+    """Return a sample as the dictionary that `tf_dataset` yields."""
     return {
         "image": sample.image[..., None],
         "valid": sample.valid[..., None],

@@ -1,4 +1,4 @@
-"""From a data set's config to the list of its epochs, and which tiles of an epoch belong to the set."""
+"""Plan a data set: the list of its epochs, the simulation of each, and which tiles of an epoch belong to the set."""
 
 from __future__ import annotations
 
@@ -19,8 +19,16 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class PlannedEpoch:
-    """One epoch of a data set. index: in the plan; number: among the epochs of its combination and split, from 1;
-    reference: which of the reference epochs it is compared with."""
+    """One epoch of a data set.
+
+    Attributes
+    ----------
+    index : Index in the plan.
+    split : "train", "val" or "test".
+    sensor, wall, noise, size : The combination that it belongs to.
+    number : Number among the epochs of its combination and split, from 1.
+    reference : Number of the reference epoch that it is compared with, from 1.
+    """
 
     index: int
     split: Split
@@ -38,15 +46,16 @@ class PlannedEpoch:
 
     @property
     def stage(self) -> tuple[SensorName, str, str, int]:
-        """What epochs share that have the same reference epoch: sensor, wall, noise, number of the reference."""
+        """Key of the set-up that epochs with the same reference epoch share: sensor, wall, noise, number of the reference."""
         return self.sensor, self.wall, self.noise, self.reference
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the fields as a dictionary."""
         return asdict(self)
 
 
 def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
-    """All epochs of the set, those that share a reference epoch one after the other."""
+    """List all epochs of the set, those that share a reference epoch next to each other."""
     found = [
         PlannedEpoch(0, split, sensor, wall, noise, size, number, (number - 1) % config.references + 1)
         for part in config.parts
@@ -63,84 +72,119 @@ def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
 
 
 def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfig:
-    """The simulation that an epoch is an epoch of; the number of its blocks follows when the wall's area is known."""
+    """Return the config that simulates an epoch; the number of its blocks is set later, when the wall's area is known."""
     level = config.noise[epoch.noise].of(epoch.sensor)
-    if level is None:  # the config's own check has been here
-        raise InputError(f"has no model of {epoch.sensor}", where=f"noise.{epoch.noise}")
+    if level is None:  # the config's validation excludes this
+        raise InputError(f"there is no model of the {epoch.sensor} sensor", where=f"noise.{epoch.noise}")
     wall = config.walls[epoch.wall]
-    if epoch.sensor == "tls" and wall.reconstruction == "vertices":  # of the stereo pair alone
+    if epoch.sensor == "tls" and wall.reconstruction == "vertices":  # stereo only
         wall = wall.model_copy(update={"reconstruction": "direct"})
     changes = {"seed": config.seed, "sensor": (level.on(epoch.wall),), "rockfall": config.sizes[epoch.size].rockfall}
     return wall.model_copy(update={**changes, "tiles": config.tiles, "annotation": config.annotation})
 
 
-def blocks_on(config: DatasetConfig, size: str, grid: Grid) -> int:
-    """How many blocks fall from a wall whose difference maps have the pixels of `grid`; raises InputError for too many."""
+def block_count(config: DatasetConfig, size: str, grid: Grid) -> int:
+    """Return the number of blocks that fall from a wall.
+
+    Parameters
+    ----------
+    config : Config of the set.
+    size : Name of the size class, which gives the blocks per area.
+    grid : Raster of the wall's difference maps, which gives the area.
+
+    Raises
+    ------
+    InputError
+        If there would be too many.
+    """
     area = grid.width * grid.height * grid.gsd**2
     count = config.sizes[size].blocks_per_m2 * area
     if count > MOST_BLOCKS:
-        problem = f"asks for {count:,.3g} blocks on {area:,.0f} m2"
+        problem = f"this gives {count:,.3g} blocks on {area:,.0f} m2"
         allowed = f"up to {MOST_BLOCKS / area:.3g}, {MOST_BLOCKS:,} blocks"
         raise InputError(problem, where=f"sizes.{size}.blocks_per_m2", allowed=allowed)
     return max(1, round(count))
 
 
 def random_of_wall(config: DatasetConfig, wall: str) -> KeyedRandom:
-    """Of a wall without a seed of its own, and of its texture: the same for all sensors, noise and sizes."""
+    """Return the random source of a wall without its own seed, and of its texture; the same for all sensors, noise levels and
+    sizes.
+    """
     return KeyedRandom(config.seed).child("dataset", "wall", wall)
 
 
 def random_of_reference(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
+    """Return the random source of an epoch's reference epoch."""
     return KeyedRandom(config.seed).child("dataset", "reference", *epoch.stage)
 
 
 def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch, draw: int) -> KeyedRandom:
-    """Of an epoch's blocks, noise and registration; draw: counts from 1, where blocks find no room and are drawn anew."""
+    """Return the random source of an epoch's blocks, noise and registration.
+
+    draw counts from 1; it differs if blocks find no room and are drawn again.
+    """
     path = epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split
     return KeyedRandom(config.seed).child("dataset", "epoch", *path, "draw", draw)
 
 
 @dataclass(frozen=True)
-class Region:
-    """The columns of pixels, [first, end), in which a tile must lie."""
+class TileRegion:
+    """Columns of pixels, [first, end), in which a tile must lie."""
 
     first: int
     end: float
 
     def holds(self, column: int, size: int) -> bool:
-        """Whether a tile of `size` px from `column` on lies in it."""
+        """Whether a tile of `size` px that begins at `column` lies in the region."""
         return self.first <= column and column + size <= self.end
 
 
-def region(split: Split, share: float, grid: Grid, config: TileConfig) -> Region:
-    """Where the tiles of a split may lie on a wall with the difference maps `grid`.
+def tile_region(split: Split, share: float, grid: Grid, config: TileConfig) -> TileRegion:
+    """Return the region of a split's tiles on a wall.
 
-    Training has the columns of tiles from the left, validation those at the right end that make up about `share`; strata run
-    along the wall, so both see all of them. Tests use the whole wall. Raises InputError where a wall has too few columns.
+    Training uses the columns of tiles from the left; validation uses those at the right end. Strata run along the wall, so both
+    contain all of them. Tests use the whole wall.
+
+    Parameters
+    ----------
+    split : "train", "val" or "test".
+    share : Approximate share of the columns for validation; 0: both use the whole wall.
+    grid : Raster of the difference maps.
+    config : Size and overlap of the tiles.
+
+    Raises
+    ------
+    InputError
+        If the wall has too few columns to divide.
     """
     step = config.size_px - config.overlap_px
     columns = len(starts_of_tiles(grid.width, config))
     if split == "test" or share == 0:
-        return Region(0, float("inf"))
+        return TileRegion(0, float("inf"))
     kept = round(share * columns)
     if not 0 < kept < columns:
         raise InputError(
-            f"{share:g} of {columns} columns of tiles is {'none' if kept == 0 else 'all'} of them, as the difference maps are "
+            f"{share:g} of {columns} columns of tiles rounds to {'none' if kept == 0 else 'all'}: the difference maps are "
             f"{grid.width} px wide (gsd {grid.gsd:.3g} m) and a tile {config.size_px} px",
             where="validation_region",
-            allowed="0, or a share that leaves both training and validation a column",
+            allowed="0, or a share that gives training and validation at least one column",
             remedy="use smaller tiles, a finer gsd or a longer wall",
         )
     boundary = (columns - kept) * step
-    return Region(0, boundary) if split == "train" else Region(boundary, float("inf"))
+    return TileRegion(0, boundary) if split == "train" else TileRegion(boundary, float("inf"))
 
 
-def check_filled(split: Split, where: Region, grid: Grid, config: TileConfig) -> None:
-    """Raise InputError where no tile of a split can have enough pixels with data, as the wall or its part is too small for one.
+def check_tiles_filled(split: Split, where: TileRegion, grid: Grid, config: TileConfig) -> None:
+    """Raise InputError if no tile of a split can have enough pixels with data, because the wall or the region is too small.
 
-    where: the split's columns on a wall with the difference maps `grid`.
+    Parameters
+    ----------
+    split : "train", "val" or "test".
+    where : Region of the split.
+    grid : Raster of the difference maps.
+    config : Size of the tiles and their smallest share of data.
     """
-    filled, whole = (_most_filled(part, grid, config) for part in (where, Region(0, float("inf"))))
+    filled, whole = (_most_filled(part, grid, config) for part in (where, TileRegion(0, float("inf"))))
     if filled >= config.minimum_valid_share and filled > 0:
         return
     wall = f"the difference maps are {grid.width} x {grid.height} px (gsd {grid.gsd:.3g} m)"
@@ -160,8 +204,8 @@ def check_filled(split: Split, where: Region, grid: Grid, config: TileConfig) ->
     )
 
 
-def _most_filled(where: Region, grid: Grid, config: TileConfig) -> float:
-    """The largest share of a tile within a region that lies on the wall, 0 where no tile lies in the region."""
+def _most_filled(where: TileRegion, grid: Grid, config: TileConfig) -> float:
+    """Return the largest share of a tile in a region that the wall covers; 0 if no tile fits."""
     size = config.size_px
     starts = (column for column in starts_of_tiles(grid.width, config) if where.holds(column, size))
     width = max((min(size, grid.width - column) for column in starts), default=0)

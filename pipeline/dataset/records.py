@@ -1,4 +1,4 @@
-"""dataset.json and the shards as they are read: of the right types, with their checksums, and naming no file elsewhere."""
+"""Read and write dataset.json and the shards (records of single epochs), with checks of types, checksums and file names."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ SCHEMA = 1
 SHARDS = "shards"
 Record = dict[str, Any]
 _MOST_EPOCHS = 100_000
-"""Of a set: a plan of 1,620 tiles has as many at the most, and a million that are not there took two minutes to name."""
-_REMEDY = "put it back from a copy, or make the set again in another folder; tiles and annotations.json stay usable"
+"""Largest number of epochs in a set; the limit keeps a damaged file from causing minutes of work."""
+_REMEDY = "restore it from a copy, or make the set again in another folder; tiles and annotations.json are still usable"
 _Fingerprint = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")]
 _Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
 
 class _Source(BaseModel):
-    """How some of a set's epochs are made. prefix: of their files' names."""
+    """How some epochs of a set are made; prefix: of their file names."""
 
     model_config = ConfigDict(extra="forbid")
     config: dict[str, Any]
@@ -37,7 +37,14 @@ class _Source(BaseModel):
 
 
 class _DatasetFile(BaseModel):
-    """dataset.json. sources: by fingerprint; epochs: those that the set holds of each; sha256: of all that is before it."""
+    """Content of dataset.json.
+
+    Attributes
+    ----------
+    sources : How epochs are made, by fingerprint.
+    epochs : Indices of the epochs in the set, by the fingerprint of their source.
+    sha256 : Checksum of everything before it.
+    """
 
     model_config = ConfigDict(extra="forbid")
     schema_: Literal[1] = Field(alias="schema")
@@ -50,8 +57,9 @@ class _DatasetFile(BaseModel):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        """Check that `epochs` and `sources` match."""
         if list(self.epochs) != list(self.sources):
-            raise ValueError("`epochs` and `sources` are not of the same fingerprints")
+            raise ValueError("`epochs` and `sources` have different fingerprints")
         for fingerprint, source in self.sources.items():
             if source.prefix not in ("", f"{fingerprint}_"):
                 raise ValueError(
@@ -61,11 +69,15 @@ class _DatasetFile(BaseModel):
 
 
 class _ShardImage(BaseModel):
+    """File names of a tile."""
+
     file_name: str
     truth_file_name: str = ""
 
 
 class _Tile(BaseModel):
+    """A tile's entry in a shard."""
+
     image: _ShardImage
     sha256: str
     truth_sha256: str | None
@@ -73,6 +85,8 @@ class _Tile(BaseModel):
 
 
 class _Epoch(BaseModel):
+    """Which epoch a shard describes."""
+
     index: NonNegativeInt
     split: Split
     sensor: _Word
@@ -82,7 +96,7 @@ class _Epoch(BaseModel):
 
 
 class _Shard(BaseModel):
-    """An epoch's record, as far as it is used here."""
+    """The parts of an epoch's record that are used here."""
 
     source: _Fingerprint
     epoch: _Epoch
@@ -92,10 +106,10 @@ class _Shard(BaseModel):
 
 
 def read_dataset_file(folder: Path) -> Record:
-    """dataset.json of a data set; raises InputError where the folder is none, and where the file is not as it was written."""
+    """Read dataset.json; raise InputError if the folder is not a data set or the file was changed."""
     path = folder / DATASET_FILE
     if not path.exists():
-        raise InputError("is not a data set: it has no dataset.json", where=str(folder), remedy="check the path")
+        raise InputError("the folder is not a data set: it has no dataset.json", where=str(folder), remedy="check the path")
     values = read_json(path, remedy=_REMEDY)
     parse(_DatasetFile, values, str(path))
     if values.pop("sha256", "") != _digest(_text(values)):
@@ -106,13 +120,23 @@ def read_dataset_file(folder: Path) -> Record:
 def write_dataset_file(
     folder: Path, name: str, sources: dict[str, Any], epochs: dict[str, list[int]], *, complete: bool = False
 ) -> None:
-    """Write dataset.json. sources: config, versions, command, prefix of file names, by fingerprint; epochs: the set's."""
+    """Write dataset.json.
+
+    Parameters
+    ----------
+    folder : Folder of the set.
+    name : Name of the set.
+    sources : Config, versions, command and file name prefix, by fingerprint.
+    epochs : Indices of the set's epochs, by fingerprint.
+    complete : Whether all epochs are made.
+    """
     head = {"schema": SCHEMA, "name": name, "fingerprint": "-".join(sources), "complete": complete}
     values = {**head, "sources": sources, "epochs": epochs}
     write_json(folder / DATASET_FILE, {**values, "sha256": _digest(_text(values))})
 
 
 def shard_name(source: str, index: int) -> str:
+    """Return the file name of an epoch's shard."""
     return f"{source}_{index:06d}.json"
 
 
@@ -123,24 +147,27 @@ def write_shard(folder: Path, name: str, record: Record) -> None:
 
 
 def read_shard(folder: Path, name: str) -> Record | None:
-    """An epoch's record; None where there is none, or a damaged one."""
+    """Read an epoch's record; None if it is missing or damaged."""
     try:
         digest, _, text = read_text(folder / SHARDS / name).partition("\n")
         text = text.removesuffix("\n")
         record = dict(json.loads(text)) if _digest(text) == digest else None
         found = None if record is None else _Shard.model_validate(record)
-    except (ValueError, TypeError, RecursionError, ValidationError):  # ValueError: an InputError is one
+    except (ValueError, TypeError, RecursionError, ValidationError):  # ValueError includes InputError
         return None
     return record if found and shard_name(found.source, found.epoch.index) == name else None
 
 
 def _text(values: Record) -> str:
+    """Return the JSON text that checksums are computed from."""
     return json.dumps(values, allow_nan=False, separators=(",", ":"))
 
 
 def _digest(text: str) -> str:
+    """Return the SHA-256 of a text."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _damaged(path: Path) -> InputError:
-    return InputError("is damaged: it is not as it was written", where=str(path), remedy=_REMEDY)
+    """Return the error for a changed dataset.json."""
+    return InputError("the file is damaged: its checksum differs", where=str(path), remedy=_REMEDY)

@@ -1,4 +1,4 @@
-"""What the card tells of a set, gathered shard by shard in bounded memory."""
+"""Gather the statistics for the data set card, shard by shard in bounded memory."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from numpy.typing import NDArray
 from pipeline.change.annotate import STANDS_OUT
 
 SIZE_EDGES_M = np.geomspace(0.04, 6.0, 81)
+"""Bin edges of the histogram of block sizes, m."""
 _FINER = {"stereo": "a finer depth_map, or reconstruction: vertices", "tls": "finer scanner steps"}
+"""How to make the samples of each sensor denser."""
 Cell = tuple[str, str, str, str, str]
 """Split, sensor, wall, noise, size class."""
 
 
 @dataclass
 class CellStatistics:
-    """Of one combination. noise_m: StD outside the blocks of each epoch; sizes: annotations per bin of SIZE_EDGES_M; with_ratio,
-    stand_out: annotations whose signal-to-noise ratio is known, and above STANDS_OUT; filled: sum of the shares of their bounding
-    boxes that they fill."""
+    """Statistics of one combination.
+
+    Attributes
+    ----------
+    tiles, annotations : Their numbers.
+    with_ratio, stand_out : Annotations with a known signal-to-noise ratio, and with one above STANDS_OUT.
+    filled : Sum over the annotations of the share of the bounding box that the mask fills.
+    noise_m : StD outside the blocks of each epoch, m.
+    sizes : Annotations in each bin of SIZE_EDGES_M.
+    """
 
     tiles: int = 0
     annotations: int = 0
@@ -34,7 +43,15 @@ class CellStatistics:
 
 @dataclass(frozen=True)
 class ShownTile:
-    """A tile to show. file: relative to the set's folder; record: its entry in the shard."""
+    """A sample tile for the card.
+
+    Attributes
+    ----------
+    cell : Combination of its epoch.
+    file : Path relative to the set's folder.
+    tile : Its entry in the shard.
+    noise_m : Noise of its epoch, m.
+    """
 
     cell: Cell
     file: str
@@ -43,7 +60,15 @@ class ShownTile:
 
 
 class SetStatistics:
-    """The cells of a set, and a sample tile of each sensor, noise and size class."""
+    """Statistics of a set by combination, and a sample tile of each sensor, noise level and size class.
+
+    Attributes
+    ----------
+    cells : Statistics of each combination.
+    samples : Sample tile by sensor, noise level and size class.
+    seeds : Seeds of the epochs.
+    spacing_m, smallest_m : Largest spacing of ray-traced samples and smallest edge of a block, m, by sensor and wall.
+    """
 
     def __init__(self) -> None:
         self.cells: dict[Cell, CellStatistics] = defaultdict(CellStatistics)
@@ -53,7 +78,7 @@ class SetStatistics:
         self.smallest_m: dict[tuple[str, str], float] = {}
 
     def add(self, record: dict[str, Any]) -> None:
-        """Count an epoch."""
+        """Add an epoch's record."""
         epoch = record["epoch"]
         key = epoch["split"], epoch["sensor"], epoch["wall"], epoch["noise"], epoch["size"]
         cell = self.cells[key]
@@ -78,15 +103,16 @@ class SetStatistics:
             self.samples[shown] = ShownTile(key, f"{epoch['split']}/{tile['image']['file_name']}", tile, noise or 1e-3)
 
     def _compare_spacing(self, place: tuple[str, str], spacing_m: float, annotations: list[dict[str, Any]]) -> None:
+        """Update the largest sample spacing and the smallest block edge of a sensor and wall."""
         self.spacing_m[place] = max(spacing_m, self.spacing_m.get(place, 0.0))
         edges = [min(each["size_m"]) for each in annotations]
         self.smallest_m[place] = min([*edges, self.smallest_m.get(place, float("inf"))])
 
     def warnings(self) -> list[str]:
-        """What is amiss with ray-traced samples: fewer than two along the smallest edge of a block."""
+        """Return a warning for each sensor and wall with fewer than two ray-traced samples along the smallest edge of a block."""
         return [
-            f"{sensor} {wall}: samples are {1e3 * spacing:.0f} mm apart, the smallest block has an edge of {1e3 * edge:.0f} mm: "
-            f"less than two samples a smallest edge, which lose depth and rims of small niches; take {_FINER[sensor]}"
+            f"{sensor} {wall}: samples are {1e3 * spacing:.0f} mm apart; the smallest block has an edge of {1e3 * edge:.0f} mm. "
+            f"Fewer than two samples on it lose depth and rims of small niches; use {_FINER[sensor]}"
             for (sensor, wall), spacing in sorted(self.spacing_m.items())
             if (edge := self.smallest_m[sensor, wall]) < 2 * spacing
         ]

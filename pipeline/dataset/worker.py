@@ -1,4 +1,4 @@
-"""What a worker does: make an epoch of the set and put its tiles and its shard into the folder, which every worker sees."""
+"""What a worker does: make an epoch of the set and store its tiles and shard in the folder, which all workers share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.dataset.config import DatasetConfig
-from pipeline.dataset.epoch import EpochTile, MadeEpoch, Stages, make_epoch
+from pipeline.dataset.epoch import EpochTile, MadeEpoch, StageCache, make_epoch
 from pipeline.dataset.folder import STAGING, TRUTH
 from pipeline.dataset.plan import PlannedEpoch, planned_epochs
 from pipeline.dataset.records import SCHEMA, SHARDS, read_dataset_file, shard_name, write_shard
@@ -28,13 +28,22 @@ from scene.common.config import parse
 from scene.common.errors import InputError
 
 _one_at_a_time = threading.Lock()
-"""Dask may give a worker several threads; a stage is set up once and used by one run of epochs at a time."""
+"""Dask may give a worker several threads, but one stage serves one run of epochs at a time."""
 
 
 @dataclass(frozen=True)
-class Order:
-    """An epoch to make. folder: of the data set; job: names its staging folder; source: whose epoch; stage: what it shares with
-    others (`PlannedEpoch.stage`), of that source; threads: to use; 0: all."""
+class EpochOrder:
+    """An epoch to make.
+
+    Attributes
+    ----------
+    folder : Folder of the set.
+    job : Identifier of the job, which names its staging folder.
+    source : Fingerprint of the epoch's config.
+    index : Index of the epoch in the plan of that config.
+    stage : Key of its set-up (`PlannedEpoch.stage`).
+    threads : Threads to use; 0: all.
+    """
 
     folder: str
     job: str
@@ -45,44 +54,44 @@ class Order:
 
 
 @dataclass(frozen=True)
-class _Workshop:
-    """What a worker keeps of a source between epochs."""
+class _SourcePlan:
+    """What a worker keeps of a source between epochs: config, plan, set-up and prefix of file names."""
 
     config: DatasetConfig
     plan: list[PlannedEpoch]
-    stages: Stages
+    stages: StageCache
     prefix: str
 
 
 @lru_cache(maxsize=1)
-def _workshop(folder: str, job: str, source: str) -> _Workshop:
-    """The config of a source as the folder has it; `job` makes a new job read it anew."""
+def _source_plan(folder: str, job: str, source: str) -> _SourcePlan:
+    """Read the config of a source from the folder; a new `job` reads it again."""
     entry = read_dataset_file(Path(folder))["sources"][source]
-    require_same_makers(entry, folder)
+    require_same_versions(entry, folder)
     config = parse(DatasetConfig, entry["config"], folder)
-    return _Workshop(config, planned_epochs(config), Stages(config), entry["prefix"])
+    return _SourcePlan(config, planned_epochs(config), StageCache(config), entry["prefix"])
 
 
-def makers() -> dict[str, str]:
-    """What the bytes of a set depend on beside its config: versions of the packages, and the ray tracer's backend."""
+def package_versions() -> dict[str, str]:
+    """Return what the bytes of a set depend on besides its config: versions of the packages, and the ray tracer's backend."""
     return {**versions(), "backend": VARIANT}
 
 
-def require_same_makers(entry: dict[str, Any], where: str) -> None:
-    """Raise InputError where the packages here differ from those that began the set: its bytes would, too."""
-    before, here = entry["versions"], makers()
+def require_same_versions(entry: dict[str, Any], where: str) -> None:
+    """Raise InputError if the versions here differ from those that started the set, which would change its bytes."""
+    before, here = entry["versions"], package_versions()
     differ = sorted(key for key in before if key != "platform" and here.get(key) != before[key])
     if differ:
         told = ", ".join(f"{key} {before[key]} (here {here.get(key, 'none')})" for key in differ)
         raise InputError(
-            f"was begun with {told}",
+            f"the set was started with {told}",
             where=where,
             remedy="use the same versions, or make the set in another folder",
         )
 
 
 def use_threads(count: int) -> None:
-    """Let the ray tracer and the image library use `count` threads in this process; 0: as many as there are."""
+    """Limit the threads of the ray tracer and of the image library in this process; 0: no limit."""
     if count:
         import cv2
 
@@ -90,25 +99,29 @@ def use_threads(count: int) -> None:
         cv2.setNumThreads(count)
 
 
-def fill_run(orders: Sequence[Order]) -> list[dict[str, Any]]:
-    """Make epochs one after the other, with nothing in between that needs another stage. Returns what each took, see `fill`."""
+def make_and_store_run(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
+    """Make epochs one after the other, without changing the stage in between; return what each took (see `make_and_store`)."""
     with _one_at_a_time:
-        return [fill(order) for order in orders]
+        return [make_and_store(order) for order in orders]
 
 
-def fill(order: Order) -> dict[str, Any]:
-    """Make an epoch and store it. Returns what it took: wall time by stage and processor time, s, peak memory of the worker
-    so far, GB, and the number of tiles."""
+def make_and_store(order: EpochOrder) -> dict[str, Any]:
+    """Make an epoch and store it.
+
+    Returns
+    -------
+    Wall time of each step and processor time, s, the worker's peak memory so far, GB, and the number of tiles.
+    """
     began = time.process_time()
     use_threads(order.threads)
-    workshop = _workshop(order.folder, order.job, order.source)
+    workshop = _source_plan(order.folder, order.job, order.source)
     epoch, progress = workshop.plan[order.index], Progress()
     made = make_epoch(workshop.config, epoch, workshop.stages, progress)
     with progress.stage("write"):
         _store(Path(order.folder), order, workshop.prefix, epoch, made)
     tiles = len(made.tiles)
     del made
-    dr.flush_malloc_cache()  # carving, the peak of large walls, does without what the ray tracer took
+    dr.flush_malloc_cache()  # free the ray tracer's memory before carving, which needs most on large walls
     return {
         "index": order.index,
         "tiles": tiles,
@@ -120,13 +133,14 @@ def fill(order: Order) -> dict[str, Any]:
 
 
 def _stage_name(name: str) -> str:
-    """A stage's name without the epoch's number; what is done for the reference epoch counts as setting up."""
+    """Return a step's name without the epoch's number; steps of the reference epoch count as set-up."""
     if name.startswith("epoch 0: ") or name == "wall":
         return f"set up: {name.removeprefix('epoch 0: ')}"
     return name.partition(": ")[2] or name
 
 
-def _store(folder: Path, order: Order, prefix: str, epoch: PlannedEpoch, made: MadeEpoch) -> None:
+def _store(folder: Path, order: EpochOrder, prefix: str, epoch: PlannedEpoch, made: MadeEpoch) -> None:
+    """Write tiles and shard under temporary names, then rename them, the shard last."""
     staging = folder / STAGING / order.job / f"{order.source}_{order.index:06d}"
     entries = [_write_tile(staging, prefix, epoch, tile) for tile in made.tiles]
     for name in (name for entry in entries for name in _names(entry)):
@@ -146,13 +160,14 @@ def _store(folder: Path, order: Order, prefix: str, epoch: PlannedEpoch, made: M
 
 
 def _names(entry: dict[str, Any]) -> Iterator[str]:
+    """Yield the file names of a tile."""
     yield entry["image"]["file_name"]
     if entry["truth_sha256"] is not None:
         yield entry["image"]["truth_file_name"]
 
 
 def _write_tile(staging: Path, prefix: str, epoch: PlannedEpoch, made: EpochTile) -> dict[str, Any]:
-    """Write a tile, and its truth, into the staging folder; returns its entry in the shard."""
+    """Write a tile, and its truth, into the staging folder; return its entry in the shard."""
     tile = made.tile
     name = f"{prefix}{epoch.name}_{tile.name}.tif"
     write_geotiff(staging / name, tile.values, tile.grid, description="reference minus epoch, m", with_mask=True)

@@ -1,5 +1,5 @@
-"""Detect rockfall in difference maps with Mask R-CNN in Keras, train it, and score detections against the truth.
+"""Detect rockfall in difference maps with Mask R-CNN in Keras, train the network, and score detections against the truth.
 
-Making the training data is the work of `pipeline/dataset`.
-Start with `products/run.py` (`scarpsim detect`), then `inference`, `network`, `training`, `evaluation`.
+Training data is made by `pipeline/dataset`. Start with `products/run.py` (`scarpsim detect`), then `inference`, `network`,
+`training` and `evaluation`.
 """

@@ -8,7 +8,7 @@ from scene.common.backend import dr, mi
 
 dr.eval(dr.arange(mi.Float, 4) * 2)
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "1")  # as `keras_ready` has it
+os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "1")  # as `import_keras` has it
 
 
 @pytest.fixture

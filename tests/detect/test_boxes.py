@@ -13,7 +13,7 @@ from pipeline.detection.network.boxes import (
     doublings,
     encode,
     intersection_over_union,
-    suppressed,
+    non_maximum_suppression,
     widened,
 )
 from pipeline.detection.network.roi_align import roi_align
@@ -77,7 +77,7 @@ def test_suppression_is_the_greedy_one(seed):
     boxes = _random_boxes(300, 10 + seed, 250)
     scores = np.sort(np.random.default_rng(seed).random(300).astype(np.float32))[::-1]
     wanted = _greedy(boxes, 0.3)
-    found, best = suppressed(boxes[None], scores[None].copy(), 0.3, 300)
+    found, best = non_maximum_suppression(boxes[None], scores[None].copy(), 0.3, 300)
     assert_allclose(np.asarray(found)[0, : len(wanted)], boxes[wanted])
     assert_allclose(np.asarray(best)[0, : len(wanted)], scores[wanted])
     assert (np.asarray(best)[0, len(wanted) :] == -1).all()
@@ -88,7 +88,7 @@ def test_a_long_chain_of_overlaps_is_settled():
     boxes = np.stack(
         [start, 0 * start, start + 10, 0 * start + 10], axis=1
     )  # each overlaps its neighbours alone by more than 0.4
-    _, scores = suppressed(boxes[None], np.linspace(1, 0.5, 200, dtype=np.float32)[None], 0.4, 200)
+    _, scores = non_maximum_suppression(boxes[None], np.linspace(1, 0.5, 200, dtype=np.float32)[None], 0.4, 200)
     assert int((np.asarray(scores) > 0).sum()) == 100
 
 

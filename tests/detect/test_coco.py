@@ -264,7 +264,7 @@ def test_detect_names_the_same_mistakes(case, tmp_path, capsys):
 def test_a_key_whose_values_are_no_words_makes_no_groups(tmp_path, capsys):
     paths = [str(path) for path in written(tmp_path, truth(), found())]
     message = _refused(["evaluate", *paths, "--by", "list"], tmp_path, capsys)
-    assert "the images' 'list' is no word or number; allowed: file_name, height, id, noise, width" in message
+    assert "the images' 'list' is not a word or number; allowed: file_name, height, id, noise, width" in message
 
 
 @QUICK

@@ -16,16 +16,16 @@ from pycocotools.coco import COCO
 from test_model import make_set
 
 from pipeline.cli.main import main
-from pipeline.detection.evaluation.detections import Detection, cropped, without_doubles
+from pipeline.detection.evaluation.detections import Detection, detection_from_mask, without_duplicates
 from pipeline.detection.inference import baseline, inference
 from pipeline.detection.inference.inference import paste, tile_places
 from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainingConfig
 from pipeline.detection.network.data import CocoFolder, batches, mirrored, network_input
-from pipeline.detection.network.keras_backend import keras_ready
+from pipeline.detection.network.keras_backend import import_keras
 from pipeline.detection.network.normalisation import denormalised, nmad, normalised
 from pipeline.detection.products import events
 from pipeline.detection.products.run import detect, find_inputs
-from pipeline.detection.training.schedule import has_settled, learning_rate
+from pipeline.detection.training.schedule import has_converged, learning_rate
 from pipeline.formats.rasters.geotiff import write_geotiff
 from scene.common.errors import InputError
 from scene.common.native_output import suppress_stderr
@@ -130,7 +130,7 @@ def test_a_mask_is_pasted_at_its_place():
 
 def test_run_lengths_go_round():
     mask = np.random.default_rng(3).random((9, 7)) > 0.4
-    item = cropped(mask, 5, 6, 0.7)
+    item = detection_from_mask(mask, 5, 6, 0.7)
     assert item is not None
     entry = item.annotation(1, 1, (32, 40))
     whole = np.zeros((32, 40), bool)
@@ -142,7 +142,7 @@ def test_run_lengths_go_round():
 
 def test_the_better_of_two_detections_of_one_block_stays():
     whole, part = np.ones((20, 20), bool), np.ones((20, 12), bool)
-    found = without_doubles([Detection(0, 0, part, 0.8), Detection(0, 0, whole, 0.9), Detection(0, 19, whole, 0.7)])
+    found = without_duplicates([Detection(0, 0, part, 0.8), Detection(0, 0, whole, 0.9), Detection(0, 19, whole, 0.7)])
     assert [item.score for item in found] == [0.9, 0.7]
 
 
@@ -150,7 +150,7 @@ def test_the_volume_of_a_known_niche():
     difference = np.zeros((50, 60), np.float32)
     difference[10:20, 30:50] = 0.25
     difference[10, 30] = np.nan
-    item = cropped(difference[10:20, 30:50] != 0, 10, 30, 0.99)
+    item = detection_from_mask(difference[10:20, 30:50] != 0, 10, 30, 0.99)
     assert item is not None
     found = events.event(item, 1, "map", difference, Grid(100.0, 7.0, 0.02, 60, 50))
     assert (found.x_m, found.y_m) == pytest.approx((100.0 + 40 * 0.02, 7.0 - 15 * 0.02))
@@ -219,9 +219,9 @@ def test_learning_rate_warms_up_and_falls():
 def test_training_stops_where_the_mean_slope_is_flat():
     config = TrainingConfig(stop_window=10, stop_slope=0.01)
     falling = [2.0 - 0.05 * epoch for epoch in range(20)]
-    assert not has_settled(falling, config)
-    assert has_settled(falling + [falling[-1]] * 10, config)
-    assert not has_settled([1.0] * 10, config)  # fewer than the window
+    assert not has_converged(falling, config)
+    assert has_converged(falling + [falling[-1]] * 10, config)
+    assert not has_converged([1.0] * 10, config)  # fewer than the window
 
 
 def test_the_detector_does_without_the_ray_tracer_and_that_refuses_to_come_second():
@@ -282,7 +282,7 @@ def test_convolutions_are_onednns_unless_the_environment_says_otherwise(
     monkeypatch.delenv("TF_ENABLE_ONEDNN_OPTS", raising=False)
     if given is not None:
         monkeypatch.setenv("TF_ENABLE_ONEDNN_OPTS", given)
-    keras_ready()
+    import_keras()
     assert os.environ["TF_ENABLE_ONEDNN_OPTS"] == expected
 
 

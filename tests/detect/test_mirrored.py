@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.cli.main import main
 from pipeline.detection.inference import operating_point, weights
-from pipeline.detection.inference.mirrored import VIEWS, Mirrored, network
+from pipeline.detection.inference.mirrored import VIEWS, MirroredMaskRCNN, build_network
 from pipeline.detection.network.config import DetectorConfig, HeadConfig, ProposalConfig
 from pipeline.detection.network.model import MaskRCNN
 from pipeline.detection.products import run
@@ -28,9 +28,9 @@ TURNS = VIEWS["both"]
 
 
 @pytest.fixture(scope="module")
-def model() -> Mirrored:
+def model() -> MirroredMaskRCNN:
     """With weights large enough that what it says varies over the map, and depends on which way up the map is."""
-    random, result = np.random.default_rng(4), Mirrored(SMALL)
+    random, result = np.random.default_rng(4), MirroredMaskRCNN(SMALL)
     for head in (result.proposal_head, result.box_head, result.mask_head):
         for variable in head.weights:
             variable.assign(variable + random.normal(0, 0.1, variable.shape))
@@ -72,7 +72,7 @@ def test_a_mirrored_map_has_mirrored_answers_where_its_mirror_images_are_looked_
 
 def test_one_view_is_the_network_alone_bit_for_bit(model, images):
     model.config = SMALL
-    alone = network(SMALL)
+    alone = build_network(SMALL)
     assert type(alone) is MaskRCNN
     alone.set_weights(model.get_weights())
     one_view = model({"image": images[:1]})
@@ -82,9 +82,9 @@ def test_one_view_is_the_network_alone_bit_for_bit(model, images):
 
 def test_a_detector_looks_as_its_yaml_says_unless_it_is_asked_not_to(tmp_path):
     head = {"score_shift": 1.0, "score_per_doubling": 0.25, "mirrored_score_shift": 2.0, "mirrored_score_per_doubling": -0.25}
-    weights.save(network(weights.with_head(SMALL, mirrored="both", **head)), tmp_path)
+    weights.save(build_network(weights.with_head(SMALL, mirrored="both", **head)), tmp_path)
     looks, alone = weights.load(tmp_path), weights.load(tmp_path, unmirrored=True)
-    assert isinstance(looks, Mirrored)
+    assert isinstance(looks, MirroredMaskRCNN)
     assert looks.config.head.shifts == (2.0, -0.25)
     assert type(alone) is MaskRCNN
     assert alone.config.head.shifts == (1.0, 0.25)
@@ -102,11 +102,11 @@ def test_detectors_of_before_look_at_maps_as_they_are(tmp_path):
 
 def test_scores_are_set_for_each_way_of_looking(tmp_path, monkeypatch):
     """By detections whose log odds are best moved by 1 where the map alone is looked at, and by 2 with its mirror images."""
-    monkeypatch.setattr(operating_point, "_found", lambda model, images, lowest: model.config.head.mirrored)
+    monkeypatch.setattr(operating_point, "_detect_all", lambda model, images, lowest: model.config.head.mirrored)
     monkeypatch.setattr(operating_point, "best_shifts", lambda _, found: {"none": (1.0, 0.5), "both": (2.0, -0.5)}[found])
     validation = type("Tiles", (), {"images": [], "annotations": []})()
     head = {"score_shift": 0.5, "mirrored_score_shift": 0.25, "mirrored_score_per_doubling": -0.25}
-    weights.save(network(weights.with_head(SMALL, mirrored="both", **head)), tmp_path)
+    weights.save(build_network(weights.with_head(SMALL, mirrored="both", **head)), tmp_path)
     assert operating_point.set_operating_point(tmp_path, validation) == 2.25
     set_to = weights.load_config(tmp_path).head
     assert (set_to.mirrored, set_to.score_shift, set_to.score_per_doubling) == ("both", 1.5, 0.5)
@@ -125,7 +125,7 @@ def test_the_threshold_has_no_views_to_leave_out(tmp_path, capsys):
     (tmp_path / "map.tif").write_bytes(b"")
     words = ["detect", "baseline", str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"), "--unmirrored"]
     assert main(words) == 2
-    assert "--unmirrored: goes with a network" in capsys.readouterr().err
+    assert "--unmirrored: the option needs a network" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

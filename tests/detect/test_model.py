@@ -24,7 +24,7 @@ from pipeline.detection.network.config import (
     TrainingConfig,
     load_train_config,
 )
-from pipeline.detection.network.data import CocoFolder, network_input, window
+from pipeline.detection.network.data import CocoFolder, cut_window, network_input
 from pipeline.detection.network.model import LOSSES, MaskRCNN
 from pipeline.detection.products.run import detect as run_detect
 from pipeline.detection.training.training import train
@@ -191,7 +191,7 @@ def test_a_training_starts_from_the_weights_that_its_config_names(data_set, tmp_
 def test_a_training_does_not_start_from_another_network(data_set, tmp_path):
     weights.save(MaskRCNN(SMALL.model_copy(update={"pyramid_channels": 40})), tmp_path / "begun")
     config = TrainConfig(detector=SMALL, training=TrainingConfig(start=str(tmp_path / "begun")))
-    with pytest.raises(InputError, match="does not fit"):
+    with pytest.raises(InputError, match="do not fit"):
         train(data_set, config, tmp_path / "out")
 
 
@@ -343,10 +343,10 @@ def test_weights_of_another_network_are_refused(tmp_path):
     weights.save(MaskRCNN(SMALL), tmp_path)
     other = SMALL.model_copy(update={"pyramid_channels": 40})
     (tmp_path / weights.CONFIG).write_text(json.dumps(other.model_dump(mode="json")))
-    with pytest.raises(InputError, match="does not fit"):
+    with pytest.raises(InputError, match="do not fit"):
         weights.load(tmp_path)
     (tmp_path / weights.WEIGHTS).write_bytes(b"no weights")
-    with pytest.raises(InputError, match="is no HDF5 file"):
+    with pytest.raises(InputError, match="the file is not HDF5"):
         weights.load(tmp_path)
     with pytest.raises(InputError, match="holds no detector"):
         weights.load(tmp_path / "nowhere")
@@ -354,7 +354,7 @@ def test_weights_of_another_network_are_refused(tmp_path):
 
 def test_a_window_keeps_what_it_shows_at_least_half_of(data_set):
     labelled = CocoFolder(data_set / "train").labelled(0)
-    part = window(labelled, 64, np.random.default_rng(5))
+    part = cut_window(labelled, 64, np.random.default_rng(5))
     assert part.difference.shape == part.labels.shape == (64, 64)
     assert part.labels.max() == len(part.boxes)
     for number, (y0, x0, y1, x1) in enumerate(part.boxes, start=1):

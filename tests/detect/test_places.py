@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.detection.products.events import Event, read_events, write_events
-from pipeline.detection.products.places import placed
+from pipeline.detection.products.places import with_world_coordinates
 from pipeline.formats.files.atomic import write_json
 from pipeline.formats.meshes.ply import write_ply
 from scene.geometry.frame import WallFrame
@@ -34,11 +34,11 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_an_event_lies_on_the_rock_before_it_fell(run: Path) -> None:
-    found = placed(EVENT, run / "difference_001.tif")
+    found = with_world_coordinates(EVENT, run / "difference_001.tif")
     frame = WallFrame(np.array([[0.75**0.5, 0.5, 0], [0, 0, 1], [0.5, -(0.75**0.5), 0]]), ORIGIN)
     expected = frame.to_world(np.array([3.0, 2.0, 0.3]))
     np.testing.assert_allclose([found.world_x_m, found.world_y_m, found.world_z_m], expected, atol=0.005)
-    assert placed(EVENT, run / "tiles" / "a.tif") == found
+    assert with_world_coordinates(EVENT, run / "tiles" / "a.tif") == found
     write_events([found], run / "events.csv")
     (again,) = read_events(run / "events.csv")
     assert again.world_y_m == pytest.approx(found.world_y_m, abs=1e-4)
@@ -46,7 +46,10 @@ def test_an_event_lies_on_the_rock_before_it_fell(run: Path) -> None:
 
 def test_a_place_that_is_not_known_stays_empty(run: Path, tmp_path: Path) -> None:
     (run / "epoch_000/surface.ply").unlink()
-    for event in (placed(EVENT, run / "other" / "difference_001.tif"), placed(EVENT, tmp_path / "x" / "y" / "map.tif")):
+    for event in (
+        with_world_coordinates(EVENT, run / "other" / "difference_001.tif"),
+        with_world_coordinates(EVENT, tmp_path / "x" / "y" / "map.tif"),
+    ):
         assert np.isnan([event.world_x_m, event.world_y_m, event.world_z_m]).all()
     write_events([EVENT], tmp_path / "events.csv")
     assert (tmp_path / "events.csv").read_text().splitlines()[1].endswith(",0.9700,,,")

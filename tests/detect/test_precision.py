@@ -12,7 +12,7 @@ from test_model import SMALL, make_set
 
 from pipeline.detection.inference import weights
 from pipeline.detection.network.config import TrainConfig, TrainingConfig
-from pipeline.detection.network.keras_backend import computing_in
+from pipeline.detection.network.keras_backend import computing_precision
 from pipeline.detection.training.training import train
 from scene.common.errors import InputError
 
@@ -32,18 +32,18 @@ def _error_of_a_product() -> float:
 
 @bfloat16_processor
 def test_products_have_eight_bits_inside_and_all_of_them_outside():
-    with computing_in("bfloat16"):
+    with computing_precision("bfloat16"):
         assert 1e-4 < _error_of_a_product() < 1e-2
     assert _error_of_a_product() < 1e-5
-    with computing_in("float32"):
+    with computing_precision("float32"):
         assert _error_of_a_product() < 1e-5
 
 
 def test_another_backend_is_refused(monkeypatch):
     monkeypatch.setattr(keras.backend, "backend", lambda: "jax")
-    with pytest.raises(InputError, match=r"training\.precision.*tensorflow"), computing_in("bfloat16"):
+    with pytest.raises(InputError, match=r"training\.precision.*tensorflow"), computing_precision("bfloat16"):
         pass
-    with computing_in("float32"):
+    with computing_precision("float32"):
         pass
 
 

@@ -14,8 +14,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_model import make_set
 
 from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainConfig, TrainingConfig
-from pipeline.detection.network.data import CocoFolder, mirrored, network_input, window
-from pipeline.detection.training.resident import cut, resident, turned
+from pipeline.detection.network.data import CocoFolder, cut_window, mirrored, network_input
+from pipeline.detection.training.resident import cut_on_device, load_resident_set, mirrored_window
 from pipeline.detection.training.training import train
 from scene.common.errors import InputError
 
@@ -37,10 +37,10 @@ class _At:
 def test_windows_are_those_of_the_streamed_training(tmp_path, corner, axes):
     """Cut and mirrored in NumPy and on the device; the device keeps a block's number, NumPy counts anew."""
     folder = CocoFolder(make_set(tmp_path, 2, 6, blocks=4))
-    expected = window(folder.labelled(1), 64, _At(*corner))
-    found = cut(resident(folder, FIXED, 64), jnp.int32(1), jnp.array(corner), 64)
+    expected = cut_window(folder.labelled(1), 64, _At(*corner))
+    found = cut_on_device(load_resident_set(folder, FIXED, 64), jnp.int32(1), jnp.array(corner), 64)
     for axis in axes:
-        expected, found = mirrored(expected, axis), turned(found, axis)
+        expected, found = mirrored(expected, axis), mirrored_window(found, axis)
     wanted = network_input(expected, FIXED)
     assert_allclose(found["image"], wanted["image"], rtol=1e-3, atol=1e-4)  # half precision
     kept = np.flatnonzero(found["valid"])
@@ -57,13 +57,13 @@ def test_blocks_to_ignore_stay_so(tmp_path):
     content = json.loads(path.read_text())
     content["annotations"][1]["ignore"] = 1
     path.write_text(json.dumps(content))
-    data = resident(CocoFolder(tmp_path), FIXED, 64)
+    data = load_resident_set(CocoFolder(tmp_path), FIXED, 64)
     assert_array_equal(np.asarray(data.valid)[0, :3], [1, -1, 0])
 
 
 def test_tiles_that_are_too_small_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"64 x 64 px.*96 px or more.*streamed"):
-        resident(CocoFolder(make_set(tmp_path, 1, 6, side=64, blocks=1)), FIXED, 96)
+        load_resident_set(CocoFolder(make_set(tmp_path, 1, 6, side=64, blocks=1)), FIXED, 96)
 
 
 def test_another_backend_is_refused(tmp_path):
@@ -77,9 +77,9 @@ def test_another_backend_is_refused(tmp_path):
 _LEARNED = """
 from pathlib import Path
 
-from pipeline.detection.network.keras_backend import keras_ready
+from pipeline.detection.network.keras_backend import import_keras
 
-keras_ready()
+import_keras()
 import keras
 import numpy as np
 from keras import ops

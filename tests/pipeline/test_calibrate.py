@@ -13,15 +13,15 @@ import pytest
 import tifffile
 from scipy import stats
 
-from pipeline.calibration.calibrate import calibrate_material
-from pipeline.calibration.greedy import greedy
+from pipeline.calibration.calibrate import calibrate_inputs
+from pipeline.calibration.greedy import greedy_search
 from pipeline.calibration.inputs import CalibrationInputs
-from pipeline.calibration.maps import noise_map
-from pipeline.calibration.parameters import _ALLOWED, Parameters, parameters
-from pipeline.calibration.reobserve import Reobserver
+from pipeline.calibration.noise_map import noise_map
+from pipeline.calibration.parameters import _ALLOWED, NoiseParameters, noise_parameters
 from pipeline.calibration.search import NoiseSearch
-from pipeline.calibration.signature import Signature
-from pipeline.calibration.windows import Windows, choose_windows, unchanged
+from pipeline.calibration.summary_statistics import SummaryStatistics
+from pipeline.calibration.window_simulator import WindowSimulator
+from pipeline.calibration.windows import Windows, choose_windows, stable_ground
 from pipeline.change.difference import raster_grid
 from pipeline.cli.main import main
 from pipeline.config.bundled import bundled_config
@@ -74,7 +74,7 @@ def test_what_moved_is_not_stable_and_what_is_wrong_by_itself_is() -> None:
     noise = KeyedRandom(1).generator().normal(0, 0.01, GRID.shape).astype(np.float32)
     noise[50:90, 60:120] += 0.3
     noise[20, 20] = 2.0
-    stable = unchanged([noise])
+    stable = stable_ground([noise])
     assert not stable[50:90, 60:120].any()
     assert stable[20, 20]
     assert stable.mean() > 0.9
@@ -108,8 +108,8 @@ def test_maps_that_are_no_measurement_are_one_line(tmp_path: Path, capsys: pytes
     tagged.close()
     out = tmp_path / "out"
     for words, message in (
-        ([zero], "zero: shows the same difference, 0 m, everywhere"),
-        ([once, once], "is the same map as once"),
+        ([zero], "zero: the difference is 0 m everywhere"),
+        ([once, once], "the map equals once"),
         ([flat], "its pixels are 0 x 0 units"),
     ):
         assert main(["calibrate", *map(str, words), "--sensor", "tls", "--out", str(out), "--quiet"]) == 2
@@ -128,18 +128,18 @@ def test_no_stable_window_is_an_input_error() -> None:
     ("model", "name", "message"),
     [
         (StereoModel(), "parallax_sigma", "did you mean 'parallax_sigma_px'"),
-        (StereoModel(), "orientation", "no noise of the orientation"),
-        (TlsModel(), "parallax_sigma_px", "no noise parameter of the tls sensor"),
+        (StereoModel(), "orientation", "no orientation noise to scale"),
+        (TlsModel(), "parallax_sigma_px", "not a noise parameter of the tls sensor"),
     ],
 )
 def test_wrong_parameters_are_named(model: StereoModel | TlsModel, name: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        parameters(model, [name])
+        noise_parameters(model, [name])
 
 
 def test_a_factor_scales_every_sigma_of_the_orientation_but_those_fitted_singly() -> None:
     base = parse(StereoModel, {"noise": {"orientation": {"f_px": 0.5, "k1": 0.001}}}, "test")
-    model: Any = parameters(base, ["orientation", "orientation.k1"]).model([2.0, 0.004])
+    model: Any = noise_parameters(base, ["orientation", "orientation.k1"]).model([2.0, 0.004])
     assert model.noise.orientation.f_px.sigma == 1.0
     assert model.noise.orientation.k1.sigma == 0.004
 
@@ -160,7 +160,7 @@ def test_chosen_cells_are_those_of_the_whole_observation_to_the_bit(sensor: str,
     seen = whole.observe(RayCaster(site.mesh), KeyedRandom(5)).points.reshape(-1, 3)
     grid = Grid(2.0, 5.0, 0.04, 120, 80)
     windows = choose_windows(np.ones(grid.shape, dtype=bool), grid, config.calibration)
-    simulator = Reobserver(config, site, windows)
+    simulator = WindowSimulator(config, site, windows)
     np.testing.assert_array_equal(simulator._observe(whole.model, KeyedRandom(5)), seen[simulator.cells])
 
 
@@ -168,10 +168,10 @@ def test_chosen_cells_are_those_of_the_whole_observation_to_the_bit(sensor: str,
 def test_maps_in_windows_have_the_statistics_of_the_whole_simulation(sensor: str) -> None:
     """The same random numbers in both, so that only the registration differs: 4 % of any length at small scale."""
     config, site = small(sensor)
-    material = seen_by(config, site, 2, 3)
-    windows = material.windows(config)
-    simulator = Reobserver(config, site, windows)
-    signature = Signature(windows, simulator.silent_heights, np.array([0.0, 0.0, 1.0]))
+    inputs = seen_by(config, site, 2, 3)
+    windows = inputs.windows(config)
+    simulator = WindowSimulator(config, site, windows)
+    summary = SummaryStatistics(windows, simulator.noiseless_heights, np.array([0.0, 0.0, 1.0]))
     whole: Any = site.sensor
     random = [KeyedRandom(3).child("map", number) for number in range(2)]
     fast = np.stack(
@@ -181,9 +181,9 @@ def test_maps_in_windows_have_the_statistics_of_the_whole_simulation(sensor: str
         ]
     )
     fast = np.where(windows.stable, fast, np.nan)
-    slow = np.stack([windows.cut(values) for values in material.maps])
-    local = [name.split(".")[0] in ("size", "variogram", "incidence") for name in signature.names]
-    np.testing.assert_allclose((signature.of(fast) - signature.of(slow))[local], 0, atol=0.04)
+    slow = np.stack([windows.cut(values) for values in inputs.maps])
+    local = [name.split(".")[0] in ("size", "variogram", "incidence") for name in summary.names]
+    np.testing.assert_allclose((summary.compute(fast) - summary.compute(slow))[local], 0, atol=0.04)
 
 
 @pytest.mark.parametrize("count", [1, 5])
@@ -192,10 +192,10 @@ def test_few_windows_have_no_modes_of_deformation(count: int) -> None:
     corner = np.array([[0, 32 * number] for number in range(count)], dtype=np.int32)
     windows = Windows(Grid(0.0, 1.0, 0.02, 200, 50), corner, 24, np.ones((count, 24, 24), dtype=bool))
     bumps = KeyedRandom(1).generator().normal(0, 0.05, (count, 24, 24))
-    signature = Signature(windows, bumps, np.array([0.0, 0.0, 1.0]))
+    summary = SummaryStatistics(windows, bumps, np.array([0.0, 0.0, 1.0]))
     level = 1e-3 * np.arange(1, count + 1)
     values = np.broadcast_to(level[None, :, None, None], (2, count, 24, 24)) + 0.0
-    found = dict(zip(signature.names, np.exp(signature.of(values)), strict=True))
+    found = dict(zip(summary.names, np.exp(summary.compute(values)), strict=True))
     assert [name for name in found if name.startswith("deformation")] == ["deformation.rest"]
     assert found["deformation.rest"] == pytest.approx(np.sqrt(np.mean(level**2)), rel=0.01)
 
@@ -215,7 +215,7 @@ class Known:
 
     def search(self, seed: int) -> NoiseSearch:
         bounds = np.array([0.05, 0.05]), np.array([5.0, 5.0])
-        named = Parameters(TlsModel(), ("range_sigma_m", "angle_sigma_rad"), *bounds)
+        named = NoiseParameters(TlsModel(), ("range_sigma_m", "angle_sigma_rad"), *bounds)
         return NoiseSearch(self, named, 2, KeyedRandom(seed), Progress())
 
 
@@ -302,7 +302,7 @@ def test_greedy_meets_the_standard_deviation_and_not_the_pattern() -> None:
     search = known.search(1)
     observed = known(np.array([0.5, 2.0]), 2, KeyedRandom(1))
     found = search.run(observed, 60, 0.95)
-    result = greedy(known, search.parameters, np.array([1.0, 1.0]), 4, observed[4], KeyedRandom(2))
+    result = greedy_search(known, search.parameters, np.array([1.0, 1.0]), 4, observed[4], KeyedRandom(2))
     assert abs(result.relative_error) < 0.1
     cost = np.sum(found.surface.misfit(found.x, observed) ** 2)
     assert np.sum(found.surface.misfit(result.x, observed) ** 2) > 10 * cost
@@ -317,9 +317,9 @@ def test_known_noise_of_another_wall_and_seed_comes_back() -> None:
     config, site = small("tls", "wall.seed=22", "calibration.simulations=60", "seed=2")
     truth = np.array([0.0015, 2e-4])
     whole: Any = site.sensor
-    real = replace(site, sensor=replace(whole, model=parameters(whole.model, ()).model(truth)))
-    material = replace(seen_by(config, real, 2, 102), site=site)
-    found = calibrate_material(config, "tls", material, Progress(), with_greedy=False).found
+    real = replace(site, sensor=replace(whole, model=noise_parameters(whole.model, ()).model(truth)))
+    inputs = replace(seen_by(config, real, 2, 102), site=site)
+    found = calibrate_inputs(config, "tls", inputs, Progress(), with_greedy=False).found
     off = (found.x - np.log(truth)) / ((found.high - found.low) / 2)
     assert np.abs(off).max() < 2
 
@@ -329,7 +329,7 @@ def test_every_parameter_has_words() -> None:
     allowed = {"tls": TlsModel(), "stereo": stereo}
     for sensor, model in allowed.items():
         names = _ALLOWED[sensor]
-        told = [Parameters(model, names, np.ones(len(names)), np.ones(len(names))).meaning(name) for name in names]
+        told = [NoiseParameters(model, names, np.ones(len(names)), np.ones(len(names))).meaning(name) for name in names]
         assert not any(text == name or "[" in text for text, name in zip(told, names, strict=True))
-    words = Parameters(stereo, ("orientation.k1",), np.ones(1), np.ones(1)).meaning("orientation.k1")
+    words = NoiseParameters(stereo, ("orientation.k1",), np.ones(1), np.ones(1)).meaning("orientation.k1")
     assert words == "standard deviation: radial distortion, r^2"

@@ -10,10 +10,10 @@ import yaml
 
 from benchmarks.workshop import rays
 from pipeline.calibration.calibrate import calibrate
-from pipeline.calibration.inputs import CalibrationInputs, _angular_spacing, read_material
+from pipeline.calibration.inputs import CalibrationInputs, _angular_spacing, read_inputs
 from pipeline.calibration.reference_error import ReferenceError
-from pipeline.calibration.reobserve import Reobserver
 from pipeline.calibration.report import warnings
+from pipeline.calibration.window_simulator import WindowSimulator
 from pipeline.calibration.write import to_dict
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
@@ -98,15 +98,15 @@ def half(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "half"
 
 
-def material(half: Path) -> tuple[SimulationConfig, CalibrationInputs]:
+def inputs(half: Path) -> tuple[SimulationConfig, CalibrationInputs]:
     config = load_config(bundled_config("", "demo"), [*SETTINGS, "calibration.fit=[range_sigma_m]"], "tls", None)
-    return config, read_material([half], config, "tls", KeyedRandom(1))
+    return config, read_inputs([half], config, "tls", KeyedRandom(1))
 
 
 def test_maps_of_a_half_are_as_noisy_as_measured_only_with_the_reference_error(half: Path) -> None:
     """Without it the simulated maps have less than 0.85 of the measured deviation, with it as much to 8 %: a half's points stand
     as on a chessboard, simulated ones on squares, and pixels hold some three."""
-    config, found = material(half)
+    config, found = inputs(half)
     assert found.reference_error is not None
     assert found.reference_error.sigma_m == pytest.approx(NOISE_M, rel=0.1)
     windows = found.windows(config)
@@ -114,7 +114,7 @@ def test_maps_of_a_half_are_as_noisy_as_measured_only_with_the_reference_error(h
     model = TlsModel.model_validate({"noise": {"range_sigma_m": NOISE_M, "angle_sigma_rad": 1e-6}})
 
     def deviation(error: ReferenceError | None) -> float:
-        simulator = Reobserver(config, found.site, windows, of_points=True, reference_error=error)
+        simulator = WindowSimulator(config, found.site, windows, of_points=True, reference_error=error)
         return float(np.nanstd(simulator.maps(model, 2, KeyedRandom(5))))
 
     assert deviation(found.reference_error) == pytest.approx(measured, rel=0.08)
@@ -134,7 +134,7 @@ def test_points_that_lie_in_one_direction_are_an_input_error(half: Path) -> None
 @pytest.mark.slow
 def test_the_noise_of_the_instrument_comes_back_from_a_half(half: Path) -> None:
     """Within twice the interval of 95 %, and 8 % at most; without the reference's error it is a quarter more."""
-    config, _ = material(half)
+    config, _ = inputs(half)
     result = calibrate(config, "tls", [half], Progress(), with_greedy=False)
     (value,), (low,), (high,) = (np.exp(each) for each in (result.found.x, result.found.low, result.found.high))
     assert abs(np.log(value / NOISE_M)) < min(np.log(high / low), 0.08)

@@ -18,7 +18,7 @@ from pipeline.comparison import report
 from pipeline.comparison.assess import assess
 from pipeline.comparison.comparison import compare_sensors
 from pipeline.comparison.covariates import edge_distance
-from pipeline.comparison.sensors_compared import contestants
+from pipeline.comparison.sensor_setups import sensor_setups
 from pipeline.comparison.trial import Trial, compare, rockfalls
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.progress import Progress
@@ -53,7 +53,7 @@ def trial(site: Path) -> Trial:
     """The scanner with its own noise, and with ten times as much."""
     noisy = site.parent / "noisy.yaml"
     noisy.write_text("sensor: tls\nnoise: {range_sigma_m: 0.02, angle_sigma_rad: 0.0}\n")
-    sensors = [each for each in contestants([str(site), str(noisy)]) if each.sensor == "tls"]
+    sensors = [each for each in sensor_setups([str(site), str(noisy)]) if each.sensor == "tls"]
     return compare(sensors, 2, (0.1, 0.4))
 
 
@@ -61,7 +61,7 @@ def test_who_is_compared(site: Path) -> None:
     again = site.parent / "again" / site.name
     again.parent.mkdir()
     again.write_text(site.read_text())
-    found = contestants([str(site), "riegl_vz400i", "glendale_high", str(again)])
+    found = sensor_setups([str(site), "riegl_vz400i", "glendale_high", str(again)])
     assert [(each.name, each.sensor) for each in found] == [
         ("site_stereo", "stereo"),
         ("site_tls", "tls"),
@@ -78,7 +78,7 @@ def test_who_is_compared(site: Path) -> None:
 
 
 def test_a_site_beside_another_gets_the_first_ones_wall(site: Path) -> None:
-    found = contestants([str(site), "bulga"], ["difference.gsd_m=0.05"])
+    found = sensor_setups([str(site), "bulga"], ["difference.gsd_m=0.05"])
     assert found[-1].config.wall == found[0].config.wall
     assert found[-1].config.cameras != found[0].config.cameras
     assert {each.config.difference.gsd_m for each in found} == {0.05}
@@ -86,12 +86,12 @@ def test_a_site_beside_another_gets_the_first_ones_wall(site: Path) -> None:
 
 def test_an_unknown_name_is_told_with_the_nearest() -> None:
     with pytest.raises(InputError, match="riegl_vz400i"):
-        contestants(["riegl_vz40i"])
+        sensor_setups(["riegl_vz40i"])
 
 
 def test_presets_scan_with_the_configs_step_unless_asked(site: Path) -> None:
     """The config's is 2 mrad in both; the preset names none, so that its own is the default of 0.5 mrad."""
-    shared, own = (contestants([str(site), "riegl_vz400i"], own_step=own_step) for own_step in (False, True))
+    shared, own = (sensor_setups([str(site), "riegl_vz400i"], own_step=own_step) for own_step in (False, True))
     assert [each.angular_step_rad for each in shared] == [None, (0.002, 0.002), (0.002, 0.002)]
     assert own[2].angular_step_rad == (0.0005, 0.0005)
     assert shared[2].config.scanner.pulse_rate_hz == own[2].config.scanner.pulse_rate_hz
@@ -101,9 +101,9 @@ def test_presets_scan_with_the_configs_step_unless_asked(site: Path) -> None:
 def test_the_same_file_twice_is_refused(site: Path, monkeypatch: pytest.MonkeyPatch, again: str) -> None:
     monkeypatch.chdir(site.parent)
     with pytest.raises(InputError, match="given twice"):
-        contestants(["site.yaml", "riegl_vz400i", again.format(folder=site.parent)])
+        sensor_setups(["site.yaml", "riegl_vz400i", again.format(folder=site.parent)])
     with pytest.raises(InputError, match="given twice"):
-        contestants(["riegl_vz400i", "riegl_vz400i"])
+        sensor_setups(["riegl_vz400i", "riegl_vz400i"])
 
 
 @pytest.mark.parametrize("epochs", ["0", "1000", "1000000000", "9" * 5000, "1e9", "-1"])
@@ -150,7 +150,7 @@ class Recorded(Progress):
 
 def test_the_progress_ends_with_the_figures(site: Path) -> None:
     progress = Recorded()
-    compare_sensors(contestants([str(site)])[1:], (), 2, (0.1, 0.4), progress)
+    compare_sensors(sensor_setups([str(site)])[1:], (), 2, (0.1, 0.4), progress)
     assert progress.shares[0] < 0.01
     assert progress.shares == sorted(progress.shares)
     assert progress.shares[-1] == pytest.approx(1.0)

@@ -21,9 +21,9 @@ from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
 from pipeline.dataset.combine import merge_datasets, split_dataset
 from pipeline.dataset.config import load_dataset_config
-from pipeline.dataset.epoch import Stages, make_epoch
+from pipeline.dataset.epoch import StageCache, make_epoch
 from pipeline.dataset.loaders import Tiles
-from pipeline.dataset.plan import planned_epochs, region, simulation_of
+from pipeline.dataset.plan import planned_epochs, simulation_of, tile_region
 from pipeline.dataset.records import write_dataset_file
 from pipeline.dataset.run import make_dataset, verify_dataset
 from pipeline.formats.rasters.geotiff import read_geotiff
@@ -129,11 +129,11 @@ def test_validation_shares_neither_place_nor_epoch_with_training(made: Path) -> 
 def test_regions_keep_apart(width: int, overlap: int, share: float) -> None:
     config = TileConfig(size_px=100, overlap_px=overlap if overlap < 100 else 99)
     grid = Grid(0.0, 0.0, 0.02, width, 500)
-    train, val = region("train", share, grid, config), region("val", share, grid, config)
+    train, val = tile_region("train", share, grid, config), tile_region("val", share, grid, config)
     assert train.end <= val.first
     assert train.first == 0
-    with pytest.raises(InputError, match="columns of tiles is none of them"):
-        region("train", 1e-4, grid, config)
+    with pytest.raises(InputError, match="columns of tiles rounds to none"):
+        tile_region("train", 1e-4, grid, config)
 
 
 def test_the_card_tells_what_is_there(made: Path) -> None:
@@ -155,7 +155,7 @@ def test_an_epoch_does_not_depend_on_those_before_it(made: Path) -> None:
     """The last epoch of each sensor alone, its stage set up for it only, against the set's tiles."""
     config = tiny()
     epoch = planned_epochs(config)[-1]
-    found = make_epoch(config, epoch, Stages(config), Progress())
+    found = make_epoch(config, epoch, StageCache(config), Progress())
     for each in found.tiles:
         stored, grid = read_geotiff(made / epoch.split / f"{epoch.name}_{each.tile.name}.tif")
         np.testing.assert_array_equal(stored, each.tile.values)
@@ -166,7 +166,7 @@ def test_a_stage_is_set_up_once_and_shared(monkeypatch: pytest.MonkeyPatch) -> N
     config = tiny(references=2, sensors=["tls"])
     plan = planned_epochs(config)
     assert [epoch.reference for epoch in plan] == [1, 1, 1, 2]
-    stages = Stages(config)
+    stages = StageCache(config)
     for epoch in plan[:3]:
         make_epoch(config, epoch, stages, Progress())
     assert stages.made == 1
@@ -215,7 +215,7 @@ def test_sets_merge_and_split(made: Path, tmp_path: Path) -> None:
     tls = Tiles(tmp_path / "parts/tls/train")
     assert {record["sensor"] for record in tls.records} == {"tls"}
     assert len(tls) == sum(image["sensor"] == "tls" for image in entries(merged, "train", "images"))
-    with pytest.raises(InputError, match="holds epochs that an earlier one holds too"):
+    with pytest.raises(InputError, match="an earlier set has the same epochs"):
         merge_datasets([made, made], tmp_path / "twice")
     assert not (tmp_path / "twice").exists()
     with pytest.raises(InputError, match="unknown key 'sensr'"):
@@ -276,7 +276,7 @@ def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="exists and is not empty"):
         make_dataset(tiny(), tmp_path)
-    with pytest.raises(InputError, match="the config is of another"):
+    with pytest.raises(InputError, match="but the config gives"):
         make_dataset(tiny(seed=5), made)
     known = json.loads((made / "dataset.json").read_text())
     with pytest.raises(InputError, match="is not a data set"):
@@ -285,7 +285,7 @@ def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     changed = {known["fingerprint"]: {**source, "versions": {**source["versions"], "numpy": "0.1"}}}
     copy = tmp_path / "copy"
     write_dataset_file(copy, known["name"], changed, known["epochs"])
-    with pytest.raises(InputError, match=r"begun with numpy 0.1 \(here"):
+    with pytest.raises(InputError, match=r"started with numpy 0.1 \(here"):
         make_dataset(tiny(), copy)
 
 
@@ -347,7 +347,7 @@ def test_noise_is_scaled_and_its_grid_is_not() -> None:
         ({"noise": {}}, "'noise'"),
         ({"parts": [{"walls": ["ledg"], "noise": ["low"], "sizes": ["large"], "train": 1}]}, "did you mean 'ledge'"),
         ({"parts": [{"walls": ["ledge"], "noise": ["low"], "sizes": ["large"]}]}, "has no epochs"),
-        ({"parts": [TINY["parts"][0], TINY["parts"][0]]}, "a second time"),
+        ({"parts": [TINY["parts"][0], TINY["parts"][0]]}, "repeats the combination"),
         ({"noise": {"low": {"stereo": TINY["noise"]["low"]["stereo"]}}}, "needs noise.low.tls"),
         ({"noise": {"low": {**TINY["noise"]["low"], "tls": {"model": {"sensor": "tls"}, "scale": {"x": 1}}}}}, "no factor"),
         ({"walls": {"a_b": TINY["walls"]["ledge"]}}, "a_b"),

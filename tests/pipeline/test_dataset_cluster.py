@@ -20,8 +20,8 @@ import psutil
 import pytest
 from tiny_dataset import ROOT, TINY
 
-from pipeline.dataset import standstill
-from pipeline.dataset.worker import Order
+from pipeline.dataset import watchdog
+from pipeline.dataset.worker import EpochOrder
 from scene.common.errors import OutsideError
 
 dask = pytest.importorskip("dask")
@@ -29,19 +29,19 @@ distributed = pytest.importorskip("distributed")
 pytest.importorskip("cryptography")
 cluster = pytest.importorskip("pipeline.dataset.cluster")
 
-ORDERS = [Order("folder", "job", "source", index, ("tls", "wall", "low", 1)) for index in range(4)]
+ORDERS = [EpochOrder("folder", "job", "source", index, ("tls", "wall", "low", 1)) for index in range(4)]
 
 
-def quickly(orders: Sequence[Order]) -> list[dict[str, Any]]:
+def quickly(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
     return [{"index": order.index} for order in orders]
 
 
-def deadly(orders: Sequence[Order]) -> list[dict[str, Any]]:
+def deadly(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
     os.kill(os.getpid(), signal.SIGKILL)
     return []
 
 
-def deadlocked(orders: Sequence[Order]) -> list[dict[str, Any]]:
+def deadlocked(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
     """Waits in native code, without the interpreter's lock, for what nobody gives; the worker's own threads go on."""
     lock = threading.Lock()
     lock.acquire()
@@ -49,7 +49,7 @@ def deadlocked(orders: Sequence[Order]) -> list[dict[str, Any]]:
     return []
 
 
-def slowly(orders: Sequence[Order]) -> list[dict[str, Any]]:
+def slowly(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
     """Takes processor time; a file says that it does."""
     Path(os.environ["AT_WORK"]).touch()
     end = time.monotonic() + 1.0
@@ -116,26 +116,26 @@ def test_nobody_else_can_hand_the_workers_work() -> None:
 
 
 def test_workers_killed_at_their_start_are_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "fill_run", quickly)
+    monkeypatch.setattr(cluster, "make_and_store_run", quickly)
     with killer(2) as killed:
-        found = list(cluster.fill_on_cluster(ORDERS, 1, ""))
+        found = list(cluster.make_on_cluster(ORDERS, 1, ""))
     assert len(killed) == 2
     assert sorted(each["index"] for each in found) == [0, 1, 2, 3]
 
 
 def test_workers_that_never_start_end_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "fill_run", quickly)
+    monkeypatch.setattr(cluster, "make_and_store_run", quickly)
     monkeypatch.setattr(cluster, "_STARTS", 2)
-    with killer(1000) as killed, pytest.raises(OutsideError, match="the same command goes on"):
-        list(cluster.fill_on_cluster(ORDERS, 1, ""))
+    with killer(1000) as killed, pytest.raises(OutsideError, match="run the same command to continue"):
+        list(cluster.make_on_cluster(ORDERS, 1, ""))
     assert 2 <= len(killed) < 20
 
 
 def test_an_epoch_that_kills_its_workers_ends_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "fill_run", deadly)
+    monkeypatch.setattr(cluster, "make_and_store_run", deadly)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
-    with pytest.raises(OutsideError, match="the same command goes on"):
-        list(cluster.fill_on_cluster(ORDERS, 1, ""))
+    with pytest.raises(OutsideError, match="run the same command to continue"):
+        list(cluster.make_on_cluster(ORDERS, 1, ""))
 
 
 @pytest.mark.slow
@@ -145,9 +145,9 @@ def test_a_stopped_worker_is_replaced(
 ) -> None:
     """SIGSTOP, as of a process that stands still with its interpreter; the work is done by the next."""
     monkeypatch.setenv("AT_WORK", str(tmp_path / "at_work"))
-    monkeypatch.setattr(cluster, "fill_run", slowly)
+    monkeypatch.setattr(cluster, "make_and_store_run", slowly)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
-    monkeypatch.setattr(standstill, "STUCK_S", 4.0)
+    monkeypatch.setattr(watchdog, "STALLED_S", 4.0)
 
     def stopped() -> None:
         while not (spawned() if moment == "at its start" else (tmp_path / "at_work").exists()):
@@ -156,20 +156,20 @@ def test_a_stopped_worker_is_replaced(
 
     stop = threading.Thread(target=stopped)
     stop.start()
-    found = list(cluster.fill_on_cluster(ORDERS, 1, ""))
+    found = list(cluster.make_on_cluster(ORDERS, 1, ""))
     stop.join()
     assert sorted(each["index"] for each in found) == [0, 1, 2, 3]
-    assert "took no processor time" in capfd.readouterr().err
+    assert "used no processor time" in capfd.readouterr().err
 
 
 def test_a_deadlocked_worker_ends_the_job(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(cluster, "fill_run", deadlocked)
+    monkeypatch.setattr(cluster, "make_and_store_run", deadlocked)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
-    monkeypatch.setattr(standstill, "STUCK_S", 1.0)
+    monkeypatch.setattr(watchdog, "STALLED_S", 1.0)
     once = dask.config.set({"distributed.scheduler.allowed-failures": 0})
-    with once, pytest.raises(OutsideError, match="the same command goes on"):
-        list(cluster.fill_on_cluster(ORDERS, 1, ""))
-    assert "took no processor time for 1 s" in capfd.readouterr().err
+    with once, pytest.raises(OutsideError, match="run the same command to continue"):
+        list(cluster.make_on_cluster(ORDERS, 1, ""))
+    assert "used no processor time for 1 s" in capfd.readouterr().err
 
 
 @pytest.fixture
@@ -182,8 +182,8 @@ def no_workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def test_a_cluster_of_the_users_without_workers_ends_the_job(no_workers: str) -> None:
-    with pytest.raises(OutsideError, match="the scheduler has no workers; what was finished is kept"):
-        list(cluster.fill_on_cluster(ORDERS, 0, no_workers))
+    with pytest.raises(OutsideError, match="the scheduler has no workers; finished epochs are kept"):
+        list(cluster.make_on_cluster(ORDERS, 0, no_workers))
 
 
 @pytest.mark.parametrize("error", [TimeoutError("late"), OSError("gone"), RuntimeError("Cannot change state of Timeout")])
@@ -200,7 +200,7 @@ def test_an_error_while_closing_does_not_hide_the_outcome(
 
     monkeypatch.setattr(distributed.Client, "close", failing)
     with pytest.raises(OutsideError, match="the scheduler has no workers"):
-        list(cluster.fill_on_cluster(ORDERS, 0, no_workers))
+        list(cluster.make_on_cluster(ORDERS, 0, no_workers))
 
 
 def test_a_scheduler_that_dies_ends_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,8 +217,8 @@ def test_a_scheduler_that_dies_ends_the_job(tmp_path: Path, monkeypatch: pytest.
         time.sleep(0.05)
     timer = threading.Timer(2.0, scheduler.kill)
     timer.start()
-    with pytest.raises(OutsideError, match="the same command goes on"):
-        list(cluster.fill_on_cluster(ORDERS, 0, json.loads(file.read_text())["address"]))
+    with pytest.raises(OutsideError, match="run the same command to continue"):
+        list(cluster.make_on_cluster(ORDERS, 0, json.loads(file.read_text())["address"]))
     scheduler.wait()
 
 
@@ -253,6 +253,6 @@ def test_workers_do_not_run_the_script_again(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(main, "__file__", file, raising=False)
         before = get_preparation_data("worker")
         assert {"init_main_from_path", "init_main_from_name"} & set(before)
-        with cluster._script_kept_from_workers():
+        with cluster._workers_without_user_script():
             assert not {"init_main_from_path", "init_main_from_name"} & set(get_preparation_data("worker"))
         assert get_preparation_data("worker") == before

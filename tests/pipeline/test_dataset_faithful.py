@@ -40,7 +40,7 @@ def test_a_level_scales_the_orientation_alone_or_all_noise() -> None:
 
 
 def test_a_laser_scanner_has_no_orientation_to_scale() -> None:
-    with pytest.raises(InputError, match="scaled: orientation is of a stereo pair"):
+    with pytest.raises(InputError, match="a laser scanner has no orientation noise"):
         with_noise({}, {"scaled": "orientation"})
 
 

@@ -110,10 +110,10 @@ def test_a_killed_worker_costs_nothing(made: Path, tmp_path: Path) -> None:
 def test_epochs_that_share_a_stage_go_to_one_worker(name: str, workers: int) -> None:
     """Every epoch once; no run has two stages; whole stages where they are short; enough runs for all workers."""
     from pipeline.dataset.cluster import runs
-    from pipeline.dataset.worker import Order
+    from pipeline.dataset.worker import EpochOrder
 
     plan = planned_epochs(load_dataset_config(bundled_config("datasets", name)))
-    found = runs([Order("folder", "job", "source", epoch.index, epoch.stage) for epoch in plan], workers)
+    found = runs([EpochOrder("folder", "job", "source", epoch.index, epoch.stage) for epoch in plan], workers)
     assert [order.index for run in found for order in run] == list(range(len(plan)))
     assert all(len({order.stage for order in run}) == 1 for run in found)
     assert max(len(run) for run in found) <= 8
@@ -178,14 +178,14 @@ def test_an_interrupted_set_is_usable(tmp_path: Path, monkeypatch: pytest.Monkey
     from pipeline.dataset import run
 
     out = tmp_path / "set"
-    fill = run.fill
+    fill = run.make_and_store
 
     def interrupted(order: Any) -> dict[str, Any]:
         if order.index == 1:
             raise KeyboardInterrupt
         return fill(order)
 
-    monkeypatch.setattr(run, "fill", interrupted)
+    monkeypatch.setattr(run, "make_and_store", interrupted)
     with pytest.raises(KeyboardInterrupt):
         make_dataset(tiny(sensors=["tls"]), out)
     assert len(COCO(out / "train/annotations.json").imgs) > 0

@@ -10,8 +10,8 @@ import pytest
 from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
 from pipeline.dataset.config import load_dataset_config
-from pipeline.dataset.epoch import no_tile
-from pipeline.dataset.plan import Split, check_filled, planned_epochs, region
+from pipeline.dataset.epoch import no_tile_error
+from pipeline.dataset.plan import Split, check_tiles_filled, planned_epochs, tile_region
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 
@@ -19,7 +19,7 @@ from scene.geometry.grid import Grid
 def check(width: int, height: int, split: Split, share: float, **tiles: Any) -> None:
     config = TileConfig(**{"size_px": 512, **tiles})
     grid = Grid(0.0, 0.0, 0.05, width, height)
-    check_filled(split, region(split, share, grid, config), grid, config)
+    check_tiles_filled(split, tile_region(split, share, grid, config), grid, config)
 
 
 @pytest.mark.parametrize("split", ["train", "val", "test"])
@@ -53,6 +53,6 @@ def test_pixels_without_data_are_named_where_they_are_the_cause() -> None:
     config = config.model_copy(update={"tiles": TileConfig(size_px=50, minimum_valid_share=0.5), "validation_region": 0.0})
     values = np.full((100, 100), np.nan, np.float32)
     values[:20, :50] = 0.0
-    error = no_tile(config, planned_epochs(config)[0], values, Grid(0.0, 0.0, 0.05, 100, 100))
-    assert "the fullest of 4 has it in 40 % of its pixels, the whole map in 10 %; allowed: 50 %" in str(error)
+    error = no_tile_error(config, planned_epochs(config)[0], values, Grid(0.0, 0.0, 0.05, 100, 100))
+    assert "the best of 4 tiles has data in 40 % of its pixels, the whole map in 10 %; allowed: 50 %" in str(error)
     check(100, 100, "train", 0.0, size_px=50)

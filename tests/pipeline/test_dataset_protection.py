@@ -22,7 +22,7 @@ from pipeline.dataset.folder import fingerprint
 from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.records import read_dataset_file, read_shard, write_dataset_file, write_shard
 from pipeline.dataset.run import Workers, make_dataset, verify_dataset
-from pipeline.dataset.worker import Order
+from pipeline.dataset.worker import EpochOrder
 from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.products.run import find_inputs
 from pipeline.formats.cameras.colmap import write_colmap
@@ -84,7 +84,7 @@ def test_a_changed_digit_is_found_and_spoils_no_tile(made: Path, copy: Path, cap
     next((copy / "train").glob("*.tif")).unlink()
     before = digests(copy)
     for words in (["verify", str(copy), "--report-only"], ["verify", str(copy)]):
-        assert "dataset.json: is damaged" in in_one_line(["dataset", *words, "--quiet"], capsys)
+        assert "dataset.json: the file is damaged" in in_one_line(["dataset", *words, "--quiet"], capsys)
     assert digests(copy) == before
 
 
@@ -96,7 +96,7 @@ def test_a_config_that_is_not_the_epochs_own_makes_no_tile(copy: Path) -> None:
     write_dataset_file(copy, known["name"], known["sources"], known["epochs"], complete=True)
     next((copy / "train").glob("*.tif")).unlink()
     before = digests(copy)
-    with pytest.raises(InputError, match="is not the one that its epochs were made with"):
+    with pytest.raises(InputError, match="was changed after its epochs were made"):
         verify_dataset(copy)
     assert digests(copy) == before
 
@@ -116,7 +116,7 @@ def test_a_folder_in_the_place_of_a_file_is_named(name: str, copy: Path) -> None
     path.unlink()
     path.mkdir()
     assert "a folder" in [damage.problem for damage in verify_dataset(copy, repair=False).damage]
-    with pytest.raises(InputError, match=f"{path.name}: is a folder where a file of the set belongs"):
+    with pytest.raises(InputError, match=f"{path.name}: a folder is in the place of a file of the set"):
         verify_dataset(copy)
 
 
@@ -163,7 +163,7 @@ def test_an_epoch_beyond_the_plan_is_named(copy: Path) -> None:
     known = read_dataset_file(copy)
     (source,) = known["epochs"]
     write_dataset_file(copy, known["name"], known["sources"], {source: [*known["epochs"][source], 10**9]}, complete=True)
-    with pytest.raises(InputError, match="epoch 1000000000, which its config does not plan"):
+    with pytest.raises(InputError, match="epoch 1000000000 is not in the plan of its config"):
         verify_dataset(copy)
 
 
@@ -198,7 +198,7 @@ def test_a_link_out_of_the_set_is_not_followed(copy: Path, tmp_path: Path) -> No
         lambda: merge_datasets([copy, other], tmp_path / "merged"),
         lambda: verify_dataset(copy),
     ):
-        with pytest.raises(InputError, match=r"lies outside of its folder|holds epochs that an earlier"):
+        with pytest.raises(InputError, match=r"lies outside of its folder|an earlier set has"):
             call()
 
 
@@ -236,7 +236,7 @@ def scaled(scale: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sensors": ["tls", "tls"]}, "names a sensor twice"),
+        ({"sensors": ["tls", "tls"]}, "a sensor is listed twice"),
         ({"noise": {"low": {**TINY["noise"]["low"], "tls": {"model": {"sensor": "tls"}, "scale": -1}}}}, "greater than or equal"),
         (
             {"noise": {"low": {**TINY["noise"]["low"], "tls": {"model": {"sensor": "tls"}, "scale": {"ledge": -1}}}}},
@@ -258,7 +258,7 @@ def test_a_job_that_cannot_begin_leaves_nothing(
     file.write_text(json.dumps(TINY))
     for options, message in (
         (["--scheduler", "tcp://127.0.0.1:9"], "no scheduler answers"),
-        (["--workers", "100000"], "--workers: got 100,000; allowed: 1 to"),
+        (["--workers", "100000"], "--workers: got 100,000 workers; allowed: 1 to"),
         (["--by", "sensor"], "--by: goes with split"),
         (["--report-only"], "--report-only: goes with verify"),
         (["--set", "tiles.size_px=4096"], "columns of tiles"),
@@ -274,7 +274,7 @@ def test_what_others_put_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyP
         (tmp_path / "set/notes.txt").write_text("mine")
         raise InputError("no room")
 
-    monkeypatch.setattr(run, "fill", fails)
+    monkeypatch.setattr(run, "make_and_store", fails)
     with pytest.raises(InputError, match="no room"):
         make_dataset(tiny(), tmp_path / "set")
     assert [path.name for path in (tmp_path / "set").iterdir()] == ["notes.txt"]
@@ -291,7 +291,7 @@ def test_a_set_that_is_not_whole_is_neither_merged_nor_split(spoil: str, copy: P
     tile = max((copy / "test").glob("*.tif"))
     path = tile if spoil == "tile" else max((copy / "shards").glob("*.json"))
     path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(InputError, match="is missing or damaged; verify its set"):
+    with pytest.raises(InputError, match="is missing or damaged; run scarpsim dataset verify"):
         split_dataset(copy, tmp_path / "parts", ["sensor"])
     assert not (tmp_path / "parts").exists()
 
@@ -318,12 +318,12 @@ def test_nothing_is_staged_through_a_link(copy: Path, tmp_path: Path) -> None:
 
 
 def test_an_epoch_that_cannot_be_made_again_leaves_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(order: Order) -> dict[str, Any]:
+    def fails(order: EpochOrder) -> dict[str, Any]:
         (copy / ".staging" / order.job).mkdir(parents=True)
         raise InputError("cannot be made")
 
     next((copy / "train").glob("*.tif")).unlink()
-    monkeypatch.setattr(run_module, "fill", fails)
+    monkeypatch.setattr(run_module, "make_and_store", fails)
     with pytest.raises(InputError, match="cannot be made"):
         verify_dataset(copy)
     assert not (copy / ".staging").exists()

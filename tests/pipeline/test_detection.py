@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.comparison.detection import (
-    MeanTest,
-    blocks_seen,
+    BlockMeanTest,
+    detect_blocks,
     false_alarms,
     footprints,
     level_of_detection,
@@ -48,9 +48,9 @@ def test_the_limit_of_a_mean_follows_the_correlation() -> None:
     """White noise: z sigma / sqrt(n). Noise that is the same over the block: z sigma, however many pixels."""
     level = np.full((50, 50), 1.96 * SIGMA, dtype=np.float32)
     block, window = np.ones((10, 10), dtype=bool), (slice(5, 15), slice(5, 15))
-    assert MeanTest(WHITE, level, 0.1).limit_m(block, window) == pytest.approx(1.96 * SIGMA / 10)
+    assert BlockMeanTest(WHITE, level, 0.1).limit_m(block, window) == pytest.approx(1.96 * SIGMA / 10)
     alike = VariogramModel(0.0, (Structure("gaussian", SIGMA**2, 1e5),))
-    assert MeanTest(alike, level, 0.1).limit_m(block, window) == pytest.approx(1.96 * SIGMA, rel=1e-4)
+    assert BlockMeanTest(alike, level, 0.1).limit_m(block, window) == pytest.approx(1.96 * SIGMA, rel=1e-4)
 
 
 def test_blocks_that_must_and_must_not_be_seen() -> None:
@@ -63,9 +63,9 @@ def test_blocks_that_must_and_must_not_be_seen() -> None:
     change[45:55, 20:27] = np.nan  # hides 70 % of the third
     visible = np.ones((60, 60), dtype=bool)
     visible[45:55] = False
-    test = MeanTest(WHITE, np.full((60, 60), 1.96 * SIGMA, dtype=np.float32), 0.1)
+    test = BlockMeanTest(WHITE, np.full((60, 60), 1.96 * SIGMA, dtype=np.float32), 0.1)
     records = [record(1, 1.0), record(2, 1.0), record(3, 1.0), record(4, 0.1)]
-    deep, shallow, hidden, absent = blocks_seen(1, change, block, truth, records, visible, test)
+    deep, shallow, hidden, absent = detect_blocks(1, change, block, truth, records, visible, test)
     assert (deep.seen, shallow.seen, hidden.seen, absent.seen) == (True, False, False, False)
     assert (deep.in_view, hidden.in_view, absent.in_view) == (True, False, False)
     assert deep.footprint_px == 100
@@ -80,7 +80,7 @@ def test_blocks_that_must_and_must_not_be_seen() -> None:
 def test_stable_ground_is_taken_for_a_block_in_two_and_a_half_percent() -> None:
     """40 footprints at 10 places on each of 20 maps of white noise: 8,000 trials, 2.5 +- 0.18 %; limit 4.5 sigma."""
     level = np.full((200, 200), 1.96 * SIGMA, dtype=np.float32)
-    test, random = MeanTest(WHITE, level, 0.1), KeyedRandom(3)
+    test, random = BlockMeanTest(WHITE, level, 0.1), KeyedRandom(3)
     shapes = [np.ones((size, size), dtype=bool) for size in (4, 5, 6, 7)] * 10
     found = [false_alarms(noise(100 + number, (200, 200)), shapes, test, random.child(number)) for number in range(20)]
     alarms, trials = np.sum(found, axis=0)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.calibration.maps import noise_map, with_model
+from pipeline.calibration.noise_map import noise_map, with_model
 from pipeline.change.difference import statistics
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config

@@ -161,8 +161,8 @@ ROW |= {"depth_m": "0.1", "mean_depth_m": "0.05", "volume_m3": "0.015", "score":
         ("events_nan.csv", ROW, "no name of a table"),
         ("events_0.9.csv", {**ROW, "x_m": "left"}, "line 2: 'x_m' is 'left'"),
         ("events_0.9.csv", {**ROW, "x_m": "nan"}, "finite numbers"),
-        ("events_0.9.csv", {"image": "a.tif"}, "is no table of events"),
-        ("events_0.9.csv", {**ROW, "more": "1"}, "is no table of events"),
+        ("events_0.9.csv", {"image": "a.tif"}, "not a table of events"),
+        ("events_0.9.csv", {**ROW, "more": "1"}, "not a table of events"),
     ],
 )
 def test_tables_of_events_that_are_none_are_told(name: str, row: dict[str, str], said: str, run: Path, tmp_path: Path) -> None:

@@ -1,5 +1,4 @@
-"""Compare detections with the truth: matching, precision, recall, F1, and how reliable a score is.
+"""Compare detections with the truth: matching, precision, recall, F1, and the reliability of scores.
 
-Writing tables for the user is in `pipeline/detection/products`.
-Start with `evaluate.py`.
+Tables for the user are written by `pipeline/detection/products`. Start with `evaluate.py`.
 """

@@ -1,4 +1,4 @@
-"""Blocks found in a difference map, whoever found them."""
+"""Detections of blocks in a difference map, by whatever detector, and operations on them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,19 @@ from numpy.typing import NDArray
 from pipeline.change.annotate import BLOCK_CATEGORY, run_length_encoding
 
 _COVERED = 0.6
-"""Most of a detection's pixels: of two that share more than this part of the smaller one, the better stays."""
+"""Share of the smaller detection's pixels above which two detections are of the same block, and the better one is kept."""
 
 
 @dataclass(frozen=True)
 class Detection:
-    """One block. row, column: px, the mask's top-left pixel in the map; mask: (h, w) bool; score: 0...1."""
+    """One detected block.
+
+    Attributes
+    ----------
+    row, column : Top-left pixel of the mask in the map.
+    mask : (h, w) bool mask of the block, cropped to it.
+    score : Confidence, 0 to 1.
+    """
 
     row: int
     column: int
@@ -26,26 +33,33 @@ class Detection:
 
     @property
     def area_px(self) -> int:
-        """Pixels of the mask."""
+        """Number of pixels in the mask."""
         return int(np.count_nonzero(self.mask))
 
     @property
     def bounds(self) -> tuple[int, int, int, int]:
-        """First and last row and column of the mask in the map, the last not in it, px."""
+        """First row, end row, first column and end column of the mask in the map, px; the ends are exclusive."""
         height, width = self.mask.shape
         return self.row, self.row + height, self.column, self.column + width
 
     def pixels_within(self, bounds: tuple[int, int, int, int]) -> int:
-        """Pixels of the mask inside `bounds`, given as the own ones are."""
+        """Count the mask's pixels inside `bounds` (first row, end row, first column, end column of the map)."""
         top, bottom, left, right = (max(edge, 0) for edge in np.subtract(bounds, np.repeat((self.row, self.column), 2)))
         return int(np.count_nonzero(self.mask[top:bottom, left:right]))
 
     def moved(self, row: int, column: int) -> Detection:
-        """The same in a larger frame, in which this one's pixel (0, 0) is (row, column)."""
+        """Return the same detection in a larger frame, where pixel (0, 0) of the present frame is (row, column)."""
         return Detection(self.row + row, self.column + column, self.mask, self.score)
 
     def annotation(self, number: int, image_id: int, shape: tuple[int, ...]) -> dict[str, Any]:
-        """As COCO holds a result, with an id and the box, so that it is an annotation too; shape: of the map."""
+        """Return the detection as a COCO result that also has an id and a box, so that it is an annotation too.
+
+        Parameters
+        ----------
+        number : Id of the annotation.
+        image_id : Id of its image.
+        shape : (h, w) of the map, px.
+        """
         height, width = self.mask.shape
         return {
             "id": number,
@@ -59,8 +73,19 @@ class Detection:
         }
 
 
-def cropped(mask: NDArray[np.bool_], row: int, column: int, score: float) -> Detection | None:
-    """A detection of the set pixels of `mask` (h, w), whose top-left pixel is (row, column); None where there are none."""
+def detection_from_mask(mask: NDArray[np.bool_], row: int, column: int, score: float) -> Detection | None:
+    """Make a detection from the true pixels of a mask.
+
+    Parameters
+    ----------
+    mask : (h, w) bool.
+    row, column : Top-left pixel of `mask` in the map.
+    score : Confidence.
+
+    Returns
+    -------
+    The detection; None if the mask is empty.
+    """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return None
@@ -68,8 +93,8 @@ def cropped(mask: NDArray[np.bool_], row: int, column: int, score: float) -> Det
     return Detection(row + int(rows[0]), column + int(columns[0]), inner, score)
 
 
-def united(items: Sequence[Detection]) -> Detection:
-    """All their pixels as one detection, with the best of their scores."""
+def merged(items: Sequence[Detection]) -> Detection:
+    """Merge detections into one with all their pixels and the best of their scores."""
     bounds = np.array([item.bounds for item in items])
     (top, left), (bottom, right) = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
     mask = np.zeros((bottom - top, right - left), bool)
@@ -78,8 +103,8 @@ def united(items: Sequence[Detection]) -> Detection:
     return Detection(int(top), int(left), mask, max(item.score for item in items))
 
 
-def without_doubles(found: Iterable[Detection]) -> list[Detection]:
-    """Best first; a detection that shares most of its pixels, or of the other's, with a better one is left out."""
+def without_duplicates(found: Iterable[Detection]) -> list[Detection]:
+    """Sort detections, best first, and drop each one that shares most of its pixels, or of the other's, with a better one."""
     ranked = sorted(found, key=lambda item: (-item.score, item.row, item.column))
     kept: list[Detection] = []
     bounds = np.empty((len(ranked), 4), np.int64)
@@ -91,8 +116,8 @@ def without_doubles(found: Iterable[Detection]) -> list[Detection]:
     return kept
 
 
-def not_mostly_in(found: Iterable[Detection], others: Sequence[Detection]) -> list[Detection]:
-    """Those of `found` that share most of their pixels with none of the others."""
+def not_covered_by(found: Iterable[Detection], others: Sequence[Detection]) -> list[Detection]:
+    """Return the detections of `found` that share most of their pixels with none of the others."""
     bounds = np.array([item.bounds for item in others]).reshape(-1, 4)
 
     def covered(item: Detection) -> bool:
@@ -103,13 +128,13 @@ def not_mostly_in(found: Iterable[Detection], others: Sequence[Detection]) -> li
 
 
 def bounds_overlap(bounds: NDArray[np.int64], other: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """(n,) which of the bounds (n, 4), as `Detection.bounds`, share pixels with another's."""
+    """Return the (n,) mask of those bounds (n, 4), as `Detection.bounds`, that overlap the other bounds."""
     top, bottom, left, right = bounds.T
     return np.asarray((top < other[1]) & (other[0] < bottom) & (left < other[3]) & (other[2] < right))
 
 
 def shared_pixels(one: Detection, other: Detection) -> int:
-    """Pixels of both masks."""
+    """Count the pixels that are in both masks."""
     top, bottom = max(one.row, other.row), min(one.bounds[1], other.bounds[1])
     first, last = max(one.column, other.column), min(one.bounds[3], other.bounds[3])
     if top >= bottom or first >= last:

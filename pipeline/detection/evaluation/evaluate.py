@@ -1,6 +1,6 @@
-"""Score detections against the truth: matching, precision, recall, F1 and mask areas, and COCO's metrics beside them.
+"""Score detections against the truth: precision, recall, F1 and mask areas, and COCO's metrics.
 
-Both come from the same matching, that of pycocotools. The thesis calls the precision AP and the recall AR.
+Both use the matching of pycocotools. The thesis calls the precision AP and the recall AR.
 """
 
 from __future__ import annotations
@@ -20,18 +20,28 @@ from pycocotools.cocoeval import COCOeval
 from pipeline.change.annotate import STANDS_OUT
 
 CONFIDENCES, THRESHOLDS = (0.9, 0.95, 0.99), (0.25, 0.75)
+"""Default lowest scores and lowest overlaps that count."""
 Overlap = Literal["segm", "bbox"]
+"""Overlap of masks or of boxes."""
 _KEYS = ("image_id", "category_id", "segmentation", "bbox", "area", "iscrowd", "score")
+"""Keys of COCO entries that pycocotools needs."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """One cell of the thesis's tables.
+    """Scores of one group of images at one confidence and one overlap: one cell of the thesis's tables.
 
-    group: what the images or blocks have in common; confidence: lowest score that counts; iou: lowest overlap that counts;
-    area_ratio: mean of predicted over true mask area of the matched, NaN where nothing matched; kind: overlap of masks or boxes;
-    stand_out: share of the blocks whose niche stands out from the noise (pipeline/change/matched_filter.py), which is about the
-    largest recall that any detector could reach; NaN where the annotations do not tell.
+    Attributes
+    ----------
+    group : Name of the group.
+    confidence : Lowest score that counts.
+    iou : Lowest overlap that counts as a match.
+    true_positives, false_positives, false_negatives : Their numbers.
+    area_ratio : Mean of predicted over true mask area of the matches; NaN without matches.
+    kind : Overlap of masks ("segm") or boxes ("bbox").
+    stand_out : Share of the blocks whose niche stands out from the noise for a matched filter
+        (pipeline/change/matched_filter.py):
+        about the largest recall that any detector could reach. NaN if the annotations do not say.
     """
 
     group: str
@@ -60,7 +70,7 @@ class Score:
         return _share(2 * self.true_positives, 2 * self.true_positives + self.false_positives + self.false_negatives)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types; null for NaN."""
+        """Return the content as JSON types, with null for NaN."""
         values = {**asdict(self), "precision": self.precision, "recall": self.recall, "f1": self.f1}
         return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in values.items()}
 
@@ -89,7 +99,7 @@ def match_detections(overlap: NDArray[np.float64], threshold: float, crowd: NDAr
     detections, annotations = overlap.shape
     result = np.full(detections, -1)
     crowd = np.zeros(annotations, dtype=bool) if crowd is None else crowd
-    least = min(threshold, 1 - 1e-10)  # as pycocotools, which lets a threshold of 1 be reached in spite of rounding
+    least = min(threshold, 1 - 1e-10)  # as in pycocotools, so that rounding does not rule out a threshold of 1
     free = ~crowd
     for number, row in enumerate(overlap):
         for choice in (free, crowd):
@@ -153,9 +163,18 @@ def matched_scores(
     threshold: float,
     kind: Overlap = "segm",
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the scores (p,) of the detections in some images, and whether each is matched with a block.
+    """Return the scores of detections and whether each is matched with a block; detections on crowd regions are left out.
 
-    Detections that fall on crowd regions are left out.
+    Parameters
+    ----------
+    truth, predictions : COCO annotations and detections, as in `evaluate`.
+    images : Ids of the images.
+    threshold : Smallest overlap of a match.
+    kind : Overlap of masks or boxes.
+
+    Returns
+    -------
+    (p,) scores and (p,) bool.
     """
     blocks, found = _by_image_and_category(truth["annotations"]), _by_image_and_category(predictions)
     scores: list[float] = []
@@ -170,7 +189,7 @@ def matched_scores(
 
 
 def coco_metrics(truth: Mapping[str, Any], predictions: Sequence[Mapping[str, Any]], kind: Overlap = "segm") -> dict[str, float]:
-    """pycocotools' twelve figures (average precision and recall by overlap, area and count), by name; -1 where undefined."""
+    """Return pycocotools' twelve metrics by name: average precision and recall by overlap, area and count; -1 where undefined."""
     names = (
         "AP",
         "AP50",
@@ -198,7 +217,7 @@ def coco_metrics(truth: Mapping[str, Any], predictions: Sequence[Mapping[str, An
 
 
 def _without_annotations(reference: COCO) -> COCO:
-    """Return the images and categories of a data set alone; pycocotools loads no empty list of detections."""
+    """Return a data set without annotations, since pycocotools cannot load an empty list of detections."""
     empty = COCO()
     empty.dataset = {**reference.dataset, "annotations": []}
     empty.createIndex()
@@ -206,13 +225,20 @@ def _without_annotations(reference: COCO) -> COCO:
 
 
 def _numbered(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The entries with ids from 1, as COCOeval takes an id of 0 for no match, and without keys of others', such as captions."""
+    """Number the entries from 1, as COCOeval takes id 0 for no match, and drop keys of other programs, such as captions."""
     return [{"id": number, **{key: entry[key] for key in _KEYS if key in entry}} for number, entry in enumerate(entries, start=1)]
 
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Detections and annotations of one category in one image. overlap: (p, t); areas: px; crowd: (t,) COCO's `iscrowd`."""
+    """Detections and annotations of one category in one image.
+
+    Attributes
+    ----------
+    overlap : (p, t) overlap of each detection with each annotation.
+    predicted_area, true_area : (p,) and (t,) areas, px.
+    crowd : (t,) COCO's `iscrowd`.
+    """
 
     overlap: NDArray[np.float64]
     predicted_area: NDArray[np.float64]
@@ -220,8 +246,8 @@ class _Pairs:
     crowd: NDArray[np.bool_]
 
     def on_crowd(self, matched: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(p,) which detections are matched with a crowd region."""
-        return np.append(self.crowd, False)[matched]  # -1, no match, takes the last
+        """Return the (p,) mask of detections that are matched with a crowd region."""
+        return np.append(self.crowd, False)[matched]  # -1 (no match) indexes the appended False
 
 
 Key = tuple[int, int]
@@ -229,6 +255,7 @@ Key = tuple[int, int]
 
 
 def _by_image_and_category(entries: Iterable[Mapping[str, Any]]) -> dict[Key, list[Mapping[str, Any]]]:
+    """Group COCO entries by image and category."""
     result: dict[Key, list[Mapping[str, Any]]] = {}
     for entry in entries:
         result.setdefault((entry["image_id"], entry["category_id"]), []).append(entry)
@@ -236,12 +263,13 @@ def _by_image_and_category(entries: Iterable[Mapping[str, Any]]) -> dict[Key, li
 
 
 def _keys(images: Iterable[int], *entries: Mapping[Key, Any]) -> list[Key]:
-    """The keys of these images at which there is something in any of the `entries`."""
+    """Return the sorted keys of these images that occur in any of the `entries`."""
     chosen = set(images)
     return sorted({key for each in entries for key in each if key[0] in chosen})
 
 
 def _pairs(blocks: list[Mapping[str, Any]], found: list[Mapping[str, Any]], confidence: float, kind: Overlap) -> _Pairs:
+    """Compute the overlaps of the detections with sufficient confidence and the annotated blocks."""
     chosen = sorted((item for item in found if item["score"] >= confidence), key=lambda item: -item["score"])
     predicted, true = (np.array([float(item["area"]) for item in items]) for items in (chosen, blocks))
     crowd = np.array([bool(block.get("iscrowd")) for block in blocks], dtype=bool)
@@ -252,10 +280,12 @@ def _pairs(blocks: list[Mapping[str, Any]], found: list[Mapping[str, Any]], conf
 
 
 def _shape(item: Mapping[str, Any], kind: Overlap) -> Any:
+    """Return what the overlap is computed of."""
     return [float(value) for value in item["bbox"]] if kind == "bbox" else item["segmentation"]
 
 
 def _score(group: str, confidence: float, threshold: float, images: Iterable[_Pairs]) -> Score:
+    """Match detections in all images and add up the counts."""
     hits = predicted = true = 0
     ratios: list[NDArray[np.float64]] = []
     for pairs in images:
@@ -264,16 +294,18 @@ def _score(group: str, confidence: float, threshold: float, images: Iterable[_Pa
         chosen = np.flatnonzero((matched >= 0) & ~on_crowd)
         hits, predicted, true = hits + len(chosen), predicted + int((~on_crowd).sum()), true + int((~pairs.crowd).sum())
         true_area = pairs.true_area[matched[chosen]]
-        ratios.append((pairs.predicted_area[chosen] / np.maximum(true_area, 1.0))[true_area > 0])  # a box may hold no mask
+        ratios.append((pairs.predicted_area[chosen] / np.maximum(true_area, 1.0))[true_area > 0])  # a box may have an empty mask
     every = np.concatenate(ratios) if ratios else np.zeros(0)
     ratio = float(every.mean()) if every.size else float("nan")
     return Score(group, confidence, threshold, hits, predicted - hits, true - hits, ratio)
 
 
 def _stand_out(blocks: Sequence[Mapping[str, Any]]) -> float:
+    """Return the share of blocks that stand out from the noise."""
     known = [block["signal_to_noise"] for block in blocks if isinstance(block.get("signal_to_noise"), int | float)]
     return _share(sum(ratio > STANDS_OUT for ratio in known), len(known))
 
 
 def _share(part: int, whole: int) -> float:
+    """Return a ratio; NaN if the denominator is 0."""
     return part / whole if whole else float("nan")

@@ -1,6 +1,6 @@
-"""What a detection's score means: of the detections with about such a score, the share that are blocks.
+"""Reliability of scores: of the detections with about the same score, the share that are blocks.
 
-A reliability diagram (Murphy & Winkler 1977). A score that is a probability lies on the diagonal.
+It is a reliability diagram (Murphy & Winkler 1977). Scores that are probabilities lie on its diagonal.
 """
 
 from __future__ import annotations
@@ -14,13 +14,22 @@ import numpy as np
 from pipeline.detection.evaluation.evaluate import Overlap, matched_scores
 
 EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
-"""Of the classes of scores, finer towards 1 where most detections lie; 1 itself belongs to the last."""
+"""Edges of the score classes, finer towards 1 where most detections lie; 1 itself belongs to the last."""
 OVERLAP = 0.25
+"""Overlap from which a detection counts as a block."""
 
 
 @dataclass(frozen=True)
 class ScoreClass:
-    """Detections with scores from `low` up to `high`. score: their mean; right: how many are blocks."""
+    """Detections with scores from `low` to `high`.
+
+    Attributes
+    ----------
+    low, high : Limits of the class.
+    score : Mean score.
+    detections : Number of detections.
+    right : Number of those that are blocks.
+    """
 
     low: float
     high: float
@@ -35,7 +44,7 @@ class ScoreClass:
 
     @property
     def error(self) -> float:
-        """Standard error of that share, never 0: with one block and one false alarm more (Agresti & Coull 1998)."""
+        """Standard error of that share, with one block and one false alarm added so that it is never 0 (Agresti & Coull 1998)."""
         count = self.detections + 2
         share = (self.right + 1) / count
         return float(np.sqrt(share * (1 - share) / count))
@@ -43,7 +52,15 @@ class ScoreClass:
 
 @dataclass(frozen=True)
 class Reliability:
-    """Of one group of images; classes without a detection are left out."""
+    """Reliability of the scores in one group of images.
+
+    Attributes
+    ----------
+    group : Name of the group.
+    classes : Score classes with at least one detection.
+    kind : Overlap of masks or boxes.
+    iou : Smallest overlap of a match.
+    """
 
     group: str
     classes: tuple[ScoreClass, ...]
@@ -52,13 +69,13 @@ class Reliability:
 
     @property
     def calibration_error(self) -> float:
-        """Mean |precision - score| over the detections, NaN without any (Naeini et al. 2015)."""
+        """Mean |precision - score| over the detections (Naeini et al. 2015); NaN without detections."""
         count = sum(each.detections for each in self.classes)
         off = sum(abs(each.right - each.score * each.detections) for each in self.classes)
         return off / count if count else float("nan")
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types; null for NaN."""
+        """Return the content as JSON types, with null for NaN."""
         classes = [{**asdict(each), "precision": each.precision, "standard_error": each.error} for each in self.classes]
         error = None if np.isnan(self.calibration_error) else self.calibration_error
         return {"group": self.group, "kind": self.kind, "iou": self.iou, "calibration_error": error, "classes": classes}
@@ -70,11 +87,22 @@ def reliability(
     groups: Mapping[str, Iterable[int]],
     kind: Overlap = "segm",
 ) -> list[Reliability]:
-    """By group of image ids; a detection is a block as `evaluate` counts it, at an overlap of OVERLAP and every score."""
-    return [_of(group, *matched_scores(truth, predictions, images, OVERLAP, kind), kind) for group, images in groups.items()]
+    """Compute the reliability of all scores, at an overlap of OVERLAP.
+
+    Parameters
+    ----------
+    truth, predictions : COCO annotations and detections, as in `evaluate`.
+    groups : Image ids by the name of their group.
+    kind : Overlap of masks or boxes.
+    """
+    return [
+        _group_reliability(group, *matched_scores(truth, predictions, images, OVERLAP, kind), kind)
+        for group, images in groups.items()
+    ]
 
 
-def _of(group: str, score: np.ndarray, right: np.ndarray, kind: Overlap) -> Reliability:
+def _group_reliability(group: str, score: np.ndarray, right: np.ndarray, kind: Overlap) -> Reliability:
+    """Sort the (p,) scores of a group into classes."""
     number = np.minimum(np.searchsorted(EDGES, score, side="right"), len(EDGES) - 1) - 1
     count, hits, total = (np.bincount(number, each, len(EDGES) - 1) for each in (None, right, score))
     return Reliability(

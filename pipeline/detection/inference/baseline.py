@@ -1,4 +1,4 @@
-"""What a user would take instead of a network: a threshold at the level of detection, morphology, connected components."""
+"""A detector without a network, for comparison: threshold at the level of detection, morphology, connected components."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from scene.common.config import Config
 
 
 class BaselineConfig(Config):
-    """How the baseline finds blocks."""
+    """Settings of the baseline detector."""
 
     median_px: Literal[1, 3, 5] = Field(3, description="side of the median filter before the threshold; 1: none")
     levels: float = Field(
-        1.0, gt=0, description="threshold, in multiples of the level of detection, 1.96 NMAD of the filtered map"
+        1.0, gt=0, description="threshold, as a multiple of the level of detection (1.96 NMAD of the filtered map)"
     )
-    opening_px: int = Field(3, ge=1, description="side of the disc of the opening, which takes out specks; 1: none")
-    closing_px: int = Field(3, ge=1, description="side of the disc of the closing, which fills gaps; 1: none")
+    opening_px: int = Field(3, ge=1, description="diameter of the opening's disc, which removes specks; 1: none")
+    closing_px: int = Field(3, ge=1, description="diameter of the closing's disc, which fills gaps; 1: none")
     minimum_area_px: int = Field(12, ge=1, description="smaller components are left out")
 
 
 def detect(difference: NDArray[np.float32], config: BaselineConfig | None = None) -> list[Detection]:
-    """Missing rock in a difference map (h, w), m, NaN where there are no data, best first.
+    """Detect missing rock in a difference map (h, w), m, NaN without data; best first.
 
-    The score of a component is 1 - 2^-r^2 with r the mean difference over the threshold: 0.5 at the threshold, 0.94 at twice.
+    The score of a component is 1 - 2^-r^2, where r is its mean difference over the threshold: 0.5 at the threshold, 0.94 at
+    twice.
     """
     config = config or BaselineConfig()
     valid = np.isfinite(difference)
@@ -52,8 +53,10 @@ def detect(difference: NDArray[np.float32], config: BaselineConfig | None = None
 
 
 def _score(ratio: float) -> float:
+    """Return the score for a ratio of mean difference to threshold."""
     return 1.0 - 2.0 ** -(ratio**2)
 
 
 def _disc(size: int) -> NDArray[np.uint8]:
+    """Return a disc as a structuring element."""
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))

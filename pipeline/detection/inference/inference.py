@@ -1,4 +1,4 @@
-"""Detection in whole difference maps: tiles with overlap, and one answer at their seams."""
+"""Detect blocks in whole difference maps with the network, tile by tile, with consistent results at the seams."""
 
 from __future__ import annotations
 
@@ -9,36 +9,49 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.detection.evaluation.detections import Detection, cropped
-from pipeline.detection.inference.seams import BlockPart, MapTile, part, without_seams
+from pipeline.detection.evaluation.detections import Detection, detection_from_mask
+from pipeline.detection.inference.seams import BlockPart, MapTile, block_part, merge_tile_parts
 from pipeline.detection.network.normalisation import nmad, normalised
 
 _BATCH = 4
+"""Tiles in a batch."""
 
 
 def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0.5) -> list[Detection]:
-    """The blocks in a difference map (h, w), m, NaN where there are no data, best first.
+    """Detect blocks in a difference map with the network.
 
-    model: a MaskRCNN. Tiles overlap by a half of their side, so that every block of up to that size lies whole in one of them;
-    `seams` says what becomes of the blocks that a tile's inner border cuts. Margins without data are not searched where a map is
-    larger than a tile.
+    Tiles overlap by half of their side, so that every block up to that size is complete in one of them; `seams` merges blocks
+    that tiles cut. In maps larger than a tile, margins without data are skipped.
+
+    Parameters
+    ----------
+    model : A MaskRCNN.
+    difference : (h, w) map, m; NaN without data.
+    minimum_score : Lowest score of a detection.
+
+    Returns
+    -------
+    The detections, best first.
     """
     known = np.isfinite(difference)
     if not known.any():
         return []
-    (top, bottom), (left, right) = (_searched_along(np.asarray(known.any(axis=axis)), model.size) for axis in (1, 0))
-    return [item.moved(top, left) for item in _searched(model, difference[top:bottom, left:right], minimum_score)]
+    (top, bottom), (left, right) = (_data_range(np.asarray(known.any(axis=axis)), model.size) for axis in (1, 0))
+    return [item.moved(top, left) for item in _detect_in_tiles(model, difference[top:bottom, left:right], minimum_score)]
 
 
-def _searched_along(known: NDArray[np.bool_], size: int) -> tuple[int, int]:
-    """From and to where the rows or columns (n,) that have data are searched, with tiles of side `size`."""
+def _data_range(known: NDArray[np.bool_], size: int) -> tuple[int, int]:
+    """Return the first and the end index of the rows or columns (n,) to search: all of them, or those with data in a
+    larger map.
+    """
     if len(known) <= size:
         return 0, len(known)
     there = np.flatnonzero(known)
     return int(there[0]), int(there[-1]) + 1
 
 
-def _searched(model: Any, difference: NDArray[np.float32], minimum_score: float) -> list[Detection]:
+def _detect_in_tiles(model: Any, difference: NDArray[np.float32], minimum_score: float) -> list[Detection]:
+    """Detect blocks in all tiles of a map and merge them."""
     size = model.size
     noise = nmad(difference)
     parts: list[BlockPart] = []
@@ -48,28 +61,37 @@ def _searched(model: Any, difference: NDArray[np.float32], minimum_score: float)
         answers = model.predict_on_batch({"image": np.stack(images)})
         for number, tile in enumerate(group):
             answer = {name: values[number] for name, values in answers.items()}
-            parts += [part(item, tile) for item in _in_tile(answer, minimum_score, tile)]
-    return without_seams(parts)
+            parts += [block_part(item, tile) for item in _in_tile(answer, minimum_score, tile)]
+    return merge_tile_parts(parts)
 
 
 def _batches(tiles: list[MapTile]) -> Iterator[list[MapTile]]:
-    """Whole batches, and what is left over tile by tile: two shapes, so that two functions are compiled, and nothing in vain."""
+    """Yield full batches, then the remaining tiles one by one, so that only two shapes are compiled."""
     whole = len(tiles) // _BATCH * _BATCH
     yield from (tiles[first : first + _BATCH] for first in range(0, whole, _BATCH))
     yield from ([tile] for tile in tiles[whole:])
 
 
 def tile_places(shape: tuple[int, ...], size: int) -> Iterator[tuple[int, int]]:
-    """(row, column) of tiles of side `size` that overlap by a half and end flush with the map where it is larger than a tile."""
+    """Yield (row, column) of tiles of side `size` that overlap by at least half and end flush with the map's edge."""
     rows, columns = (_starts(length, size) for length in shape)
     return ((row, column) for row in rows for column in columns)
 
 
 def paste(probability: NDArray[np.float32], box: NDArray[np.float32], size: int) -> tuple[int, int, NDArray[np.bool_]]:
-    """Row, column and mask of the pixels of an image of side `size` whose centres have a probability above a half.
+    """Draw a mask that is given on a box into the image's pixels.
 
-    probability: (m, m) over the box (y0, x0, y1, x1), px, which may reach beyond the image. It is interpolated bilinearly between
-    the centres of its cells; pixels that the box does not touch have none.
+    Values are interpolated bilinearly between the centres of the mask's cells.
+
+    Parameters
+    ----------
+    probability : (m, m) mask probabilities over the box.
+    box : (4,) y0, x0, y1, x1, px; it may reach beyond the image.
+    size : Side of the image, px.
+
+    Returns
+    -------
+    Row and column of the result's first pixel, and the mask of pixels whose centres have a probability above one half.
     """
     y0, x0, y1, x1 = (float(value) for value in box)
     top, left = max(int(np.floor(y0)), 0), max(int(np.floor(x0)), 0)
@@ -85,6 +107,7 @@ def paste(probability: NDArray[np.float32], box: NDArray[np.float32], size: int)
 
 
 def _starts(length: int, size: int) -> list[int]:
+    """Return the starts of overlapping tiles along one axis."""
     if length <= size:
         return [0]
     count = -(-(length - size) // (size // 2)) + 1
@@ -92,19 +115,21 @@ def _starts(length: int, size: int) -> list[int]:
 
 
 def _pixels(difference: NDArray[np.float32], tile: MapTile) -> NDArray[np.float32]:
-    """(size, size) what the tile shows, NaN beyond the map."""
+    """Return the (size, size) pixels of a tile, NaN beyond the map."""
     cut = difference[tile.row : tile.row + tile.size, tile.column : tile.column + tile.size]
     missing = [(0, tile.size - length) for length in cut.shape]
     return np.pad(cut, missing, constant_values=np.nan)
 
 
 def _in_tile(answer: dict[str, NDArray[Any]], minimum_score: float, tile: MapTile) -> Iterator[Detection]:
-    """What the network found in the tile, in the map's frame."""
+    """Yield the network's detections in a tile, in the map's frame."""
     top, bottom, left, right = tile.bounds
     for box, score, mask in zip(answer["mask_boxes"], answer["scores"], answer["masks"], strict=True):
         if score < minimum_score:
             return
         row, column, pixels = paste(mask, box, tile.size)
-        item = cropped(pixels[: max(bottom - top - row, 0), : max(right - left - column, 0)], row, column, float(score))
+        item = detection_from_mask(
+            pixels[: max(bottom - top - row, 0), : max(right - left - column, 0)], row, column, float(score)
+        )
         if item is not None:
             yield item.moved(top, left)

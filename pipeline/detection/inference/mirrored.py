@@ -1,7 +1,7 @@
-"""Detection that looks at a map's mirror images too: all that the network says is a mean over the views, each turned back.
+"""Test-time augmentation: detect in a map and its mirror images, and average the network's outputs over these views.
 
-Log odds, codes of boxes and log odds of masks are means; a proposal is one box in all views. With all four views, the map as it
-is, mirrored left-right, up-down and both ways, a mirrored map has mirrored answers, which those of the network alone are not.
+The averages are taken of log odds, box codes and mask log odds; a proposal is the same box in all views. With all four views (as
+it is, mirrored left-right, up-down, and both), a mirrored map gives exactly mirrored detections, unlike with the network alone.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ VIEWS: dict[Mirroring, tuple[Axes, ...]] = {
     "left_right": ((), (1,)),
     "both": ((), (1,), (0,), (0, 1)),
 }
-"""The axes along which a map is mirrored, view by view."""
+"""Axes along which each view is mirrored, by `head.mirrored`."""
 
 
-def network(config: DetectorConfig, image_px: int | None = None) -> MaskRCNN:
-    """The network that a detector's config tells of, as detection uses it."""
-    return MaskRCNN(config, image_px) if config.head.mirrored == "none" else Mirrored(config, image_px)
+def build_network(config: DetectorConfig, image_px: int | None = None) -> MaskRCNN:
+    """Build the network of a detector's config for detection."""
+    return MaskRCNN(config, image_px) if config.head.mirrored == "none" else MirroredMaskRCNN(config, image_px)
 
 
-class Mirrored(MaskRCNN):
-    """A MaskRCNN whose answers are means over views. `FirstStage.levels` holds P2 to P5 of each view."""
+class MirroredMaskRCNN(MaskRCNN):
+    """A MaskRCNN that averages its outputs over mirrored views; `FirstStage.levels` holds P2 to P5 of each view."""
 
     @property
     def views(self) -> tuple[Axes, ...]:
-        """Those of its config."""
+        """The mirrored axes of each view, from the config."""
         return VIEWS[self.config.head.mirrored]
 
     def first_stage(self, image: Tensor, *, training: bool) -> FirstStage:
-        """As `MaskRCNN.first_stage`, anchors of the map as it is."""
+        """Compute `MaskRCNN.first_stage` of all views, and average it over them for the anchors of the unmirrored map."""
         levels, logits, codes = [], [], []
         for axes in self.views:
             own = super().first_stage(ops.flip(image, [axis + 1 for axis in axes]), training=training)
-            order = self._turned_back(axes)
+            order = self._anchor_order(axes)
             levels.append(own.levels)
             logits.append(ops.take(own.logits, order, axis=1))
             codes.append(mirrored_codes(ops.take(own.codes, order, axis=1), axes))
         return FirstStage(levels, _mean(logits), _mean(codes))
 
-    def _turned_back(self, axes: Axes) -> NDArray[np.int64]:
-        """(a,) where the anchors of the map stand in a view."""
+    def _anchor_order(self, axes: Axes) -> NDArray[np.int64]:
+        """Return the (a,) indices in a view of the unmirrored map's anchors."""
         ratios, start, result = len(self.config.proposal.anchor_ratios), 0, []
         for stride in self.config.strides:
             cells = -(-self.size // stride)
@@ -57,6 +57,7 @@ class Mirrored(MaskRCNN):
         return np.concatenate(result)
 
     def _on_boxes(self, levels: list[Tensor], boxes: Tensor, training: bool) -> tuple[Tensor, Tensor]:
+        """Average class logits and box codes over the views."""
         logits, codes = [], []
         for axes, own in zip(self.views, levels, strict=True):
             classes, turned = super()._on_boxes(own, mirrored(boxes, axes, self.size), training)
@@ -65,6 +66,7 @@ class Mirrored(MaskRCNN):
         return _mean(logits), _mean(codes)
 
     def _masks(self, levels: list[Tensor], boxes: Tensor, training: bool) -> Tensor:
+        """Average mask logits over the views."""
         views = []
         for axes, own in zip(self.views, levels, strict=True):
             logits = super()._masks(own, mirrored(boxes, axes, self.size), training)
@@ -73,4 +75,5 @@ class Mirrored(MaskRCNN):
 
 
 def _mean(values: list[Tensor]) -> Tensor:
+    """Return the mean of tensors."""
     return sum(values[1:], values[0]) / len(values)

@@ -1,9 +1,8 @@
-"""The score from which on a detection counts, put where it finds blocks best on images that the training has not seen.
+"""Calibrate the detector's scores so that a threshold of 0.95 gives the largest F1 on validation images.
 
-A network trained on many faint blocks is unsure of most, and a score of 0.95 then finds few; and where most blocks are missed, as
-small ones are, F1 is largest at a score at which more of the detections are wrong. Scores are ranks more than they are
-probabilities: all log odds are shifted by the same amount, and by another for each doubling of a block's side, such that 0.95
-gives the largest F1 on the validation images.
+A network trained on many faint blocks is unsure of most of them, and a threshold of 0.95 then finds few. Where most blocks are
+missed, as small ones are, F1 is largest at a threshold with more false detections. Scores are therefore used as ranks rather than
+as probabilities: a constant is added to all log odds, and another for each doubling of a block's side.
 """
 
 from __future__ import annotations
@@ -20,44 +19,61 @@ from pipeline.detection.inference import inference, weights
 from pipeline.detection.network.data import CocoFolder
 
 CONFIDENCE, OVERLAP = 0.95, 0.5
-"""The score that is to be best, and the overlap of masks from which on a block counts as found."""
+"""Score threshold to optimise for, and overlap of masks from which a block counts as detected."""
 _HIGHEST = 1 - 1e-6
-"""Of a score, whose log odds are finite then."""
+"""Largest score, so that its log odds are finite."""
 _TRIED_PER_DOUBLING = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75, -1.0, 1.0)
-"""Nothing first, which stays where others are no better. The slope that was found best is inside, not at an end."""
+"""Slopes to try, zero first, which is kept unless another one is better. The range is wide enough for the best one to
+lie inside.
+"""
 _TRIED = tuple(float(score) for score in 1 / (1 + np.exp(-np.linspace(-3, 5, 33))))
+"""Score thresholds to try."""
 
 
 def set_operating_point(folder: Path, validation: CocoFolder) -> float:
-    """Write the best shifts of the scores into the detector in `folder`, 0 where nothing is found; returns that of 16 px.
+    """Calibrate the scores of the detector in `folder` on validation images, and save it.
 
-    They are set for maps as they are, and for their mirror images too where the detector looks at those (`head.mirrored`);
-    what is returned is of the way that it looks.
+    If the detector uses mirrored views (`head.mirrored`), scores are calibrated with and without them.
+
+    Returns
+    -------
+    Shift of the log odds of a block of 16 px, as the detector is configured; 0 if nothing is detected.
     """
     config = weights.load_config(folder)
     set_to: dict[str, float] = {}
     for unmirrored in (True, False) if config.head.mirrored != "none" else (True,):
         model = weights.load(folder, unmirrored=unmirrored)
-        set_to |= _set_on(model, validation, "" if unmirrored else "mirrored_")
+        set_to |= _best_head_shifts(model, validation, "" if unmirrored else "mirrored_")
     model.config = weights.with_head(config, **set_to)
-    weights.save(model, folder)  # and without the optimizer's state, which a model in training saves too
+    weights.save(model, folder)  # without the optimizer's state
     return float(model.config.head.shifts[0])
 
 
-def _set_on(model: Any, validation: CocoFolder, prefix: str) -> dict[str, float]:
-    """The shifts of `head` with which CONFIDENCE is best for the model, 0 where nothing is found. prefix: of their keys."""
+def _best_head_shifts(model: Any, validation: CocoFolder, prefix: str) -> dict[str, float]:
+    """Return the best shifts as keys of `head`, 0 if nothing is detected; prefix: of the keys."""
     before = model.config.head.shifts
-    found = _found(model, validation, min(_TRIED))
-    blocks = [{**each, "category_id": BLOCK_CATEGORY["id"]} for each in validation.annotations]  # whatever a set calls them
+    found = _detect_all(model, validation, min(_TRIED))
+    blocks = [
+        {**each, "category_id": BLOCK_CATEGORY["id"]} for each in validation.annotations
+    ]  # sets may name the category otherwise
     best = best_shifts({"images": validation.images, "annotations": blocks}, found)
     shift, slope = (before[0] + best[0], before[1] + best[1]) if best else (0.0, 0.0)
     return {f"{prefix}score_shift": round(shift, 3), f"{prefix}score_per_doubling": slope}
 
 
 def best_shifts(truth: dict[str, Any], found: list[dict[str, Any]]) -> tuple[float, float] | None:
-    """What to add to the log odds of detections (COCO) of 16 px, and for each doubling of the side, so that CONFIDENCE is best.
+    """Find the shifts of the log odds with which the threshold CONFIDENCE gives the largest F1.
 
-    A detection's side is that of its mask's bounds. None where nothing is found.
+    A detection's size is that of its box.
+
+    Parameters
+    ----------
+    truth : COCO images and annotations.
+    found : COCO detections.
+
+    Returns
+    -------
+    Shift for a size of 16 px, and for each doubling of the size; None if nothing is detected.
     """
     best, result = 0.0, None
     for slope in _TRIED_PER_DOUBLING:
@@ -69,12 +85,14 @@ def best_shifts(truth: dict[str, Any], found: list[dict[str, Any]]) -> tuple[flo
 
 
 def _shifted(annotation: dict[str, Any], slope: float) -> float:
+    """Return an annotation's score after shifting its log odds by a slope per doubling."""
     height, width = annotation["bbox"][2:]
     odds = _log_odds(min(annotation["score"], _HIGHEST)) + slope * 0.5 * math.log2(height * width / 16**2)
     return 1 / (1 + math.exp(-odds))
 
 
-def _found(model: Any, images: CocoFolder, lowest: float) -> list[dict[str, Any]]:
+def _detect_all(model: Any, images: CocoFolder, lowest: float) -> list[dict[str, Any]]:
+    """Detect blocks in all validation images."""
     found: list[dict[str, Any]] = []
     for index, image in enumerate(images.images):
         difference = images.labelled(index).difference
@@ -84,4 +102,5 @@ def _found(model: Any, images: CocoFolder, lowest: float) -> list[dict[str, Any]
 
 
 def _log_odds(score: float) -> float:
+    """Return ln(p / (1 - p))."""
     return math.log(score / (1 - score))

@@ -1,6 +1,6 @@
-"""One answer where tiles overlap: blocks that one tile sees whole as it sees them, larger ones put together from their parts.
+"""Merge detections of overlapping tiles into one per block: complete ones as they are, larger blocks joined from their parts.
 
-Tiles overlap by half of their side, so that a block of less than that side lies whole, and clear of the border, in one of them.
+Tiles overlap by half of their side. A block smaller than that is complete, and away from the border, in at least one of them.
 """
 
 from __future__ import annotations
@@ -13,21 +13,23 @@ import numpy as np
 from pipeline.detection.evaluation.detections import (
     Detection,
     bounds_overlap,
-    not_mostly_in,
+    merged,
+    not_covered_by,
     shared_pixels,
-    united,
-    without_doubles,
+    without_duplicates,
 )
 
 _SAME = 0.6
-"""Two parts are of one block where, within the pixels that both tiles see, they share more than this part of the smaller one."""
+"""Share of the smaller part's pixels, within the area that both tiles see, above which two parts belong to the same block."""
 _MARGIN = 16
-"""A detection that ends within this fraction of a tile's side from its border may be cut: networks' masks end short of it."""
+"""A detection may be cut if it ends nearer to the border than this fraction of the tile's side; masks often end short of the
+border.
+"""
 
 
 @dataclass(frozen=True)
 class MapTile:
-    """A square of a map. row, column: its first pixel in the map; size: its side, px; shape: of the map."""
+    """A square of a map. row, column: its first pixel in the map; size: its side, px; shape: (h, w) of the map."""
 
     row: int
     column: int
@@ -36,35 +38,49 @@ class MapTile:
 
     @property
     def bounds(self) -> tuple[int, int, int, int]:
-        """First and last row and column in the map, the last not in it, px."""
+        """First row, end row, first column and end column in the map, px; the ends are exclusive."""
         return self.row, min(self.row + self.size, self.shape[0]), self.column, min(self.column + self.size, self.shape[1])
 
 
 @dataclass(frozen=True)
 class Border:
-    """A side of a tile inside the map: the place along `axis`, px, beyond which the tile does not see; step: the way there."""
+    """A side of a tile inside the map.
+
+    Attributes
+    ----------
+    axis : 0 for a border along a row, 1 along a column.
+    place : Row or column beyond which the tile does not see.
+    step : Direction of the outside, -1 or 1.
+    """
 
     axis: int
     place: int
     step: int
 
     def passed_by(self, item: Detection) -> bool:
-        """Whether the detection, in the map's frame, goes on beyond it."""
+        """Whether a detection, in the map's frame, extends beyond the border."""
         first, last = item.bounds[2 * self.axis : 2 * self.axis + 2]
         return first < self.place if self.step < 0 else last > self.place
 
 
 @dataclass(frozen=True)
 class BlockPart:
-    """What one tile shows of a block. item: in the map's frame; cuts: the tile's borders that may have cut it."""
+    """A block as one tile shows it.
+
+    Attributes
+    ----------
+    item : The detection, in the map's frame.
+    tile : The tile.
+    cuts : Borders of the tile that may have cut the block.
+    """
 
     item: Detection
     tile: MapTile
     cuts: tuple[Border, ...]
 
 
-def part(item: Detection, tile: MapTile) -> BlockPart:
-    """A detection in the map's frame, with the borders of the tile that it comes near to."""
+def block_part(item: Detection, tile: MapTile) -> BlockPart:
+    """Find the borders of the tile that may have cut a detection, which is in the map's frame."""
     margin = tile.size // _MARGIN
     cuts = []
     for axis in (0, 1):
@@ -76,21 +92,21 @@ def part(item: Detection, tile: MapTile) -> BlockPart:
     return BlockPart(item, tile, tuple(cuts))
 
 
-def without_seams(parts: Sequence[BlockPart]) -> list[Detection]:
-    """The blocks of which the tiles show the parts, each once, best first.
+def merge_tile_parts(parts: Sequence[BlockPart]) -> list[Detection]:
+    """Merge the detections of all tiles into one per block, best first.
 
-    Parts that a border may have cut are put together with those of other tiles that agree with them where both see. Where a tile
-    sees the whole block that counts, whatever the scores. What then still ends at a border is left out if it is so small that
-    another tile sees it whole, and did not find it; larger ones stay as far as they were found.
+    Parts that a border may have cut are joined with parts of other tiles that agree with them in their common area. A detection
+    that is complete in a tile wins, whatever its score. A joined detection that still ends at a border is dropped if it is so
+    small that another tile sees it completely but did not detect it; larger ones are kept as they are.
     """
     whole = [each.item for each in parts if not each.cuts]
     joined = [item for item in map(_joined, _groups([each for each in parts if each.cuts])) if item is not None]
-    return without_doubles([*whole, *not_mostly_in(joined, whole)])
+    return without_duplicates([*whole, *not_covered_by(joined, whole)])
 
 
 def _joined(parts: Sequence[BlockPart]) -> Detection | None:
-    """The parts of one block as one, None where a tile sees it whole and denies it."""
-    item = united([each.item for each in parts])
+    """Join the parts of one block; None if a tile that sees the whole block did not detect it."""
+    item = merged([each.item for each in parts])
     ends = [cut for each in parts for cut in each.cuts if not cut.passed_by(item)]
     size = parts[0].tile.size
     seen_whole = size // 2 - 2 * (size // _MARGIN)
@@ -98,7 +114,7 @@ def _joined(parts: Sequence[BlockPart]) -> Detection | None:
 
 
 def _groups(parts: Sequence[BlockPart]) -> list[list[BlockPart]]:
-    """The parts by the block that they are of: linked, directly or through others, by what they agree on."""
+    """Group the parts by block: parts that agree, directly or through others."""
     bounds = np.array([each.item.bounds for each in parts]).reshape(-1, 4)
     group = np.arange(len(parts))
     for number, each in enumerate(parts):
@@ -109,7 +125,7 @@ def _groups(parts: Sequence[BlockPart]) -> list[list[BlockPart]]:
 
 
 def _agree(one: BlockPart, other: BlockPart) -> bool:
-    """Whether they come from two tiles and show the same where both tiles see."""
+    """Whether two parts of different tiles show the same block in their common area."""
     if one.tile == other.tile:
         return False
     seen = [one.item.pixels_within(other.tile.bounds), other.item.pixels_within(one.tile.bounds)]

@@ -1,5 +1,4 @@
 """Build Mask R-CNN in Keras 3: backbone, heads, anchors, targets, losses, and its input from difference maps.
 
-Running it over whole maps is in `pipeline/detection/inference`, fitting it in `pipeline/detection/training`.
-Start with `model.py`.
+`pipeline/detection/inference` applies it to whole maps, `pipeline/detection/training` trains it. Start with `model.py`.
 """

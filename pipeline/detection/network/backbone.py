@@ -1,6 +1,6 @@
-"""The part that sees: a ResNet and its feature pyramid.
+"""The backbone: a ResNet and its feature pyramid.
 
-Group normalisation (Wu & He 2018) in place of batch normalisation, which fails on the one or two images that fit a step.
+It uses group normalisation (Wu & He 2018) because batch normalisation fails with the one or two images that fit into a step.
 """
 
 from __future__ import annotations
@@ -11,17 +11,29 @@ import keras
 from keras import layers
 
 _GROUPS = 8
+"""Groups of the normalisation."""
 _STAGES = {"fine": (1, 1, 2, 2), "light": (1, 1, 2, 2), "resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}
+"""Residual blocks in each stage."""
 _BOTTLENECK_WIDTHS = (64, 128, 256, 512)
 _PLAIN_WIDTHS = {"fine": (16, 32, 64, 128), "light": (32, 64, 128, 192)}
 
 
 def feature_pyramid(name: str, image_px: int, channels_in: int, channels: int) -> keras.Model:
-    """A model from images (b, h, w, channels_in) to the levels P2 to P6, (b, h / stride, w / stride, channels) each.
+    """Build a model from images to the pyramid levels P2 to P6.
 
-    name: resnet50 and resnet101 of He et al. (2016), bottleneck blocks; `light` has six plain blocks of two convolutions and a
-    quarter of the width; `fine` is narrower still and has no pooling at its start, so that all its levels are twice as fine, as
-    blocks of five pixels need.
+    Parameters
+    ----------
+    name : "resnet50" or "resnet101" of He et al. (2016), with bottleneck blocks; "light" with six plain blocks of two
+        convolutions and
+        a quarter of the width; "fine", narrower still and without pooling at its start, so that all its levels have half the
+        stride, as blocks of five pixels need.
+    image_px : Side of the images, px.
+    channels_in : Channels of the images.
+    channels : Channels of the levels.
+
+    Returns
+    -------
+    Model from (b, h, w, channels_in) to five tensors (b, h / stride, w / stride, channels).
     """
     image = keras.Input((image_px, image_px, channels_in), name="image")
     stages = _resnet(image, name)
@@ -36,7 +48,7 @@ def feature_pyramid(name: str, image_px: int, channels_in: int, channels: int) -
 
 
 def _resnet(image: Any, name: str) -> list[Any]:
-    """The outputs of the four stages, at 1/4, 1/8, 1/16 and 1/32 of the image, or 1/2 to 1/16 for `fine`."""
+    """Return the outputs of the four stages, at 1/4, 1/8, 1/16 and 1/32 of the image, or 1/2 to 1/16 for `fine`."""
     plain = name in _PLAIN_WIDTHS
     widths = _PLAIN_WIDTHS.get(name, _BOTTLENECK_WIDTHS)
     block = _plain if plain else _bottleneck
@@ -52,12 +64,14 @@ def _resnet(image: Any, name: str) -> list[Any]:
 
 
 def _plain(x: Any, width: int, stride: int, name: str) -> Any:
+    """Add a residual block of two 3 x 3 convolutions."""
     y = _convolution(x, width, 3, stride, f"{name}_a")
     y = _convolution(y, width, 3, 1, f"{name}_b", activation=None)
     return _joined(x, y, stride, name)
 
 
 def _bottleneck(x: Any, width: int, stride: int, name: str) -> Any:
+    """Add a residual block of 1 x 1, 3 x 3 and 1 x 1 convolutions."""
     y = _convolution(x, width, 1, 1, f"{name}_a")
     y = _convolution(y, width, 3, stride, f"{name}_b")
     y = _convolution(y, 4 * width, 1, 1, f"{name}_c", activation=None)
@@ -65,13 +79,14 @@ def _bottleneck(x: Any, width: int, stride: int, name: str) -> Any:
 
 
 def _joined(x: Any, y: Any, stride: int, name: str) -> Any:
+    """Add the shortcut, with a 1 x 1 convolution where shapes differ."""
     if x.shape[-1] != y.shape[-1] or stride > 1:
         x = _convolution(x, y.shape[-1], 1, stride, f"{name}_shortcut", activation=None)
     return layers.ReLU()(layers.Add()([x, y]))
 
 
 def _convolution(x: Any, width: int, size: int, stride: int, name: str, activation: str | None = "relu") -> Any:
-    """Convolution without bias, group normalisation, activation."""
+    """Add a convolution without bias, group normalisation and activation."""
     x = layers.Conv2D(width, size, strides=stride, padding="same", use_bias=False, kernel_initializer="he_normal", name=name)(x)
     x = layers.GroupNormalization(_GROUPS, name=f"{name}_norm")(x)
     return x if activation is None else layers.Activation(activation)(x)

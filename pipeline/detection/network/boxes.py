@@ -1,6 +1,6 @@
-"""Boxes (y0, x0, y1, x1) in px, pixel (0, 0) covering 0...1: overlap, coding against anchors, suppression.
+"""Operations on boxes (y0, x0, y1, x1), px, where pixel (0, 0) covers 0...1: overlap, coding against anchors, suppression.
 
-Everything works on batches and on any Keras backend.
+They work on batches and on any Keras backend.
 """
 
 from __future__ import annotations
@@ -14,19 +14,28 @@ from numpy.typing import NDArray
 Tensor = Any
 """A tensor of the Keras backend in use."""
 Axes = tuple[int, ...]
-"""Along which an image is mirrored: 0 turns it up-down, 1 left-right."""
+"""Axes along which an image is mirrored: 0 exchanges up and down, 1 left and right."""
 _DEVIATIONS = np.array([0.1, 0.1, 0.2, 0.2], np.float32)
-"""Typical sizes of the four numbers of a code, by which they are divided (He et al. 2017, as everybody's code has it)."""
+"""Typical standard deviations of the four numbers of a code, which are divided by them (He et al. 2017)."""
 _LARGEST_LOG = float(np.log(1000 / 16))
+"""Largest logarithm of a size ratio in a code."""
 
 
 def anchors(
     height: int, width: int, strides: tuple[int, ...], sizes: tuple[float, ...], ratios: tuple[float, ...]
 ) -> NDArray[np.float32]:
-    """(a, 4) anchors of all levels, level by level, row by row, column by column, ratio by ratio.
+    """Compute the anchors of all levels, ordered by level, row, column and ratio; each is centred on its cell.
 
-    An anchor is centred on its cell; strides: pixels per cell, one per level; sizes: square root of the area, px, one per level;
-    ratios: height over width.
+    Parameters
+    ----------
+    height, width : Size of the image, px.
+    strides : Pixels per cell, one for each level.
+    sizes : Square root of the anchors' area, px, one for each level.
+    ratios : Height over width.
+
+    Returns
+    -------
+    (a, 4) boxes.
     """
     root = np.sqrt(np.asarray(ratios))
     levels = []
@@ -40,19 +49,22 @@ def anchors(
 
 
 def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
-    """(..., n, m) of boxes (..., n, 4) and (..., m, 4); 0 where both are empty."""
+    """Return the (..., n, m) IoU of boxes (..., n, 4) and (..., m, 4); 0 if both are empty."""
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     common = _common(left, right)
     return common / ops.maximum(_area(left) + _area(right) - common, 1e-6)
 
 
 def share_inside(left: Tensor, right: Tensor) -> Tensor:
-    """(..., n, m) share of boxes (..., n, 4) that lies in boxes (..., m, 4): COCO's overlap with a crowd; 0 of an empty box."""
+    """Return the (..., n, m) share of boxes (..., n, 4) that lies in boxes (..., m, 4), COCO's overlap with a crowd; 0 for empty
+    boxes.
+    """
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     return _common(left, right) / ops.maximum(_area(left), 1e-6)
 
 
 def _common(left: Tensor, right: Tensor) -> Tensor:
+    """Return the area of intersection."""
     height, width = (
         ops.maximum(ops.minimum(left[..., end], right[..., end]) - ops.maximum(left[..., start], right[..., start]), 0.0)
         for start, end in ((0, 2), (1, 3))
@@ -61,7 +73,9 @@ def _common(left: Tensor, right: Tensor) -> Tensor:
 
 
 def encode(boxes: Tensor, reference: Tensor) -> Tensor:
-    """(..., 4) boxes as seen from reference boxes: shift of the centre by their size, logarithm of the ratio of sizes."""
+    """Code (..., 4) boxes relative to reference boxes: shift of the centre in units of their size, and logarithm of the size
+    ratio.
+    """
     centre, size = _centre_size(boxes)
     at, scale = _centre_size(reference)
     code = ops.concatenate([(centre - at) / scale, ops.log(size / scale)], axis=-1)
@@ -69,7 +83,7 @@ def encode(boxes: Tensor, reference: Tensor) -> Tensor:
 
 
 def decode(code: Tensor, reference: Tensor) -> Tensor:
-    """(..., 4) boxes of codes, the inverse of `encode`; sizes are held within 62 times the reference's."""
+    """Return the (..., 4) boxes of codes, the inverse of `encode`; sizes are limited to 62 times the reference's."""
     at, scale = _centre_size(reference)
     code = code * _DEVIATIONS
     centre = at + code[..., :2] * scale
@@ -78,12 +92,12 @@ def decode(code: Tensor, reference: Tensor) -> Tensor:
 
 
 def widened(boxes: Tensor, margin: float) -> Tensor:
-    """Boxes (..., 4) with all edges `margin` further out, px."""
+    """Move all edges of boxes (..., 4) outwards by `margin`, px."""
     return boxes + margin * np.array([-1, -1, 1, 1], np.float32)
 
 
 def mirrored(boxes: Tensor, axes: Axes, side: float) -> Tensor:
-    """Where boxes (..., 4) of an image of that side, px, lie once it is mirrored; its own inverse."""
+    """Return where boxes (..., 4) of an image of this side, px, lie after mirroring; its own inverse."""
     edges = [boxes[..., number] for number in range(4)]
     for axis in axes:
         edges[axis], edges[axis + 2] = side - edges[axis + 2], side - edges[axis]
@@ -91,26 +105,37 @@ def mirrored(boxes: Tensor, axes: Axes, side: float) -> Tensor:
 
 
 def mirrored_codes(codes: Tensor, axes: Axes) -> Tensor:
-    """What codes (..., 4) become once the image is mirrored: shifts of the centre turn round, sizes stay; its own inverse."""
+    """Return codes (..., 4) after mirroring the image: shifts of the centre change sign, sizes stay; its own inverse."""
     return codes * np.array([-1 if axis in axes else 1 for axis in range(2)] + [1, 1], np.float32)
 
 
 def doublings(boxes: Tensor) -> Tensor:
-    """(...) by how many doublings the sides of boxes (..., 4), the roots of their areas, 1 px at least, lie above 16 px."""
+    """Return (...) the base-2 logarithm of the sides of boxes (..., 4), the roots of their areas (at least 1 px), over 16 px."""
     return 0.5 * ops.log2(ops.maximum(_area(boxes), 1.0)) - 4.0
 
 
 def clip(boxes: Tensor, height: int, width: int) -> Tensor:
-    """The part of boxes (..., 4) inside the image."""
+    """Clip boxes (..., 4) to the image."""
     return ops.clip(boxes, 0.0, np.array([height, width, height, width], np.float32))
 
 
-def suppressed(boxes: Tensor, scores: Tensor, threshold: float, count: int) -> tuple[Tensor, Tensor]:
-    """Greedy non-maximum suppression: the best `count` boxes (b, count, 4) and scores (b, count), -1 where fewer.
+def non_maximum_suppression(boxes: Tensor, scores: Tensor, threshold: float, count: int) -> tuple[Tensor, Tensor]:
+    """Apply greedy non-maximum suppression.
 
-    boxes: (b, n, 4); scores: (b, n), 0...1, falling along n. A box stays unless a better one that stays overlaps it by more than
-    `threshold`. That rule has one solution; it is reached by applying it to all boxes at once until nothing changes, which
-    settles at least one more box each time and in practice all of them in a few.
+    A box stays unless a better box that stays overlaps it by more than `threshold`. The rule has a unique solution. It is found
+    by applying the rule to all boxes at once until nothing changes; each pass settles at least one more box, and in practice a
+    few passes settle all.
+
+    Parameters
+    ----------
+    boxes : (b, n, 4) boxes.
+    scores : (b, n) scores, 0...1, falling along n.
+    threshold : Largest IoU of two boxes that both stay.
+    count : Number of boxes to return.
+
+    Returns
+    -------
+    The best boxes (b, count, 4) and their scores (b, count), -1 where there are fewer.
     """
     size = boxes.shape[1]
     better = np.triu(np.ones((size, size), np.float32), 1)
@@ -127,9 +152,11 @@ def suppressed(boxes: Tensor, scores: Tensor, threshold: float, count: int) -> t
 
 
 def _area(boxes: Tensor) -> Tensor:
+    """Return the area of boxes."""
     return (boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1])
 
 
 def _centre_size(boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return centre and size of boxes."""
     size = ops.maximum(boxes[..., 2:] - boxes[..., :2], 1e-3)
     return 0.5 * (boxes[..., 2:] + boxes[..., :2]), size

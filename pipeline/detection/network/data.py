@@ -1,4 +1,4 @@
-"""COCO folders of difference maps as batches for the network."""
+"""Read COCO folders of difference maps as batches for the network."""
 
 from __future__ import annotations
 
@@ -25,11 +25,15 @@ MIRRORED: dict[bool | str, tuple[int, ...]] = {True: (1, 0), "left_right": (1,),
 
 
 @dataclass(frozen=True)
-class Labelled:
-    """A difference map (h, w), m, and its blocks.
+class LabelledMap:
+    """A difference map and its blocks.
 
-    labels: (h, w) int32, 1 + the index of the block that a pixel shows (of the later one where two overlap), 0 for none;
-    boxes: (g, 4) float32 y0, x0, y1, x1 px; ignored: (g,) blocks left out of the loss, COCO's `ignore` or `iscrowd`.
+    Attributes
+    ----------
+    difference : (h, w) differences, m; NaN without data.
+    labels : (h, w) int32, 1 + the index of the block at a pixel (the later one where two overlap); 0 for none.
+    boxes : (g, 4) float32 y0, x0, y1, x1, px.
+    ignored : (g,) blocks left out of the loss, by COCO's `ignore` or `iscrowd`.
     """
 
     difference: NDArray[np.float32]
@@ -39,10 +43,21 @@ class Labelled:
 
 
 class CocoFolder:
-    """A folder with `annotations.json` and the TIFF images that it names."""
+    """A folder with `annotations.json` and the TIFF images that it names.
+
+    Parameters
+    ----------
+    folder : The folder.
+    masks : Whether every annotation must have a mask.
+
+    Raises
+    ------
+    InputError
+        As `read_coco` does.
+    """
 
     def __init__(self, folder: Path, *, masks: bool = True) -> None:
-        """masks: each annotation needs one. Raises InputError for all that `read_coco` does."""
+        """Read annotations.json; see the class."""
         content = read_coco(folder / "annotations.json", masks=masks)
         self.folder = folder
         self.images = sorted(content.images, key=lambda image: image["id"])
@@ -52,7 +67,7 @@ class CocoFolder:
             self._of[annotation["image_id"]].append(annotation)
 
     def check_images(self) -> None:
-        """Read every image once; raises InputError for the first that is damaged or of another size than annotated."""
+        """Read every image once; raise InputError for the first that is damaged or not of the annotated size."""
         for index in range(len(self)):
             self._difference(index)
 
@@ -60,13 +75,13 @@ class CocoFolder:
         return len(self.images)
 
     def path(self, image: dict[str, Any]) -> Path:
-        """The file of an entry of `images`; raises InputError for one outside of the folder."""
+        """Return the path of an entry of `images`; raise InputError if it is outside the folder."""
         return inside(self.folder, image.get("file_name"), self.folder / "annotations.json")
 
-    def labelled(self, index: int) -> Labelled:
-        """The image at `index` with its blocks, those of which it shows a pixel.
+    def labelled(self, index: int) -> LabelledMap:
+        """Read the image at `index` with those of its blocks that cover at least one pixel.
 
-        Raises InputError for a damaged file and a size other than annotated.
+        Raises InputError if the file is damaged or not of the annotated size.
         """
         difference = self._difference(index)
         labels = np.zeros(difference.shape, np.int32)
@@ -79,25 +94,34 @@ class CocoFolder:
             boxes.append((y, x, y + height, x + width))
             ignored.append(bool(annotation.get("ignore") or annotation.get("iscrowd")))
             labels[coco_mask.decode(annotation["segmentation"]) > 0] = len(boxes)
-        return Labelled(difference, labels, np.array(boxes, np.float32).reshape(-1, 4), np.array(ignored, dtype=bool))
+        return LabelledMap(difference, labels, np.array(boxes, np.float32).reshape(-1, 4), np.array(ignored, dtype=bool))
 
     def _difference(self, index: int) -> NDArray[np.float32]:
+        """Read the difference map at `index` and check its size."""
         image = self.images[index]
         path = self.path(image)
         difference = read_tiff(path)
         if difference.shape != (image["height"], image["width"]):
             allowed = f"{image['height']} x {image['width']} px as annotated"
-            problem = f"has {difference.shape[0]} x {difference.shape[1]} px"
-            raise InputError(problem, where=str(path), allowed=allowed, remedy="give the image that was annotated")
+            problem = f"the image has {difference.shape[0]} x {difference.shape[1]} px"
+            raise InputError(problem, where=str(path), allowed=allowed, remedy="use the image that was annotated")
         return difference
 
 
 def batches(
     folder: CocoFolder, detector: DetectorConfig, training: TrainingConfig, epoch: int, *, learning: bool
 ) -> Iterator[Batch]:
-    """The images once, as inputs of the network; `learning`: in random order, mirrored and cut at random, else as they are.
+    """Yield all images once, as batches of network inputs.
 
-    What is drawn depends on (seed, epoch, image) alone. The last batch is filled up with its own first images.
+    What is drawn depends on seed, epoch and image only. An incomplete last batch is filled with its own first images.
+
+    Parameters
+    ----------
+    folder : The images.
+    detector : Settings of the network's input.
+    training : Batch size, window size, flips and seed.
+    epoch : Number of the epoch.
+    learning : True: random order, mirroring and windows; False: in order, and the middle of each image.
     """
     order = np.arange(len(folder))
     if learning:
@@ -110,14 +134,14 @@ def batches(
         examples = []
         for index in group:
             random = np.random.default_rng((training.seed, epoch, 1 + int(index))) if learning else None
-            labelled = window(folder.labelled(int(index)), size, random)
+            labelled = cut_window(folder.labelled(int(index)), size, random)
             if random is not None:
                 for axis in MIRRORED[training.flips]:
                     labelled = mirrored(labelled, axis) if random.random() < 0.5 else labelled
             examples.append(network_input(labelled, detector))
         return {name: np.stack([example[name] for example in examples]) for name in examples[0]}
 
-    with ThreadPoolExecutor(1) as pool:  # the next batch is read while the network works on this one
+    with ThreadPoolExecutor(1) as pool:  # reads the next batch while the network trains on this one
         coming = None
         for group in groups:
             ready, coming = coming, pool.submit(load, group)
@@ -127,8 +151,11 @@ def batches(
             yield coming.result()
 
 
-def network_input(labelled: Labelled, config: DetectorConfig) -> Batch:
-    """One image with its blocks as the network takes them, without the batch's axis; raises InputError past `most_blocks`."""
+def network_input(labelled: LabelledMap, config: DetectorConfig) -> Batch:
+    """Return one image and its blocks as the network's input, without the batch axis.
+
+    Raises InputError if there are more than `most_blocks` blocks.
+    """
     count = len(labelled.boxes)
     if count > config.most_blocks:
         raise InputError(f"an image shows {count} blocks", where="detector.most_blocks", allowed=f"at least {count}")
@@ -138,17 +165,23 @@ def network_input(labelled: Labelled, config: DetectorConfig) -> Batch:
     return {"image": image, "boxes": boxes, "valid": valid, "labels": labelled.labels}
 
 
-def mirrored(labelled: Labelled, axis: int) -> Labelled:
-    """Up and down (axis 0) or left and right (1) exchanged."""
+def mirrored(labelled: LabelledMap, axis: int) -> LabelledMap:
+    """Mirror a map: up-down (axis 0) or left-right (axis 1)."""
     boxes = labelled.boxes.copy()
     boxes[:, [axis, axis + 2]] = labelled.difference.shape[axis] - labelled.boxes[:, [axis + 2, axis]]
     return replace(labelled, difference=np.flip(labelled.difference, axis), labels=np.flip(labelled.labels, axis), boxes=boxes)
 
 
-def window(labelled: Labelled, size: int, random: np.random.Generator | None) -> Labelled:
-    """A square of side `size`: anywhere at random, or the middle; pixels beyond the image have no data.
+def cut_window(labelled: LabelledMap, size: int, random: np.random.Generator | None) -> LabelledMap:
+    """Cut a square window out of a map; pixels beyond the map have no data.
 
-    Of a block that is cut through, the part inside counts where it is at least half of it; lesser parts are background.
+    A block that the window cuts is kept if at least half of it is inside, and is background otherwise.
+
+    Parameters
+    ----------
+    labelled : The map.
+    size : Side of the window, px.
+    random : Source of a random place; None: the middle.
     """
     if labelled.difference.shape == (size, size):
         return labelled
@@ -163,7 +196,7 @@ def window(labelled: Labelled, size: int, random: np.random.Generator | None) ->
     numbers = np.zeros(len(labelled.boxes) + 1, np.int32)
     numbers[kept + 1] = np.arange(1, len(kept) + 1)
     shifted = labelled.boxes[kept] - np.array([row, column, row, column], np.float32)
-    return Labelled(
+    return LabelledMap(
         np.pad(labelled.difference[cut], missing, constant_values=np.nan),
         numbers[labels],
         np.clip(shifted, 0, size, dtype=np.float32),

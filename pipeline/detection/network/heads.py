@@ -1,4 +1,4 @@
-"""The three heads: proposals from the pyramid, class and box, mask."""
+"""The three heads of the network: proposals, class and box, mask."""
 
 from __future__ import annotations
 
@@ -8,17 +8,25 @@ import keras
 from keras import initializers, layers
 
 POOLED_PX, MASK_POOLED_PX = 7, 14
-"""Sides of the features of a box, for its class and place, and for its mask."""
+"""Side of a box's features for its class and coordinates, and for its mask, cells."""
 CLASSES = 2
-"""Background and block."""
+"""Number of classes: background and block."""
 _RARE = initializers.Constant(-4.0)
-"""First guess of an anchor's logit: few hold a block, so that the first steps are not spent on saying no (Lin et al. 2017b)."""
+"""Initial logit of an anchor. Most anchors are background, so this saves the first training steps (Lin et al. 2017b)."""
 
 
 def proposal_head(channels: int, ratios: int, size_px: int) -> keras.Model:
-    """From one level of the pyramid, (b, h, w, channels), to a logit (b, h w ratios, 1) and a code (b, h w ratios, 4) per anchor.
+    """Build the head that classifies the anchors of one pyramid level and codes their boxes.
 
-    size_px: side of the hidden convolution, cells.
+    Parameters
+    ----------
+    channels : Channels of the level.
+    ratios : Anchors per cell.
+    size_px : Side of the hidden convolution, cells.
+
+    Returns
+    -------
+    Model from (b, h, w, channels) to logits (b, h w ratios, 1) and codes (b, h w ratios, 4).
     """
     level = keras.Input((None, None, channels))
     x = layers.Conv2D(channels, size_px, padding="same", activation="relu", kernel_initializer="he_normal", name="shared")(level)
@@ -28,7 +36,9 @@ def proposal_head(channels: int, ratios: int, size_px: int) -> keras.Model:
 
 
 def box_head(channels: int, hidden: int) -> keras.Model:
-    """From a box's features (n, POOLED_PX, POOLED_PX, channels) to class logits (n, CLASSES) and the block's code (n, 4)."""
+    """Build the head from a box's features (n, POOLED_PX, POOLED_PX, channels) to class logits (n, CLASSES) and a box code (n,
+    4).
+    """
     features = keras.Input((POOLED_PX, POOLED_PX, channels))
     x: Any = layers.Flatten()(features)
     for number in range(2):
@@ -39,9 +49,9 @@ def box_head(channels: int, hidden: int) -> keras.Model:
 
 
 def mask_head(channels: int, size_px: int) -> keras.Model:
-    """From the features of one box, (n, MASK_POOLED_PX, MASK_POOLED_PX, channels), to mask logits (n, size_px, size_px).
+    """Build the head from a box's features (n, MASK_POOLED_PX, MASK_POOLED_PX, channels) to mask logits (n, size_px, size_px).
 
-    Each doubling of 14 px is one transposed convolution: one for 28 px, two for 56, three for 112.
+    Each doubling of 14 px is a transposed convolution: one for 28 px, two for 56, three for 112.
     """
     features = keras.Input((MASK_POOLED_PX, MASK_POOLED_PX, channels))
     x: Any = features
@@ -58,4 +68,5 @@ def mask_head(channels: int, size_px: int) -> keras.Model:
 
 
 def _small() -> initializers.Initializer:
+    """Return the initializer of output layers."""
     return initializers.RandomNormal(stddev=0.01)

@@ -1,4 +1,4 @@
-"""Keras, found or asked for, and quiet."""
+"""Import Keras on its backend, and set the precision of its computations."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from scene.common.extras import how_to_install
 from scene.common.native_output import suppress_stderr
 
 _MODULES = {"tensorflow": "tensorflow", "jax": "jax", "torch": "torch"}
+"""Python module of each backend."""
 
 
-def keras_ready() -> None:
-    """Import Keras, on TensorFlow unless KERAS_BACKEND says otherwise; raises InputError where one of them is not installed.
+def import_keras() -> None:
+    """Import Keras, on TensorFlow unless KERAS_BACKEND names another backend; raise InputError if one of them is not installed.
 
-    TensorFlow writes some lines to stderr while it is imported, whatever the level of its log. They are dropped, and the level
-    is set to errors alone, unless TF_CPP_MIN_LOG_LEVEL is set to another: with 0 there TensorFlow says everything.
+    TensorFlow writes to stderr during its import, whatever its log level. This output is dropped and the log level set to errors,
+    unless TF_CPP_MIN_LOG_LEVEL is set; 0 there shows everything.
 
-    Its convolutions are oneDNN's unless TF_ENABLE_ONEDNN_OPTS says otherwise: by itself TensorFlow takes them only where the
-    processor has instructions for neural networks (AVX-512 VNNI), though they are faster without these too.
+    oneDNN's convolutions are enabled unless TF_ENABLE_ONEDNN_OPTS is set. TensorFlow by default uses them only on processors with
+    instructions for neural networks (AVX-512 VNNI), although they are faster on others too.
     """
     check_installed()
     os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "1")
@@ -33,11 +34,11 @@ def keras_ready() -> None:
 
 
 def check_installed() -> str:
-    """The library that Keras computes with; raises InputError where it, or Keras, is not installed."""
+    """Return the name of Keras's backend; raise InputError if it, or Keras, is not installed."""
     backend = os.environ.get("KERAS_BACKEND") or "tensorflow"
     os.environ["KERAS_BACKEND"] = backend
     if backend not in _MODULES:
-        raise InputError(f"is '{backend}'", where="KERAS_BACKEND", allowed=", ".join(_MODULES), remedy="set it to one of them")
+        raise InputError(f"'{backend}' is unknown", where="KERAS_BACKEND", allowed=", ".join(_MODULES), remedy="set one of them")
     missing = [name for name in ("keras", _MODULES[backend]) if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(
@@ -49,8 +50,8 @@ def check_installed() -> str:
 
 
 @contextmanager
-def computing_in(precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
-    """Compiled functions called in the body compute convolutions and products in that precision; variables stay float32.
+def computing_precision(precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
+    """Let functions compiled in this block compute convolutions and products in a precision; variables stay float32.
 
     Raises InputError for bfloat16 on another backend than TensorFlow.
     """
@@ -62,7 +63,7 @@ def computing_in(precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
     backend = keras.backend.backend()
     if backend != "tensorflow":
         raise InputError(
-            f"is bfloat16 with KERAS_BACKEND={backend}",
+            f"bfloat16 does not work with KERAS_BACKEND={backend}",
             where="training.precision",
             allowed="bfloat16 on tensorflow, float32 on every backend",
         )

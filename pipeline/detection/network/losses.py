@@ -1,4 +1,4 @@
-"""The losses of Mask R-CNN, means over what was sampled; weights are 1 for a sample and 0 for an empty place."""
+"""The losses of Mask R-CNN, as means over samples; a weight is 1 for a sample and 0 for an empty place."""
 
 from __future__ import annotations
 
@@ -8,24 +8,28 @@ from pipeline.detection.network.boxes import Tensor
 
 
 def binary_cross_entropy(logits: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
-    """Mean of -[t ln s(x) + (1 - t) ln(1 - s(x))] with the logistic s, computed without overflow."""
+    """Return the mean of -[t ln s(x) + (1 - t) ln(1 - s(x))] with the logistic function s, computed without overflow."""
     loss = ops.maximum(logits, 0.0) - logits * targets + ops.log1p(ops.exp(-ops.abs(logits)))
     return _mean(loss, weights)
 
 
 def cross_entropy(logits: Tensor, classes: Tensor, weights: Tensor) -> Tensor:
-    """Mean of -ln softmax(x)_c; logits: (..., k), classes: (...) int."""
+    """Return the mean of -ln softmax(x)_c for logits (..., k) and integer classes (...)."""
     chosen = ops.sum(ops.one_hot(classes, logits.shape[-1]) * ops.log_softmax(logits, axis=-1), axis=-1)
     return _mean(-chosen, weights)
 
 
 def smooth_l1(codes: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
-    """Mean over boxes, sum over the four numbers, of x^2 / 2 for |x| < 1, |x| - 1/2 beyond (Girshick 2015); (..., 4)."""
+    """Return the smooth L1 loss of codes (..., 4): x^2 / 2 for |x| < 1 and |x| - 1/2 beyond (Girshick 2015).
+
+    It is the mean over boxes of the sum over the four numbers.
+    """
     distance = ops.abs(codes - targets)
     loss = ops.where(distance < 1, 0.5 * ops.square(distance), distance - 0.5)
     return _mean(ops.sum(loss, axis=-1), weights)
 
 
 def _mean(loss: Tensor, weights: Tensor) -> Tensor:
+    """Return the weighted mean."""
     weights = weights * ops.ones_like(loss)
     return ops.sum(loss * weights) / ops.maximum(ops.sum(weights), 1.0)

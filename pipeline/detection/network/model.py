@@ -1,7 +1,7 @@
-"""Mask R-CNN (He et al. 2017) in Keras 3, from scratch, for difference maps.
+"""Mask R-CNN (He et al. 2017) in Keras 3, written from scratch for difference maps.
 
-Everything is `keras.ops`, so that the same model trains on any Keras backend and its weights load in any other. All shapes are
-fixed: empty places are marked by weights or scores.
+It uses only `keras.ops`, so that the model trains on any Keras backend and its weights load in any other. All shapes are fixed;
+empty places are marked by weights or scores.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from keras import ops
 
 from pipeline.detection.network.backbone import feature_pyramid
-from pipeline.detection.network.boxes import Tensor, anchors, clip, decode, doublings, suppressed, widened
+from pipeline.detection.network.boxes import Tensor, anchors, clip, decode, doublings, non_maximum_suppression, widened
 from pipeline.detection.network.config import DetectorConfig, Loss
 from pipeline.detection.network.heads import MASK_POOLED_PX, POOLED_PX, box_head, mask_head, proposal_head
 from pipeline.detection.network.losses import binary_cross_entropy, cross_entropy, smooth_l1
@@ -23,18 +23,22 @@ from pipeline.detection.network.roi_align import roi_align
 from pipeline.detection.network.targets import anchor_targets, box_targets, mask_targets
 
 LOSSES: tuple[Loss, ...] = get_args(Loss)
+"""Names of the five losses."""
 
 
 def total_loss(losses: Mapping[str, Any], weights: Mapping[Loss, float]) -> Any:
-    """The sum of losses by name, numbers or tensors, with their weights, 1 by default."""
+    """Return the weighted sum of losses by name, numbers or tensors; weights default to 1."""
     return sum(weights.get(name, 1.0) * losses[name] for name in LOSSES)
 
 
 @dataclass(frozen=True)
 class FirstStage:
-    """What the network makes of images before it looks at single boxes.
+    """What the network computes of images before it looks at single boxes.
 
-    levels: what boxes take their features from, P2 to P5; logits (b, a) and codes (b, a, 4): of the anchors.
+    Attributes
+    ----------
+    levels : Pyramid levels P2 to P5, from which boxes take their features.
+    logits, codes : (b, a) and (b, a, 4) of the anchors.
     """
 
     levels: list[Tensor]
@@ -43,16 +47,24 @@ class FirstStage:
 
 
 class MaskRCNN(keras.Model):
-    """The detector. Called with images alone it detects, called with the blocks as well it returns the losses.
+    """The detector. Called with images only, it detects; called with blocks too, it returns the losses.
 
-    Inputs, as a dict: image (b, h, w, c) float32 as `data.normalised` makes it, h = w = image_px; for the losses also
-    boxes (b, g, 4) float32 px, valid (b, g) 1 or 0, labels (b, h, w) int32, 1 + the index of a pixel's block.
+    The input is a dictionary. image: (b, h, w, c) float32 as `normalisation.normalised` makes it, with h = w = image_px. For the
+    losses also boxes: (b, g, 4) float32, px; valid: (b, g) 1 for a block, 0 for an empty place, -1 for a block to ignore; labels:
+    (b, h, w) int32, 1 + the index of a pixel's block.
+
+    Parameters
+    ----------
+    config : Settings of the network.
+    image_px : Side of the images, px; None: as in the config. It differs in training on windows.
+    seed : Seed of the weights and of sampling.
+    loss_weights : Factors of the losses in their sum; default 1.
     """
 
     def __init__(
         self, config: DetectorConfig, image_px: int | None = None, seed: int = 1, loss_weights: Mapping[Loss, float] | None = None
     ) -> None:
-        """image_px: side of the images where it differs from the config's (training on windows)."""
+        """Build all layers; see the class."""
         super().__init__(name="mask_rcnn")
         keras.utils.set_random_seed(seed)
         self.config = config
@@ -67,10 +79,10 @@ class MaskRCNN(keras.Model):
         self.means = {name: keras.metrics.Mean(name=name) for name in LOSSES}
         self.size = size
         self.term_weights = loss_weights or {}
-        self.built = True  # all layers are functional models with their shapes given
+        self.built = True  # all layers are functional models with known shapes
 
     def call(self, inputs: dict[str, Tensor], training: bool = False) -> dict[str, Tensor]:
-        """Losses by name where the inputs hold the blocks, else boxes, scores and masks as `_detections` gives them."""
+        """Return the losses by name if the inputs have blocks, else the boxes, scores and masks of `_detections`."""
         first = self.first_stage(inputs["image"], training=training)
         proposals = self._proposals(first.logits, first.codes)
         if "boxes" in inputs:
@@ -78,7 +90,7 @@ class MaskRCNN(keras.Model):
         return self._detections(first.levels, proposals)
 
     def first_stage(self, image: Tensor, *, training: bool) -> FirstStage:
-        """Of images (b, h, w, c)."""
+        """Compute pyramid, anchor logits and anchor codes of images (b, h, w, c)."""
         levels = self.pyramid(image, training=training)
         found = [self.proposal_head(level, training=training) for level in levels]
         logits = ops.concatenate([logit for logit, _ in found], axis=1)[..., 0]
@@ -87,21 +99,22 @@ class MaskRCNN(keras.Model):
     def compute_loss(
         self, x: Any = None, y: Any = None, y_pred: Any = None, sample_weight: Any = None, training: bool = True
     ) -> Tensor:
-        """The weighted sum of the losses; each one's mean is kept as a metric."""
+        """Return the weighted sum of the losses, and keep the mean of each one as a metric."""
         for name in LOSSES:
             self.means[name].update_state(y_pred[name])
         return total_loss(y_pred, self.term_weights)
 
     def _proposals(self, logits: Tensor, codes: Tensor) -> Tensor:
-        """(b, proposals, 4) px, empty ones without area; the losses do not reach through them."""
+        """Return the proposals (b, proposals, 4), px, without gradients; empty places have no area."""
         config = self.config.proposal
         best, index = ops.top_k(ops.stop_gradient(logits), min(config.candidates, logits.shape[1]))
         chosen = ops.take_along_axis(ops.stop_gradient(codes), index[..., None], axis=1)
         boxes = clip(decode(chosen, ops.take(self.anchors, index, axis=0)), self.size, self.size)
-        boxes, scores = suppressed(boxes, ops.sigmoid(best), config.suppression_iou, config.proposals)
+        boxes, scores = non_maximum_suppression(boxes, ops.sigmoid(best), config.suppression_iou, config.proposals)
         return ops.where(scores[..., None] >= 0, boxes, 0.0)
 
     def _loss_terms(self, inputs: dict[str, Tensor], first: FirstStage, proposals: Tensor, training: bool) -> dict[str, Tensor]:
+        """Compute the five losses against sampled targets."""
         blocks, valid = inputs["boxes"], inputs["valid"]
         anchor = anchor_targets(self.anchors, blocks, valid, self.config.proposal, self.samples)
         sampled = ops.take_along_axis(first.logits, ops.concatenate([anchor.positive, anchor.negative], axis=1), axis=1)
@@ -126,9 +139,12 @@ class MaskRCNN(keras.Model):
         }
 
     def _detections(self, levels: list[Tensor], proposals: Tensor) -> dict[str, Tensor]:
-        """boxes (b, n, 4) px, scores (b, n), -1 where there are fewer, best first, masks (b, n, m, m) probabilities.
+        """Compute the detections, best first.
 
-        mask_boxes (b, n, 4): where the masks lie, the boxes with `mask_margin_px` around, and so beyond the image too.
+        Returns
+        -------
+        boxes (b, n, 4), px; scores (b, n), -1 where there are fewer; masks (b, n, m, m) of probabilities; mask_boxes (b, n, 4),
+        the area of the masks: the boxes with `mask_margin_px` around them, which may reach beyond the image.
         """
         config = self.config.head
         classes, codes = self._on_boxes(levels, proposals, False)
@@ -138,19 +154,19 @@ class MaskRCNN(keras.Model):
         odds = classes[..., 1] - classes[..., 0] + shift + per_doubling * doublings(boxes)
         scores, order = ops.top_k(ops.where(real, ops.sigmoid(odds), -1.0), proposals.shape[1])
         boxes = ops.take_along_axis(ops.where(real[..., None], boxes, 0.0), order[..., None], axis=1)
-        boxes, scores = suppressed(boxes, scores, config.suppression_iou, config.detections)
+        boxes, scores = non_maximum_suppression(boxes, scores, config.suppression_iou, config.detections)
         around = widened(boxes, config.mask_margin_px)
         masks = ops.sigmoid(self._masks(levels, around, False))
         return {"boxes": boxes, "scores": scores, "mask_boxes": around, "masks": masks}
 
     def _on_boxes(self, levels: list[Tensor], boxes: Tensor, training: bool) -> tuple[Tensor, Tensor]:
-        """Class logits (b, n, classes) and codes (b, n, 4)."""
+        """Return class logits (b, n, classes) and codes (b, n, 4) of boxes."""
         count = boxes.shape[1]
         logits, codes = self.box_head(_flat(roi_align(levels, boxes, self.config.strides, POOLED_PX)), training=training)
         return ops.reshape(logits, (-1, count, logits.shape[-1])), ops.reshape(codes, (-1, count, 4))
 
     def _masks(self, levels: list[Tensor], boxes: Tensor, training: bool) -> Tensor:
-        """(b, n, m, m) logits."""
+        """Return the mask logits (b, n, m, m) of boxes."""
         size = self.config.head.mask_size_px
         logits = self.mask_head(
             _flat(roi_align(levels, boxes, self.config.strides, MASK_POOLED_PX, samples=1)), training=training
@@ -159,5 +175,5 @@ class MaskRCNN(keras.Model):
 
 
 def _flat(features: Tensor) -> Tensor:
-    """(b, n, s, s, c) as (b n, s, s, c)."""
+    """Reshape (b, n, s, s, c) to (b n, s, s, c)."""
     return ops.reshape(features, (-1, *features.shape[2:]))

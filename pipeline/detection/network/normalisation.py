@@ -1,4 +1,4 @@
-"""A difference map as the network's input."""
+"""Convert a difference map to the network's input."""
 
 from __future__ import annotations
 
@@ -10,19 +10,27 @@ from pipeline.detection.network.config import NormalisationConfig
 
 Image = NDArray[np.float32]
 LEVEL_OF_DETECTION = 1.96
-"""Of normal errors, 95 % lie within this many standard deviations."""
+"""95 % of normal errors are within this many standard deviations."""
 
 
 def nmad(difference: Image) -> float:
-    """Robust standard deviation of the pixels with data, m; 0 where there are none."""
+    """Return the robust standard deviation (NMAD) of the pixels with data, m; 0 without data."""
     values = difference[np.isfinite(difference)]
     return robust.nmad(values) if values.size else 0.0
 
 
 def normalised(difference: Image, config: NormalisationConfig, noise_m: float | None = None) -> Image:
-    """(h, w, channels) of a difference map (h, w), m, NaN where there are no data.
+    """Convert a difference map to the network's input.
 
-    noise_m: standard deviation of the noise for `level_of_detection`, of a map that the image is a part of; its NMAD by default.
+    Parameters
+    ----------
+    difference : (h, w) differences, m; NaN without data.
+    config : How to scale them.
+    noise_m : Standard deviation of the noise for `level_of_detection`, m, of the map that the image was cut from; None: the NMAD.
+
+    Returns
+    -------
+    (h, w, channels) float32.
     """
     valid = np.isfinite(difference)
     if config.method == "minmax":
@@ -36,11 +44,12 @@ def normalised(difference: Image, config: NormalisationConfig, noise_m: float | 
 
 
 def denormalised(image: Image, lowest_m: float, highest_m: float) -> Image:
-    """The difference map of an image (h, w) of the `minmax` kind, from the extremes that it had, m."""
+    """Convert an image (h, w) that `minmax` scaled back to differences, m, given its former minimum and maximum."""
     return np.asarray(lowest_m + image * (highest_m - lowest_m), dtype=np.float32)
 
 
 def _minmax(difference: Image, valid: NDArray[np.bool_]) -> Image:
+    """Scale valid pixels to 0...1 and set the others to the median."""
     if not valid.any():
         return np.zeros_like(difference)
     values = difference[valid]

@@ -1,4 +1,4 @@
-"""ROIAlign (He et al. 2017): features of boxes by bilinear interpolation, without any rounding of positions."""
+"""ROIAlign (He et al. 2017): sample the features of boxes by bilinear interpolation, without rounding positions."""
 
 from __future__ import annotations
 
@@ -8,18 +8,29 @@ from keras import ops
 from pipeline.detection.network.boxes import Tensor
 
 _CANONICAL_CELLS = 14.0
-"""A box of twice this side, in cells of P2, takes its features from P3, of four times from P4: a 14 px mask input samples P2 at
-its own pitch."""
+"""Side in cells of P2 from which a box of twice that size takes its features from P3, and of four times from P4. With 14, the
+mask head's input samples P2 at its own spacing.
+"""
 
 
 def roi_align(features: list[Tensor], boxes: Tensor, strides: tuple[int, ...], size: int, samples: int = 2) -> Tensor:
-    """(b, n, size, size, c) features of boxes (b, n, 4), px of the image, from the levels P2, P3, ... ((b, h, w, c) each).
-
-    strides: pixels of the image per cell of each level.
+    """Sample the features of boxes from the pyramid.
 
     Each of the size x size bins is the mean of samples x samples interpolated values at the centres of its parts. A cell's value
-    stands at the cell's centre, so a box's feature of a linear ramp is the ramp at the bin's centre; beyond the outermost
-    centres the nearest one counts.
+    is at the cell's centre, so that the feature of a linear ramp is the ramp at the bin's centre; beyond the outermost centres,
+    the nearest value is used.
+
+    Parameters
+    ----------
+    features : Levels P2, P3, ..., (b, h, w, c) each.
+    boxes : (b, n, 4) boxes, px of the image.
+    strides : Pixels of the image per cell of each level.
+    size : Bins along a side.
+    samples : Samples along a side of a bin.
+
+    Returns
+    -------
+    (b, n, size, size, c) features.
     """
     shapes = np.array([feature.shape[1:3] for feature in features], np.int32)
     starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))]).astype(np.int32)
@@ -27,7 +38,7 @@ def roi_align(features: list[Tensor], boxes: Tensor, strides: tuple[int, ...], s
     cells = ops.concatenate(
         [ops.reshape(feature, (-1, starts[i + 1] - starts[i], channels)) for i, feature in enumerate(features)], axis=1
     )
-    flat = ops.reshape(cells, (-1, channels))  # once: the gradients of all gathers then reach it in one piece
+    flat = ops.reshape(cells, (-1, channels))  # flattened once, so that the gradients of all gathers are added in one tensor
     image = ops.arange(ops.shape(cells)[0], dtype="int32")[:, None] * int(starts[-1])
     level = _levels(boxes, len(features), _CANONICAL_CELLS * strides[0])
     stride = ops.take(np.array(strides[: len(features)], np.float32), level, axis=0)
@@ -48,13 +59,14 @@ def roi_align(features: list[Tensor], boxes: Tensor, strides: tuple[int, ...], s
 
 
 def _levels(boxes: Tensor, count: int, canonical_px: float) -> Tensor:
+    """Return the level of each box by its area."""
     area = ops.maximum((boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1]), 1e-6)
     level = ops.floor(0.5 * ops.log(area / canonical_px**2) / float(np.log(2.0)))
     return ops.cast(ops.clip(level, 0, count - 1), "int32")
 
 
 def _neighbours(low: Tensor, high: Tensor, parts: np.ndarray, stride: Tensor, length: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(b, n, size) the two cells on either side of each sample along one axis, and the weight of the second."""
+    """Return the (b, n, size) cells on both sides of each sample along one axis, and the weight of the second."""
     at = (low + parts * (high - low)) / stride[..., None] - 0.5
     last = ops.cast(length, "float32")[..., None] - 1
     at = ops.minimum(ops.maximum(at, 0.0), last)

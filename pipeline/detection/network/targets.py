@@ -1,6 +1,6 @@
-"""What the network should have said: targets of anchors and of proposals, drawn at random with fixed shapes.
+"""Training targets of anchors and proposals, sampled at random with fixed shapes.
 
-Fixed numbers of positive and negative samples are drawn per image; where there are fewer, the rest of the places have weight 0.
+Fixed numbers of positive and negative samples are drawn for each image; places that cannot be filled have weight 0.
 """
 
 from __future__ import annotations
@@ -14,14 +14,18 @@ from pipeline.detection.network.boxes import Tensor, encode, intersection_over_u
 from pipeline.detection.network.config import HeadConfig, ProposalConfig
 
 _IGNORED = 0.5
-"""Share of a box in a block to ignore from which it is no background."""
+"""Share of a box inside an ignored block from which the box is not background."""
 
 
 @dataclass(frozen=True)
 class AnchorTargets:
     """Sampled anchors of each image.
 
-    positive, negative: (b, p), (b, n) their indices; positive_weight, negative_weight: 1 or 0; code: (b, p, 4) of the positives.
+    Attributes
+    ----------
+    positive, negative : (b, p) and (b, n) indices of the anchors.
+    positive_weight, negative_weight : 1 for a sample, 0 for an empty place.
+    code : (b, p, 4) target codes of the positives.
     """
 
     positive: Tensor
@@ -35,7 +39,12 @@ class AnchorTargets:
 class BoxTargets:
     """Sampled proposals of each image, positives first.
 
-    boxes: (b, p + n, 4); weight: (b, p + n) 1 or 0; code: (b, p, 4) of the positives; block: (b, p) index of each one's block.
+    Attributes
+    ----------
+    boxes : (b, p + n, 4) boxes, px.
+    weight : (b, p + n) 1 for a sample, 0 for an empty place.
+    code : (b, p, 4) target codes of the positives.
+    block : (b, p) index of each positive's block.
     """
 
     boxes: Tensor
@@ -45,16 +54,23 @@ class BoxTargets:
 
     @property
     def positives(self) -> int:
-        """Places for positives."""
+        """Number of places for positives."""
         return int(self.code.shape[1])
 
 
 def anchor_targets(
     anchors: np.ndarray, blocks: Tensor, valid: Tensor, config: ProposalConfig, seed: random.SeedGenerator
 ) -> AnchorTargets:
-    """Which anchors are blocks: those near one, and the nearest to each block.
+    """Sample positive and negative anchors. Positive are those with a large overlap with a block, and the nearest one to each
+    block.
 
-    anchors: (a, 4); blocks: (b, g, 4) with valid (b, g): 1, 0 for none, -1 for one to ignore, in which no anchor is negative.
+    Parameters
+    ----------
+    anchors : (a, 4) boxes, px.
+    blocks : (b, g, 4) boxes, px.
+    valid : (b, g) 1 for a block, 0 for an empty place, -1 for a block to ignore, in which no anchor is negative.
+    config : Thresholds and numbers of samples.
+    seed : Source of random numbers.
     """
     counted, free = _counted(anchors[None], blocks, valid)
     overlap = intersection_over_union(anchors[None], blocks) * counted
@@ -63,8 +79,8 @@ def anchor_targets(
     positive = ops.cast((best >= config.positive_iou) | nearest, "float32")
     negative = ops.cast(best < config.negative_iou, "float32") * (1 - positive) * free
     half = config.sampled_anchors // 2
-    chosen, weight = _drawn(positive, half, seed)
-    others, other_weight = _drawn(negative, config.sampled_anchors, seed)
+    chosen, weight = _draw(positive, half, seed)
+    others, other_weight = _draw(negative, config.sampled_anchors, seed)
     room = config.sampled_anchors - ops.sum(weight, axis=1, keepdims=True)
     other_weight = other_weight * ops.cast(np.arange(config.sampled_anchors)[None] < room, "float32")
     block = ops.take_along_axis(ops.argmax(overlap, axis=2), chosen, axis=1)
@@ -74,9 +90,16 @@ def anchor_targets(
 
 
 def box_targets(proposals: Tensor, blocks: Tensor, valid: Tensor, config: HeadConfig, seed: random.SeedGenerator) -> BoxTargets:
-    """Which proposals are blocks; the blocks themselves are among the proposals, so that there is always something to learn from.
+    """Sample positive and negative proposals.
 
-    proposals: (b, n, 4), empty ones have no area; blocks: (b, g, 4) with valid (b, g), as in `anchor_targets`.
+    The blocks themselves are added to the proposals, so that there is always a positive.
+
+    Parameters
+    ----------
+    proposals : (b, n, 4) boxes, px; empty places have no area.
+    blocks, valid : As in `anchor_targets`.
+    config : Threshold and number of samples.
+    seed : Source of random numbers.
     """
     everything = ops.concatenate([proposals, blocks * ops.cast(valid > 0, "float32")[..., None]], axis=1)
     sound = ops.cast((everything[..., 2] > everything[..., 0]) & (everything[..., 3] > everything[..., 1]), "float32")
@@ -85,8 +108,8 @@ def box_targets(proposals: Tensor, blocks: Tensor, valid: Tensor, config: HeadCo
     best = ops.max(overlap, axis=2)
     positive = ops.cast(best >= config.positive_iou, "float32") * sound
     count = config.sampled_proposals // 3
-    chosen, weight = _drawn(positive, count, seed)
-    others, other_weight = _drawn((1 - positive) * sound * free, config.sampled_proposals - count, seed)
+    chosen, weight = _draw(positive, count, seed)
+    others, other_weight = _draw((1 - positive) * sound * free, config.sampled_proposals - count, seed)
     block = ops.take_along_axis(ops.argmax(overlap, axis=2), chosen, axis=1)
     boxes = ops.take_along_axis(everything, ops.concatenate([chosen, others], axis=1)[..., None], axis=1)
     wanted = ops.take_along_axis(blocks, block[..., None], axis=1)
@@ -95,16 +118,27 @@ def box_targets(proposals: Tensor, blocks: Tensor, valid: Tensor, config: HeadCo
 
 
 def _counted(boxes: Tensor, blocks: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """(b, 1, g) 1 for the blocks that count, and (b, n) 0 for boxes that lie in one to ignore by _IGNORED or more, else 1."""
+    """Return (b, 1, g) 1 for blocks that count, and (b, n) 0 for boxes whose share in an ignored block reaches _IGNORED,
+    else 1.
+    """
     ignored = ops.cast(valid < 0, "float32")[:, None]
     free = ops.max(share_inside(boxes, blocks) * ignored, axis=2) < _IGNORED
     return ops.cast(valid > 0, "float32")[:, None], ops.cast(free, "float32")
 
 
 def mask_targets(labels: Tensor, boxes: Tensor, block: Tensor, size: int) -> Tensor:
-    """(b, p, size, size) 1 where the pixel at a mask cell's centre belongs to the box's block, else 0.
+    """Sample the masks of blocks on their boxes' mask grid.
 
-    labels: (b, h, w) int32, 1 + the index of the block that a pixel belongs to, 0 for none; boxes: (b, p, 4); block: (b, p).
+    Parameters
+    ----------
+    labels : (b, h, w) int32, 1 + the index of the block at a pixel, 0 for none.
+    boxes : (b, p, 4) boxes, px.
+    block : (b, p) index of each box's block.
+    size : Cells along a side of the mask.
+
+    Returns
+    -------
+    (b, p, size, size) 1 where the pixel at a cell's centre belongs to the box's block, else 0.
     """
     height, width = labels.shape[1:]
     parts = (np.arange(size, dtype=np.float32) + 0.5) / size
@@ -117,11 +151,12 @@ def mask_targets(labels: Tensor, boxes: Tensor, block: Tensor, size: int) -> Ten
 
 
 def _pixel(low: Tensor, high: Tensor, parts: np.ndarray, length: int) -> Tensor:
+    """Return the pixels at the centres of mask cells along one axis."""
     return ops.cast(ops.clip(ops.floor(low + parts * (high - low)), 0, length - 1), "int32")
 
 
-def _drawn(wanted: Tensor, count: int, seed: random.SeedGenerator) -> tuple[Tensor, Tensor]:
-    """(b, count) indices of random elements of those where wanted (b, n) is 1, and weights 1, or 0 where there are no more."""
+def _draw(wanted: Tensor, count: int, seed: random.SeedGenerator) -> tuple[Tensor, Tensor]:
+    """Draw (b, count) indices at random where wanted (b, n) is 1, with weight 1, or 0 for places that cannot be filled."""
     rank = wanted * (1 + random.uniform(ops.shape(wanted), seed=seed))
     found, index = ops.top_k(rank, min(count, wanted.shape[1]))
     return ops.cast(index, "int32"), ops.cast(found > 0.5, "float32")

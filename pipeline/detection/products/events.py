@@ -1,4 +1,4 @@
-"""Detections as people use them: a table of events with volumes in the wall's coordinates, a raster of masks, COCO files."""
+"""Write detections for users: a table of events with volumes and coordinates, a raster of masks, and COCO files."""
 
 from __future__ import annotations
 
@@ -24,10 +24,19 @@ from scene.geometry.grid import Grid
 
 @dataclass(frozen=True)
 class Event:
-    """One rockfall. x_m, y_m: centre of its mask in the map's frame, the wall's; depth_m: largest; volume_m3: over the mask.
+    """One detected rockfall.
 
-    Depth and volume are those of the difference map, along the wall's normal; pixels without data count with the mean depth.
-    world_x_m ...: the rock's place before it fell, in the survey's coordinates, NaN where they are not known.
+    Depth and volume are those of the difference map along the wall's normal; pixels without data count with the mean depth.
+
+    Attributes
+    ----------
+    image, number : Name of the map, and number of the event in it.
+    x_m, y_m : Centre of the mask in the wall frame, m.
+    width_m, height_m, area_m2 : Extent of the mask.
+    depth_m, mean_depth_m : Largest and mean depth, m.
+    volume_m3 : Volume over the mask, m^3.
+    score : Confidence, 0 to 1.
+    world_x_m, world_y_m, world_z_m : Place of the rock before it fell, in the survey's coordinates, m; NaN if unknown.
     """
 
     image: str
@@ -49,11 +58,20 @@ class Event:
 
 _ROW = TypeAdapter(Event)
 _PLACE = ("world_x_m", "world_y_m", "world_z_m")
-"""Columns that older tables lack, and that are empty where the place is not known."""
+"""Columns that older tables lack, and that are empty if the place is unknown."""
 
 
 def event(item: Detection, number: int, image: str, difference: NDArray[np.float32], grid: Grid) -> Event:
-    """The event behind a detection in the difference map (h, w), m."""
+    """Measure the event of a detection.
+
+    Parameters
+    ----------
+    item : The detection.
+    number : Number of the event in its map.
+    image : Name of the map.
+    difference : (h, w) difference map, m.
+    grid : Raster of the map.
+    """
     height, width = item.mask.shape
     values = difference[item.row : item.row + height, item.column : item.column + width][item.mask]
     known = values[np.isfinite(values)].astype(np.float64)
@@ -76,7 +94,7 @@ def event(item: Detection, number: int, image: str, difference: NDArray[np.float
 
 
 def write_events(events: Sequence[Event], path: Path) -> None:
-    """A CSV table, one line per event, metres with 4 decimals, what is not known left empty."""
+    """Write events as CSV, one line each, metres with 4 decimals, unknown values empty."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(Event.__dataclass_fields__)
@@ -86,13 +104,14 @@ def write_events(events: Sequence[Event], path: Path) -> None:
 
 
 def _written(value: Any) -> Any:
+    """Format a value for the table."""
     if not isinstance(value, float):
         return value
     return "" if math.isnan(value) else f"{value:.4f}"
 
 
 def read_events(path: Path) -> list[Event]:
-    """A table that `write_events` wrote; raises InputError for a file that is none, naming the line."""
+    """Read a table that `write_events` wrote; raise InputError for any other file, naming the line."""
     remedy = "run scarpsim detect again"
     table = csv.DictReader(io.StringIO(read_text(path, remedy=remedy)))
     names = [field.name for field in fields(Event)]
@@ -100,20 +119,20 @@ def read_events(path: Path) -> list[Event]:
     try:
         for row in table:
             if list(row) not in (names, [name for name in names if name not in _PLACE]):
-                raise InputError("is no table of events", where=str(path), allowed=f"columns {', '.join(names)}", remedy=remedy)
+                raise InputError("not a table of events", where=str(path), allowed=f"columns {', '.join(names)}", remedy=remedy)
             found.append(_ROW.validate_python({name: value for name, value in row.items() if value or name not in _PLACE}))
     except csv.Error as error:
-        raise InputError(f"is no table of events ({error})", where=str(path), remedy=remedy) from None
+        raise InputError(f"not a table of events ({error})", where=str(path), remedy=remedy) from None
     except ValidationError as error:
         wrong = error.errors()[0]
         problem = f"'{wrong['loc'][0]}' is {wrong['input']!r:.80}"
-        allowed = "finite numbers, and an image's name"
+        allowed = "finite numbers and an image's name"
         raise InputError(problem, where=f"{path}, line {table.line_num}", allowed=allowed, remedy=remedy) from None
     return found
 
 
 def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """(h, w) the number of the best detection at each pixel, counted from 1, NaN where there is none."""
+    """Return the (h, w) number of the best detection at each pixel, from 1; NaN where there is none."""
     result = np.full(shape, np.nan, np.float32)
     for number, item in reversed(list(enumerate(found, start=1))):
         height, width = item.mask.shape
@@ -123,5 +142,5 @@ def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[
 
 
 def write_coco(images: Sequence[dict[str, Any]], annotations: Sequence[dict[str, Any]], path: Path) -> None:
-    """Images and scored annotations as a COCO data set, which pycocotools loads; `annotations` alone is its result form."""
+    """Write images and scored annotations as a COCO data set; its `annotations` have the form of COCO results."""
     write_json(path, {"images": images, "annotations": annotations, "categories": [BLOCK_CATEGORY]})

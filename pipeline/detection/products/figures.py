@@ -1,6 +1,6 @@
-"""Pictures of the detector: the losses over the epochs, the detections over a difference map.
+"""Draw the detector's pictures: losses over the epochs, detections on a difference map, reliability of scores.
 
-They do without pipeline.report, which brings the ray tracer's compiler: that and TensorFlow's do not belong into one process.
+They do not use pipeline.report, which loads the ray tracer's compiler; that and TensorFlow's cannot be in one process.
 """
 
 from __future__ import annotations
@@ -24,22 +24,26 @@ from pipeline.report.plain_text import plain_text
 from scene.geometry.grid import Grid
 
 _PANELS = {"Total": ("loss",), "Class": ("class", "proposal_class"), "Box": ("box", "proposal_box"), "Mask": ("mask",)}
+"""Losses that are added up in each panel."""
 _TRAINING, _VALIDATION = "#0072B2", "#D55E00"
 _SCALE_SIGMAS = 6.0
+"""End of the colour scale, in NMADs."""
 _WIDEST_PX = 2400
+"""Larger maps are drawn with fewer pixels."""
 _HIGHEST = 4.0
-"""A map that is higher than so many times its width is drawn smaller."""
+"""Largest height over width of a drawn map; higher maps are drawn smaller."""
 _LOW_IN = 4.5
-"""Below this height of the figure the label of a colour bar has no room beside the map."""
+"""Height of the figure, inches, below which the colour bar is drawn under the map."""
 _MOST_NUMBERED = 200
+"""Largest number of detections that are numbered."""
 _MOST_LINES, _LONGEST_NAME = 12, 40
-"""Groups in one diagram, and letters of their names in its legend."""
+"""Largest number of groups in a diagram, and of letters of their names in the legend."""
 _MOST_MARKED = 30
-"""Up to this many epochs each has a marker, as one alone makes no line."""
+"""Number of epochs up to which each has a marker, since a single epoch makes no line."""
 
 
 def write_loss_figure(training: Sequence[Mapping[str, float]], validation: Sequence[Mapping[str, float]], path: Path) -> None:
-    """The four losses, the proposals' share added to the heads', against the epoch."""
+    """Draw the total, class, box and mask losses against the epoch; losses of the proposals are added to those of the heads."""
     figure = Figure(figsize=(9.6, 6.4), dpi=110, layout="constrained")
     epochs = np.arange(1, len(training) + 1)
     marker = "o" if len(epochs) <= _MOST_MARKED else ""
@@ -57,7 +61,16 @@ def write_loss_figure(training: Sequence[Mapping[str, float]], validation: Seque
 
 
 def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[Detection], path: Path, title: str = "") -> None:
-    """A difference map with the outlines of what was found in it; colours end at six NMAD on either side of zero."""
+    """Draw a difference map with the outlines of detections; the colours end at six NMAD.
+
+    Parameters
+    ----------
+    difference : (h, w) map, m.
+    grid : Its raster.
+    found : The detections.
+    path : PNG file to write.
+    title : Title; "": the number of blocks.
+    """
     step = max(1, -(-max(difference.shape) // _WIDEST_PX))
     shown = 1e3 * difference[::step, ::step]
     limit = 1e3 * max(_SCALE_SIGMAS * nmad(difference), 1e-4)
@@ -84,17 +97,19 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
     axes.set(
         xlabel="x along the wall, m",
         ylabel="y up the wall, m",
-        title=title or f"{len(found)} blocks found; numbers as in the table",
+        title=title or f"{len(found)} blocks detected, numbered as in the table",
     )
     _write(figure, path)
 
 
 def write_reliability(groups: Sequence[Reliability], path: Path) -> None:
-    """The share of blocks among the detections of about a score against that score, with standard errors; the diagonal is that of
-    scores that are probabilities. Of many groups the first, which include all images together."""
+    """Draw the share of blocks among detections against their score, with standard errors.
+
+    On the diagonal, scores are probabilities. Of many groups only the first are drawn, which include all images together.
+    """
     figure = Figure(figsize=(6.4, 5.6), dpi=110, layout="constrained")
     axes = figure.subplots()
-    axes.plot((0, 1), (0, 1), color="#808080", linestyle="--", linewidth=1, label="a probability")
+    axes.plot((0, 1), (0, 1), color="#808080", linestyle="--", linewidth=1, label="score = probability")
     for each in groups[:_MOST_LINES]:
         x, y, error = ([getattr(one, name) for one in each.classes] for name in ("score", "precision", "error"))
         count = sum(one.detections for one in each.classes)
@@ -102,18 +117,19 @@ def write_reliability(groups: Sequence[Reliability], path: Path) -> None:
             x, y, error, marker="o", markersize=4, linewidth=1, capsize=2, label=f"{each.group:.{_LONGEST_NAME}} ({count:,})"
         )
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="score", ylabel="share that are blocks")
-    axes.set_title(f"What a score means (in brackets: detections; overlap by {groups[0].iou:g})", fontsize=10)
+    axes.set_title(f"Reliability of scores (in brackets: detections; IoU from {groups[0].iou:g})", fontsize=10)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     _write(figure, path)
 
 
 def _cut_off(values: NDArray[np.floating], limit: float) -> str:
-    """At which ends of a colour bar from -limit to limit values lie beyond it, in matplotlib's words."""
+    """Return at which ends of a colour bar from -limit to limit values lie beyond it, in matplotlib's words."""
     below, above = bool((values < -limit).any()), bool((values > limit).any())
     return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
 
 
 def _write(figure: Figure, path: Path) -> None:
+    """Write a figure, completely or not at all."""
     with writing(path) as temporary, plain_text(figure):
         FigureCanvasAgg(figure).print_figure(temporary, metadata={"Software": None})

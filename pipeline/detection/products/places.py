@@ -1,4 +1,4 @@
-"""Where events lie in the coordinates of the survey: a run knows its wall frame, and its reference how far the rock stood out."""
+"""Compute the survey coordinates of events, from the run's wall frame and the heights of its reference surface."""
 
 from __future__ import annotations
 
@@ -15,21 +15,26 @@ from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
 _NEAR_M, _FARTHEST_M = 0.05, 1.0
-"""Radius in which the reference's vertices tell how far the rock stood out, doubled up to this where there are none."""
+"""Radius, m, within which reference vertices give the height of the rock; it is doubled up to the second value if there
+are none.
+"""
 
 
 @dataclass(frozen=True)
 class EventPlaces:
-    """A run's wall frame, and the vertices (n, 3) of its reference, wall frame, by rising x; none where the run wrote none."""
+    """A run's wall frame, and the vertices (n, 3) of its reference surface, wall frame, m, sorted by x; empty if the run wrote
+    none.
+    """
 
     frame: WallFrame
     vertices: FloatArray
 
     def world(self, x: float, y: float) -> FloatArray:
-        """(3,) the place on the rock before it fell at (x, y) of the wall frame, world frame, m; NaN where that is not known."""
+        """Return the (3,) place on the rock before it fell at (x, y) of the wall frame, in the world frame, m; NaN if unknown."""
         return np.asarray(self.frame.to_world(np.array([x, y, self._height(x, y)])))
 
     def _height(self, x: float, y: float) -> float:
+        """Return the median height of the reference around (x, y), m."""
         radius = _NEAR_M
         while radius <= _FARTHEST_M:
             low, high = np.searchsorted(self.vertices[:, 0], [x - radius, x + radius])
@@ -41,8 +46,8 @@ class EventPlaces:
         return float("nan")
 
 
-def placed(event: Event, path: Path) -> Event:
-    """The event with its world coordinates, where its map, at `path`, belongs to a run that says where its wall stands."""
+def with_world_coordinates(event: Event, path: Path) -> Event:
+    """Return the event with world coordinates, if its map, at `path`, belongs to a run with a known wall frame."""
     run = next((folder for folder in (path.parent, path.parent.parent) if (folder / RUN_FILE).is_file()), None)
     places = _places(run.resolve()) if run is not None else None
     if places is None:
@@ -53,6 +58,7 @@ def placed(event: Event, path: Path) -> Event:
 
 @lru_cache(2)
 def _places(folder: Path) -> EventPlaces | None:
+    """Read wall frame and reference surface of a run's folder."""
     frame = read_run(folder / RUN_FILE, "make the run again").get("wall_frame")
     if not frame:
         return None

@@ -1,4 +1,4 @@
-"""`scarpsim detect`: difference maps in, events out."""
+"""Run `scarpsim detect`: read difference maps, detect blocks, write events."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ from pipeline.detection.inference import baseline
 from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.products import events
 from pipeline.detection.products.figures import write_overlay
-from pipeline.detection.products.places import placed
+from pipeline.detection.products.places import with_world_coordinates
 from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 
 BASELINE, DEFAULT = "baseline", "default"
+"""Names of the detectors that need no folder."""
 CONFIDENCES = (0.9, 0.95, 0.99)
+"""Default confidences of the output files."""
 LOWEST_SCORE = 0.05
+"""Lowest score of a detection that is kept."""
 Detector = Callable[[NDArray[np.float32]], list[Detection]]
 
 
 @dataclass(frozen=True)
-class Input:
-    """A difference map. name: as in the outputs; image: its entry in COCO's list, with an id."""
+class InputMap:
+    """A difference map to search. name: as in the outputs; image: its entry in COCO's list, with an id."""
 
     path: Path
     name: str
@@ -40,27 +43,29 @@ class Input:
 
 
 def detector_folder(model: str) -> Path:
-    """Where a detector lies: `default` (the weights that come with scarpsim), or a folder that `scarpsim train` made."""
+    """Return the folder of a detector: `default` (the weights that come with scarpsim), or one made by `scarpsim train`."""
     return configs_folder() / "detectors" / DEFAULT if model == DEFAULT else Path(model)
 
 
 def detector(model: str, *, unmirrored: bool = False) -> Detector:
-    """By name: `baseline`, or as `detector_folder` has it; unmirrored: it does not look at mirror images of maps."""
+    """Load a detector: `baseline`, or a name as in `detector_folder`; unmirrored: without mirrored views."""
     if model == BASELINE:
         if unmirrored:
-            raise InputError(f"goes with a network, not with '{BASELINE}'", where="--unmirrored", remedy="leave it out")
+            raise InputError(f"the option needs a network, not '{BASELINE}'", where="--unmirrored", remedy="leave it out")
         return baseline.detect
-    from pipeline.detection.network.keras_backend import keras_ready
+    from pipeline.detection.network.keras_backend import import_keras
 
-    keras_ready()
+    import_keras()
     from pipeline.detection.inference import inference, weights
 
     network = weights.load(detector_folder(model), unmirrored=unmirrored)
     return lambda difference: inference.detect(network, difference, LOWEST_SCORE)
 
 
-def checked_confidences(values: Sequence[float]) -> tuple[float, ...]:
-    """The values in rising order, each once; raises InputError where one is no probability above the lowest that is kept."""
+def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
+    """Return the values in rising order without repetition; raise InputError unless they are between the lowest kept score
+    and 1.
+    """
     for value in values:
         if not LOWEST_SCORE <= value <= 1:
             raise InputError(
@@ -69,31 +74,33 @@ def checked_confidences(values: Sequence[float]) -> tuple[float, ...]:
     return tuple(sorted(set(values)))
 
 
-def find_inputs(places: Sequence[Path]) -> list[Input]:
-    """The difference maps at some paths: TIFF files, folders with annotations.json, run folders; ids from 1, or COCO's."""
-    result: list[Input] = []
+def find_inputs(places: Sequence[Path]) -> list[InputMap]:
+    """Find the difference maps at some paths: TIFF files, folders with annotations.json, run folders; ids are COCO's, or count
+    from 1.
+    """
+    result: list[InputMap] = []
     for place in places:
         if (place / "annotations.json").is_file():
             folder = CocoFolder(place, masks=False)
-            result += [Input(folder.path(image), image["file_name"], image) for image in folder.images]
+            result += [InputMap(folder.path(image), image["file_name"], image) for image in folder.images]
             continue
         files = sorted(place.glob("difference_*.tif")) if place.is_dir() else [place]
         if not files:
             allowed = "a TIFF, a run folder, or a folder with annotations.json"
-            raise InputError("holds no difference map", where=str(place), allowed=allowed)
-        result += [Input(file, file.name, {"file_name": file.name}) for file in files]
+            raise InputError("no difference map found", where=str(place), allowed=allowed)
+        result += [InputMap(file, file.name, {"file_name": file.name}) for file in files]
     for path, count in Counter(item.path for item in result).items():
         if count > 1:
-            raise InputError(f"is given {count} times", where=str(path), remedy="name each map once")
-    result = _told_apart(result)
+            raise InputError(f"the map is given {count} times", where=str(path), remedy="name each map once")
+    result = _unique_names(result)
     own = [item.image.get("id") for item in result]
     if len(set(own)) < len(own) or None in own:
-        result = [Input(item.path, item.name, {**item.image, "id": number}) for number, item in enumerate(result, start=1)]
+        result = [InputMap(item.path, item.name, {**item.image, "id": number}) for number, item in enumerate(result, start=1)]
     return result
 
 
-def _told_apart(inputs: Sequence[Input]) -> list[Input]:
-    """Maps of one file name, as those of two runs, with their folder before it, or with all of their path."""
+def _unique_names(inputs: Sequence[InputMap]) -> list[InputMap]:
+    """Give maps with the same file name, such as those of two runs, unique names: with their folder, or with their whole path."""
     inputs = list(inputs)
     for longer in (lambda item: f"{item.path.parent.name}/{item.path.name}", lambda item: item.path.as_posix()):
         count = Counter(item.name for item in inputs)
@@ -101,8 +108,9 @@ def _told_apart(inputs: Sequence[Input]) -> list[Input]:
     return inputs
 
 
-def _renamed(item: Input, name: str) -> Input:
-    return Input(item.path, name, {**item.image, "file_name": name})
+def _renamed(item: InputMap, name: str) -> InputMap:
+    """Return the input with another name."""
+    return InputMap(item.path, name, {**item.image, "file_name": name})
 
 
 def detect(
@@ -115,13 +123,25 @@ def detect(
     *,
     unmirrored: bool = False,
 ) -> list[events.Event]:
-    """Find the blocks in difference maps (GeoTIFF, m); returns the events at the lowest of the confidences.
+    """Detect blocks in difference maps and write the results.
 
-    unmirrored: a network looks at maps as they are alone, which takes less time where its `head.mirrored` says otherwise.
+    Nothing is written before all maps are searched. The files are detections.json with everything above a score of 0.05, for
+    `scarpsim evaluate`; detections_c.json and events_c.csv for each confidence c; and for the lowest one a raster of masks and a
+    picture of each map.
 
-    Writes to `out`: detections.json, everything above a score of 0.05, for `scarpsim evaluate`; for each confidence c
-    detections_c.json and events_c.csv; for the lowest also a raster of masks and an overlay picture per map. Nothing is written
-    before every map is searched.
+    Parameters
+    ----------
+    model : Name of the detector, as in `detector`.
+    places : Difference maps (GeoTIFF, m) or folders of them.
+    out : Folder to write.
+    confidences : Lowest scores of the output files.
+    pictures : Whether to write masks and pictures.
+    progress : Receives the progress; None: nothing is shown.
+    unmirrored : Whether a network uses no mirrored views, which takes less time if `head.mirrored` asks for them.
+
+    Returns
+    -------
+    The events at the lowest confidence.
     """
     inputs, progress = find_inputs(places), progress or Progress()
     with progress.stage("network"):
@@ -130,7 +150,7 @@ def detect(
     progress.plan({"detection": 1.0, "results": 0.2 if pictures else 0.01})
     with progress.stage("detection"):
         for number, item in enumerate(inputs, start=1):
-            results.append(_searched(item, find, min(confidences)))
+            results.append(_search(item, find, min(confidences)))
             progress.advance(number / len(inputs))
     with progress.stage("results"):
         _write(results, confidences, out)
@@ -143,24 +163,36 @@ def detect(
 
 @dataclass(frozen=True)
 class _Result:
-    """What was found in a map of `shape`, px, best first; events: of those from the lowest confidence on."""
+    """Detections in a map.
 
-    item: Input
+    Attributes
+    ----------
+    item : The map.
+    shape : (h, w) of the map, px.
+    found : All detections, best first.
+    events : Events of those from the lowest confidence.
+    """
+
+    item: InputMap
     shape: tuple[int, ...]
     found: list[Detection]
     events: list[events.Event]
 
 
-def _searched(item: Input, find: Detector, lowest: float) -> _Result:
+def _search(item: InputMap, find: Detector, lowest: float) -> _Result:
+    """Detect blocks in a map and measure their events."""
     difference, grid = read_geotiff(item.path)
     found = find(difference)
     sure = [each for each in found if each.score >= lowest]
-    told = [placed(events.event(each, count, item.name, difference, grid), item.path) for count, each in enumerate(sure, start=1)]
+    told = [
+        with_world_coordinates(events.event(each, count, item.name, difference, grid), item.path)
+        for count, each in enumerate(sure, start=1)
+    ]
     return _Result(item, difference.shape, found, told)
 
 
 def _write(results: Sequence[_Result], confidences: Sequence[float], out: Path) -> None:
-    """The detections as COCO, all and from each confidence on, and the tables of events."""
+    """Write detections and events, all and from each confidence."""
     images = [{**each.item.image, "height": each.shape[0], "width": each.shape[1]} for each in results]
     pairs = [(image["id"], result.shape, each) for image, result in zip(images, results, strict=True) for each in result.found]
     annotations = [each.annotation(count, number, shape) for count, (number, shape, each) in enumerate(pairs, start=1)]
@@ -173,7 +205,7 @@ def _write(results: Sequence[_Result], confidences: Sequence[float], out: Path) 
 
 
 def _stems(results: Sequence[_Result]) -> list[str]:
-    """A file name for each map's pictures, its own where a file can have it, numbered where two would be alike."""
+    """Return a unique file name for each map's pictures, its own name where possible."""
     stems: dict[str, None] = {}
     for result in results:
         stem = re.sub(r"[^\w.-]+", "_", result.item.name.rsplit(".", 1)[0])
@@ -183,7 +215,7 @@ def _stems(results: Sequence[_Result]) -> list[str]:
 
 
 def _write_pictures(result: _Result, lowest: float, out: Path, stem: str) -> None:
-    """The raster of masks and the overlay of a map, which is read again: all maps together may not fit the memory."""
+    """Write the raster of masks and the picture of a map; the map is read again, as all together may not fit the memory."""
     difference, grid = read_geotiff(result.item.path)
     sure = [each for each in result.found if each.score >= lowest]
     write_geotiff(out / f"{stem}_masks.tif", events.label_raster(sure, difference.shape), grid)

@@ -1,4 +1,4 @@
-"""`scarpsim evaluate`: files in, tables out."""
+"""Run `scarpsim evaluate`: read truth and detections, write tables of scores."""
 
 from __future__ import annotations
 
@@ -22,15 +22,20 @@ from pipeline.formats.records.coco import Coco, Entry, read_coco, read_detection
 from scene.common.errors import InputError, nearest
 
 _MOST_PAIRS = 25_000_000
-"""Of annotations and detections of one image, whose overlaps take 200 MB."""
+"""Largest number of pairs of an annotation and a detection in one image; their overlaps take 200 MB."""
 _KINDS: dict[Overlap, str] = {"segm": "masks", "bbox": "boxes"}
+"""Name of each overlap."""
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """Scores of every group, by overlap of masks and of boxes, and pycocotools' figures over all images.
+    """Scores of detections.
 
-    coco, reliability: by overlap of masks, of boxes where there are no masks.
+    Attributes
+    ----------
+    scores : Scores of every group, by overlap of masks and of boxes.
+    coco : pycocotools' metrics over all images, by overlap of masks, or of boxes if there are no masks.
+    reliability : Reliability of the scores, by the same overlap.
     """
 
     scores: list[Score]
@@ -38,7 +43,7 @@ class Assessment:
     reliability: list[Reliability]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types."""
+        """Return the content as JSON types."""
         scores, reliable = ([each.to_dict() for each in found] for found in (self.scores, self.reliability))
         return {"scores": scores, "coco": self.coco, "reliability": reliable}
 
@@ -50,11 +55,20 @@ def assess(
     kinds: Sequence[Overlap] = ("segm", "bbox"),
     confidences: Sequence[float] = CONFIDENCES,
 ) -> Assessment:
-    """Compare two COCO files; `keys` of the truth's images, such as noise or wall, make the groups.
+    """Score a COCO file of detections against one of the truth.
 
-    kinds: overlap of masks, of boxes (the thesis's), or both; confidences: lowest scores that count, each a column of the tables.
+    Parameters
+    ----------
+    truth : annotations.json, or its folder.
+    predictions : File of detections.
+    keys : Keys of the truth's images, such as noise or wall; each of their values is a group.
+    kinds : Overlap of masks, of boxes (as in the thesis), or both.
+    confidences : Lowest scores that count, each a column of the tables.
 
-    Raises InputError for all that `read_coco` and `read_detections` do, and for keys that do not tell the images apart.
+    Raises
+    ------
+    InputError
+        If a file is wrong, as in `read_coco` and `read_detections`, or images lack a key.
     """
     path = truth / "annotations.json" if truth.is_dir() else truth
     reference = read_coco(path, masks="segm" in kinds)
@@ -68,7 +82,7 @@ def assess(
 
 
 def _of_categories(truth: Coco, found: list[Entry], kinds: Sequence[Overlap], confidences: Sequence[float]) -> list[Score]:
-    """Scores of each category over all images; none where there is one category, as the total says the same."""
+    """Score each category over all images; nothing if there is only one."""
     if len(truth.categories) < 2:
         return []
     result = []
@@ -82,17 +96,17 @@ def _of_categories(truth: Coco, found: list[Entry], kinds: Sequence[Overlap], co
 
 
 def _check_pairs(truth: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]], where: str) -> None:
-    """Raise InputError where an image has so many annotations and detections that their overlaps take gigabytes."""
+    """Raise InputError if an image has so many annotations and detections that their overlaps take gigabytes."""
     annotated, detected = (Counter(each["image_id"] for each in entries) for entries in (truth, found))
     for image, count in detected.items():
         if count * annotated[image] > _MOST_PAIRS:
-            problem = f"has {count:,} detections in image {image}, where the truth has {annotated[image]:,} blocks"
-            allowed, remedy = f"{_MOST_PAIRS:,} pairs of both", "cut the image into tiles, or leave the lowest scores out"
+            problem = f"image {image} has {count:,} detections, and {annotated[image]:,} blocks in the truth"
+            allowed, remedy = f"{_MOST_PAIRS:,} pairs", "cut the image into tiles, or leave out the lowest scores"
             raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
 
 
 def as_text(assessment: Assessment) -> str:
-    """Tables in the form of the thesis's, one per group and overlap, and COCO's figures."""
+    """Return the scores as tables in the thesis's form, one for each group and overlap, and COCO's metrics."""
     lines = []
     groups: dict[tuple[str, Overlap], list[Score]] = {}
     for score in assessment.scores:
@@ -111,14 +125,14 @@ def as_text(assessment: Assessment) -> str:
             lines.append(f"{title:<12}" + "".join(_cell(getattr(score, name)) for score in scores))
         if kind == by_group[0][0][1] and not np.isnan(scores[0].stand_out):
             lines.append(f"blocks that stand out from the noise (S/N > {STANDS_OUT:g}): {100 * scores[0].stand_out:.1f} %")
-    lines += ["", *_what_scores_mean(assessment.reliability)]
+    lines += ["", *_reliability_table(assessment.reliability)]
     coco = "  ".join(f"{name} {value:.3f}" for name, value in assessment.coco.items() if value >= 0)
     return "\n".join([*lines[1:], "", f"COCO: {coco}"])
 
 
-def _what_scores_mean(groups: Sequence[Reliability]) -> Iterator[str]:
-    """The share of blocks among the detections of each class of scores, a line for each group."""
-    yield f"of detections with a score, how many are blocks ({_KINDS[groups[0].kind]} overlap by {OVERLAP:g})"
+def _reliability_table(groups: Sequence[Reliability]) -> Iterator[str]:
+    """Yield the lines of the reliability table: the share of blocks in each class of scores, one line for each group."""
+    yield f"share of blocks among the detections, by score ({_KINDS[groups[0].kind]}, IoU from {OVERLAP:g})"
     heads = [f"{low:g}-{high:g}" for low, high in pairwise(EDGES)]
     width = max(len(each.group) for each in groups) + 2
     yield " " * width + "".join(f"{head:>11}" for head in heads)
@@ -128,7 +142,7 @@ def _what_scores_mean(groups: Sequence[Reliability]) -> Iterator[str]:
 
 
 def write(assessment: Assessment, folder: Path) -> None:
-    """scores.json, scores.csv and reliability.png."""
+    """Write scores.json, scores.csv and reliability.png."""
     write_reliability(assessment.reliability, folder / "reliability.png")
     write_json(folder / "scores.json", assessment.to_dict())
     text = io.StringIO()
@@ -140,26 +154,29 @@ def write(assessment: Assessment, folder: Path) -> None:
 
 
 def _probability(value: float) -> str:
-    """With two decimals, or more where it has more."""
+    """Format a probability with two decimals, or more if it has more."""
     return max(f"{value:.2f}", f"{value:g}", key=len)
 
 
 def _cell(value: float) -> str:
+    """Format a share for a table."""
     return f"{'-':>9}" if np.isnan(value) else f"{100 * value:>7.1f} %"
 
 
 def _groups(images: Sequence[Mapping[str, Any]], keys: Sequence[str], where: str) -> dict[str, list[int]]:
+    """Group images by the values of keys; raise InputError for a key that images lack."""
     groups: dict[str, list[int]] = {"all": [image["id"] for image in images]}
     for key in keys:
         known = [name for name in sorted(set.intersection(*map(set, images))) if all(_is_word(image[name]) for image in images)]
         if key not in known:
-            problem = f"the images' '{key}' is no word or number" if any(key in image for image in images) else ""
+            problem = f"the images' '{key}' is not a word or number" if any(key in image for image in images) else ""
             problem = problem or f"the images have no '{key}'"
-            raise InputError(problem, where=where, allowed=", ".join(known), remedy=nearest(key, known) or "give another --by")
+            raise InputError(problem, where=where, allowed=", ".join(known), remedy=nearest(key, known) or "use another --by")
         for value in sorted({image[key] for image in images}, key=str):
             groups[f"{key} {value}"] = [image["id"] for image in images if image[key] == value]
     return groups
 
 
 def _is_word(value: Any) -> bool:
+    """Whether a value can name a group."""
     return isinstance(value, str | int | float | bool | None)

@@ -1,7 +1,7 @@
-"""Training with the whole data set in an accelerator's memory: windows are cut there, and the steps of an epoch are one call.
+"""Train with the whole data set in the memory of a graphics card: windows are cut there, and all steps of an epoch are one call.
 
-On JAX alone. A graphics card is done with a window before a processor has read and cut the next; here nothing but the losses
-leaves the card.
+It works with JAX only. A graphics card finishes a window before a processor has read and cut the next one; here, only the losses
+leave the card.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pipeline.detection.network.model import MaskRCNN, total_loss
 from scene.common.errors import InputError
 
 Array = Any
-"""Of JAX."""
+"""An array of JAX."""
 Batch = dict[str, Array]
 """As `data.Batch`, on the device."""
 
@@ -32,10 +32,15 @@ Batch = dict[str, Array]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ResidentSet:
-    """n tiles of one side s as the network takes them, on the device.
+    """n tiles of side s as the network takes them, on the device.
 
-    images: (n, s, s, c) float16; labels: (n, s, s) uint16, 1 + the index of a pixel's block, 0 for none; boxes: (n, g, 4) float32
-    y0, x0, y1, x1 px; valid: (n, g) 1 for a block, -1 for one left out of the loss, 0 for none; areas: (n, g) pixels of each.
+    Attributes
+    ----------
+    images : (n, s, s, c) float16.
+    labels : (n, s, s) uint16, 1 + the index of a pixel's block, 0 for none.
+    boxes : (n, g, 4) float32 y0, x0, y1, x1, px.
+    valid : (n, g) 1 for a block, -1 for one left out of the loss, 0 for an empty place.
+    areas : (n, g) pixels of each block.
     """
 
     images: Array
@@ -46,19 +51,28 @@ class ResidentSet:
 
     @property
     def tiles(self) -> int:
-        """How many."""
+        """Number of tiles."""
         return int(self.images.shape[0])
 
     @property
     def side_px(self) -> int:
-        """Of a tile."""
+        """Side of a tile, px."""
         return int(self.images.shape[1])
 
 
-def resident(folder: CocoFolder, detector: DetectorConfig, window_px: int) -> ResidentSet:
-    """All tiles of a folder; each is normalised as a whole, as detection does it.
+def load_resident_set(folder: CocoFolder, detector: DetectorConfig, window_px: int) -> ResidentSet:
+    """Load all tiles of a folder to the device; each is normalised as a whole, as in detection.
 
-    Raises InputError for tiles that are not squares of one size, of window_px or more.
+    Parameters
+    ----------
+    folder : The tiles.
+    detector : Settings of the network's input.
+    window_px : Side of the windows, px.
+
+    Raises
+    ------
+    InputError
+        If the tiles are not squares of one size, of `window_px` or more.
     """
 
     def read(index: int) -> tuple[NDArray[Any], ...]:
@@ -70,7 +84,7 @@ def resident(folder: CocoFolder, detector: DetectorConfig, window_px: int) -> Re
     shapes = sorted({(image["height"], image["width"]) for image in folder.images})
     if len(shapes) != 1 or shapes[0][0] != shapes[0][1] or shapes[0][0] < window_px:
         raise InputError(
-            "has images of " + ", ".join(f"{height} x {width}" for height, width in shapes[:5]) + " px",
+            "the images have " + ", ".join(f"{height} x {width}" for height, width in shapes[:5]) + " px",
             where=str(folder.folder),
             allowed=f"squares of one size, {window_px} px or more, with training.data=resident",
             remedy="make the set with tiles.size_px, or train with training.data=streamed",
@@ -80,10 +94,17 @@ def resident(folder: CocoFolder, detector: DetectorConfig, window_px: int) -> Re
         return ResidentSet(*(jnp.asarray(np.stack(column)) for column in columns))
 
 
-def cut(data: ResidentSet, tile: Array, corner: Array, size: int) -> Batch:
-    """The window of that side whose first pixel is the corner (2,), row and column, of one tile: `data.window` on the device.
+def cut_on_device(data: ResidentSet, tile: Array, corner: Array, size: int) -> Batch:
+    """Cut a window out of a tile, as `data.cut_window` does, on the device.
 
-    Of a block that is cut through, the part inside counts where it is at least half of it; lesser parts are background.
+    A block that the window cuts is kept if at least half of it is inside, and is background otherwise.
+
+    Parameters
+    ----------
+    data : The tiles.
+    tile : Index of the tile.
+    corner : (2,) row and column of the window's first pixel.
+    size : Side of the window, px.
     """
     at = (tile, corner[0], corner[1])
     image = jax.lax.dynamic_slice(data.images, (*at, 0), (1, size, size, data.images.shape[3]))[0]
@@ -101,8 +122,8 @@ def cut(data: ResidentSet, tile: Array, corner: Array, size: int) -> Batch:
     }
 
 
-def turned(window: Batch, axis: int) -> Batch:
-    """Up and down (axis 0) or left and right (1) exchanged: `data.mirrored` on the device."""
+def mirrored_window(window: Batch, axis: int) -> Batch:
+    """Mirror a window up-down (axis 0) or left-right (axis 1), as `data.mirrored` does, on the device."""
     size = window["labels"].shape[0]
     low, high = window["boxes"][:, axis], window["boxes"][:, axis + 2]
     boxes = window["boxes"].at[:, axis].set(size - high).at[:, axis + 2].set(size - low)
@@ -115,13 +136,19 @@ def turned(window: Batch, axis: int) -> Batch:
 
 
 class ResidentLearner:
-    """Epochs of a model on data sets in the device's memory.
+    """Trains and validates a model on data in the device's memory.
 
-    What is drawn depends on the training's seed and the epoch alone; all else is in the model's and its optimizer's variables.
+    Random choices depend on the training's seed and the epoch only; all other state is in the variables of model and optimizer.
+
+    Parameters
+    ----------
+    model : A compiled and built model.
+    learning, judging : Tiles for training and for validation.
+    training : Settings of the training.
     """
 
     def __init__(self, model: MaskRCNN, learning: ResidentSet, judging: ResidentSet, training: TrainingConfig) -> None:
-        """model: compiled and built."""
+        """Compile the functions of an epoch; see the class."""
         self._model, self._learning, self._judging, self._training = model, learning, judging, training
         optimizer = model.optimizer
         self._rate = next(n for n, variable in enumerate(optimizer.variables) if variable is optimizer.learning_rate)
@@ -129,7 +156,7 @@ class ResidentLearner:
         self._judged: Callable[..., Any] = jax.jit(self._losses_of_middles)
 
     def learn(self, epoch: int, rates: Sequence[float]) -> list[dict[str, float]]:
-        """One step for each learning rate; returns its mean losses."""
+        """Make one step for each learning rate, and return the mean losses."""
         groups = self._variables()
         state = tuple([variable.value for variable in group] for group in groups)
         key = jax.random.fold_in(jax.random.key(self._training.seed), epoch)
@@ -140,7 +167,9 @@ class ResidentLearner:
         return [{name: float(np.mean(np.asarray(values))) for name, values in losses.items()}]
 
     def validate(self) -> list[dict[str, float]]:
-        """Losses of the middles of all tiles, batch by batch; the last is filled up with its own first tiles."""
+        """Return the losses in the middles of all validation tiles, batch by batch; the last batch is filled with its own first
+        tiles.
+        """
         count, size = self._judging.tiles, self._training.batch
         weights, others, _ = ([variable.value for variable in group] for group in self._variables())
         found = []
@@ -150,16 +179,19 @@ class ResidentLearner:
         return found
 
     def _variables(self) -> tuple[list[Any], list[Any], list[Any]]:
+        """Return trainable, other and optimizer variables."""
         model = self._model
         return model.trainable_variables, model.non_trainable_variables, model.optimizer.variables
 
     def _steps(self, state: Any, data: ResidentSet, key: Array, rates: Array) -> Any:
+        """Make all steps of an epoch, on random windows of all tiles."""
         size = self._training.batch
         order, places = jax.random.split(key)
         tiles = jnp.resize(jax.random.permutation(order, data.tiles), (len(rates), size))
         return jax.lax.scan(partial(self._step, data), state, (tiles, jax.random.split(places, len(rates)), rates))
 
     def _step(self, data: ResidentSet, state: Any, drawn: Any) -> Any:
+        """Make one training step."""
         (weights, others, optimizer), (tiles, key, rate) = state, drawn
         batch = jax.vmap(partial(self._window, data))(jax.random.split(key, len(tiles)), tiles)
         (_, (others, losses)), slopes = jax.value_and_grad(self._loss, has_aux=True)(weights, others, batch)
@@ -168,19 +200,22 @@ class ResidentLearner:
         return (list(weights), list(others), list(optimizer)), losses
 
     def _window(self, data: ResidentSet, key: Array, tile: Array) -> Batch:
+        """Cut a random window, mirrored at random."""
         place, turn = jax.random.split(key)
         corner = jax.random.randint(place, (2,), 0, data.side_px - self._model.size + 1)
-        found = cut(data, tile, corner, self._model.size)
+        found = cut_on_device(data, tile, corner, self._model.size)
         axes: Axes = MIRRORED[self._training.flips]
         for axis, chosen in zip(axes, jax.random.bernoulli(turn, 0.5, (len(axes),)), strict=True):
-            found = jax.tree.map(partial(jnp.where, chosen), turned(found, axis), found)
+            found = jax.tree.map(partial(jnp.where, chosen), mirrored_window(found, axis), found)
         return found
 
     def _loss(self, weights: Any, others: Any, batch: Batch, learning: bool = True) -> Any:
+        """Return the total loss, and the losses with the model's other variables."""
         losses, others = self._model.stateless_call(weights, others, batch, training=learning)
         return total_loss(losses, self._training.loss_weights), (others, losses)
 
     def _losses_of_middles(self, weights: Any, others: Any, data: ResidentSet, tiles: Array) -> Any:
+        """Return the losses in the middles of tiles."""
         middle = jnp.full(2, (data.side_px - self._model.size) // 2)
-        batch = jax.vmap(lambda tile: cut(data, tile, middle, self._model.size))(tiles)
+        batch = jax.vmap(lambda tile: cut_on_device(data, tile, middle, self._model.size))(tiles)
         return self._loss(weights, others, batch, learning=False)[1][1]

@@ -1,4 +1,7 @@
-"""Who is compared: sensors out of configs, runs, bundled presets and model files, all in front of the first one's wall."""
+"""Read which sensors to compare: from configs, runs, bundled presets and sensor model files.
+
+All are placed in front of the first one's wall.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +20,19 @@ from scene.common.config import load_yaml, parse
 from scene.common.errors import InputError, nearest
 
 Given = str | tuple[str, SimulationConfig]
-"""What is compared: a name, or a config with the word that it goes by."""
+"""Something to compare: the name of a file or preset, or a config with the name to call it by."""
 Overrides = Sequence[str | Override]
 _SCENE = ("seed", "wall", "rockfall", "wetness", "texture", "illumination", "difference")
-"""What all share: taken from the first."""
+"""Config sections that all sensors take from the first."""
 _LONGEST_NAME = 60
+"""Longest name taken from a file name, characters."""
 _KINDS = ("", "sites", "scanners", "noise")
 """Subfolders of configs/ whose files can be named."""
 
 
 @dataclass(frozen=True)
-class Contestant:
-    """A sensor with all that goes with it: its config's wall and blocks are everybody's."""
+class SensorSetup:
+    """One sensor of a comparison, with its config. The sections that describe wall and blocks are the same for all."""
 
     name: str
     sensor: SensorName
@@ -36,23 +40,32 @@ class Contestant:
 
     @property
     def angular_step_rad(self) -> tuple[float, float] | None:
-        """Of a laser scanner, in azimuth and in zenith; None for cameras."""
+        """Steps of a laser scanner in azimuth and in zenith angle, rad; None for cameras."""
         scanner = self.config.scanner
         return (scanner.azimuth_step_rad, scanner.zenith_step_rad) if self.sensor == "tls" else None
 
 
-def contestants(
+def sensor_setups(
     names: Sequence[Given], overrides: Overrides = (), seed: int | None = None, *, own_step: bool = False
-) -> list[Contestant]:
-    """The sensors that `names` stand for, in their order; a config with both sensors gives two.
+) -> list[SensorSetup]:
+    """Read the sensors of a comparison, in their order; a config with both sensors gives two.
 
-    A name is a config with the word that it goes by, to which overrides and seed are applied already, a config file,
-    a run's folder or its run.json, a sensor model's file (sensor: tls ...), or a bundled name: a site, a scanner preset
-    (riegl_vz400i) or a noise model (glendale_high). Presets and models go into the first config's set-up, into the demo's
-    where they are first themselves. Scanner presets scan with that config's angular step, so that the instruments are
-    compared and not the time that they are given; own_step: with the preset's own, or the default's where it has none.
-    overrides: `--set` of every config. Raises InputError for an unknown name, with the nearest one, for one that is given twice,
-    and for whatever is wrong in a file.
+    A name is a config file, a run's folder or its run.json, the file of a sensor model, or a bundled name: a site, a scanner
+    preset (riegl_vz400i) or a noise model (glendale_high). Presets and models are put into the first config, or into the demo's
+    config if there is none. Scanner presets use that config's angular step, so that the comparison is of instruments and not of
+    scan times.
+
+    Parameters
+    ----------
+    names : Names, or configs with a name, to which overrides and seed are already applied.
+    overrides : `--set` options, applied to every config.
+    seed : Seed that replaces those of the configs.
+    own_step : Whether scanner presets use their own angular step instead (or the default, if they have none).
+
+    Raises
+    ------
+    InputError
+        If a name is unknown or given twice, or a file is wrong.
     """
     _check_given_once(names)
     first = next((name for name in names if not _is_part(name)), str(bundled_config("", "demo")))
@@ -68,22 +81,24 @@ def contestants(
 
 
 def _check_given_once(names: Sequence[Given]) -> None:
-    """A sensor beside itself says nothing: the same epochs, to the byte."""
+    """Raise InputError for a sensor that is given twice: it would give the same epochs."""
     given: dict[str, str] = {}
     for name in names:
         if not isinstance(name, str):
             continue
         path = Path(name) / "run.json" if Path(name).is_dir() else Path(name)
-        file = os.path.realpath(path if path.exists() or is_path(name) else _bundled(name))  # Path.resolve raises at a loop
+        file = os.path.realpath(
+            path if path.exists() or is_path(name) else _bundled(name)
+        )  # Path.resolve raises at a loop of links
         if file in given:
             as_what = "" if given[file] == name else f", as {given[file]} and as {name}"
-            remedy = "name each sensor once; a copy of the file under another name can have other settings"
-            raise InputError(f"is given twice{as_what}", where=name, remedy=remedy)
+            remedy = "name each sensor once; to vary its settings, copy the file"
+            raise InputError(f"the sensor is given twice{as_what}", where=name, remedy=remedy)
         given[file] = name
 
 
 def _is_part(name: Given) -> TypeGuard[str]:
-    """Whether a name stands for a scanner or a model alone, that needs a config around it."""
+    """Whether a name stands for a scanner or a sensor model only, which needs a config around it."""
     if not isinstance(name, str):
         return False
     if Path(name).is_dir():
@@ -95,29 +110,30 @@ def _is_part(name: Given) -> TypeGuard[str]:
 
 
 def _bundled(name: str) -> Path:
+    """Return the path of a bundled config."""
     return bundled_config(_kind(name), name)
 
 
 def _kind(name: str) -> str:
-    """The kind of bundled config that has this name; raises InputError with the nearest one where none has."""
+    """Return the kind of bundled config that has this name; raise InputError with the nearest name if none has."""
     named = {kind: named_configs(kind) for kind in _KINDS}
     kind = next((kind for kind, found in named.items() if name in found), None)
     if kind is None:
         known = sorted(each for found in named.values() for each in found)
         hint = nearest(name, known)
-        raise InputError(f"there is no file and no preset '{name}'", where="CONFIG", allowed=", ".join(known), remedy=hint)
+        raise InputError(f"no file or preset is called '{name}'", where="CONFIG", allowed=", ".join(known), remedy=hint)
     return kind
 
 
-def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[Contestant]:
-    """The sensors of a config, a config file, a run or a bundled config."""
+def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[SensorSetup]:
+    """Return the sensors of a config, a config file, a run or a bundled config."""
     if not isinstance(name, str):
         return _each_sensor(*name, name[1].sensor_names())
     path = Path(name)
     if path.is_dir():
         path = path / RUN_FILE
         if not path.exists():
-            raise InputError(f"holds no {RUN_FILE}", where=name, remedy="name a run's folder or a config file")
+            raise InputError(f"the folder contains no {RUN_FILE}", where=name, remedy="name a run's folder or a config file")
         read_run(path, "name a config file")
     elif not path.is_file() and not is_path(name):
         path = _bundled(name)
@@ -130,12 +146,13 @@ def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[Contesta
     return _each_sensor(stem, config, sensors)
 
 
-def _each_sensor(name: str, config: SimulationConfig, sensors: Sequence[SensorName]) -> list[Contestant]:
-    return [Contestant(f"{name}_{sensor}" if len(sensors) > 1 else name, sensor, config) for sensor in sensors]
+def _each_sensor(name: str, config: SimulationConfig, sensors: Sequence[SensorName]) -> list[SensorSetup]:
+    """Return one entry for each sensor of a config."""
+    return [SensorSetup(f"{name}_{sensor}" if len(sensors) > 1 else name, sensor, config) for sensor in sensors]
 
 
-def _part(name: str, base: SimulationConfig, *, own_step: bool) -> list[Contestant]:
-    """A scanner preset, with or without its own angular step, or a sensor model in the set-up of `base`."""
+def _part(name: str, base: SimulationConfig, *, own_step: bool) -> list[SensorSetup]:
+    """Put a scanner preset, with or without its own angular step, or a sensor model into the config `base`."""
     is_file = Path(name).is_file()
     path = Path(name) if is_file else _bundled(name)
     values: dict[str, Any] = base.model_dump(mode="json")
@@ -144,11 +161,11 @@ def _part(name: str, base: SimulationConfig, *, own_step: bool) -> list[Contesta
         config = parse(SimulationConfig, values | {"scanner": {"preset": str(path), **step}, "sensor": []}, name)
     else:
         config = parse(SimulationConfig, values | {"sensor": [load_yaml(path)]}, name)
-    return [Contestant(path.stem if is_file else name, config.sensor[0].sensor, config)]
+    return [SensorSetup(path.stem if is_file else name, config.sensor[0].sensor, config)]
 
 
-def _with_own_names(found: Sequence[Contestant]) -> Iterator[Contestant]:
-    """The same with names that differ, so that each has files of its own."""
+def _with_own_names(found: Sequence[SensorSetup]) -> Iterator[SensorSetup]:
+    """Make the names unique, so that each sensor has its own files."""
     used: set[str] = set()
     for each in found:
         kind = [] if each.name.endswith(each.sensor) else [f"{each.name}_{each.sensor}"]

@@ -1,13 +1,14 @@
-"""Noise maps in windows of a wall, fast: the sensor's own code traces only the cells that the windows and the registration need.
+"""Simulate difference maps of noise in windows of the wall only, so that one takes a fraction of a second.
 
-A whole epoch of the Glendale site traces two million cells, meshes them and looks at five million pixels, to compare a hundred
-thousand of them. Here the wall is seen once without noise, which tells the cells that surround each window; an observation then
-is the sensor's own (`sensors.stereo.stereo_pair`, `sensors.laser.tls`: all noise, effects, rectification, occlusion) of these
-cells and of a sparse lattice over the whole view, by which it is registered; meshing and rasters are the pipeline's own.
+A whole epoch of the Glendale site traces two million cells of the sensor, although the comparison needs only a hundred thousand
+pixels. Here the wall is first observed without noise to find the cells that surround each window. Each noisy observation then
+traces only these cells, and a sparse lattice of cells over the whole view for the registration. It uses the sensor's own code
+(`sensors.stereo.stereo_pair`, `sensors.laser.tls`), so noise, effects, rectification and occlusion are complete; meshing and
+rasters are those of the pipeline.
 
-Against the whole simulation (`pipeline.calibration.maps`) one thing differs: both epochs are registered to the wall as it is
-instead of the later to the noisy earlier one, from some thousand points instead of all. tests/pipeline/test_calibrate.py
-compares the two.
+It differs from the whole simulation (`pipeline.calibration.noise_map`) in one way: both epochs are registered to the noiseless
+wall from a few thousand points, instead of the later to the noisy earlier one from all points.
+tests/pipeline/test_calibrate.py compares the two.
 """
 
 from __future__ import annotations
@@ -40,26 +41,44 @@ from sensors.stereo.stereo_pair import StereoPair
 from sensors.subset import effects_needing_neighbours, restrict_to
 
 _LATTICE_POINTS = 4000
-"""Points by which an observation is registered: more of them would not bring it nearer to a registration by all."""
+"""Points used to register an observation; with more, the result is no nearer to a registration by all points."""
 _MARGIN_CELLS = 3
 _MARGIN_M = 0.05
-"""Around a window, so that it stays covered when noise moves the cells."""
+"""Margin around a window, in cells and in m, so that the window stays covered when noise moves the points."""
 
 
 @dataclass(frozen=True)
 class _Patch:
-    """The block of cells around a window: where it begins in the flat list of cells, and its rows and columns."""
+    """The block of sensor cells around one window.
+
+    start is its place in the flat list of cells; shape gives its rows and columns.
+    """
 
     start: int
     shape: tuple[int, int]
 
 
-class Reobserver:
-    """Simulates difference maps of noise alone in windows.
+class WindowSimulator:
+    """Simulates difference maps of noise alone in windows of the wall.
 
-    config, site: as a simulation takes them; windows: on the grid of the measured maps; of_points: these are of points;
-    reference_error: of the surface that the points are compared with. Raises InputError for what cannot be simulated cell by
-    cell.
+    Parameters
+    ----------
+    config, site : As for a whole simulation.
+    windows : Windows on the grid of the measured maps.
+    of_points : Whether a pixel is the mean distance of its points from the wall; otherwise two surfaces are compared.
+    reference_error : Error of the surface that the points are compared with.
+
+    Attributes
+    ----------
+    observations : Number of observations simulated so far.
+    cells : Flat indices of the sensor cells that each observation traces.
+    caster : The wall, for ray casting.
+    silent : The sensor model with its effects but without noise.
+
+    Raises
+    ------
+    InputError
+        If the sensor cannot be simulated cell by cell.
     """
 
     def __init__(
@@ -71,13 +90,13 @@ class Reobserver:
         of_points: bool = False,
         reference_error: ReferenceError | None = None,
     ) -> None:
-        self.sensor = _checked(config, site)
+        self.sensor = _supported_sensor(config, site)
         self.config, self.site, self.windows, self.of_points = config, site, windows, of_points
         self.reference_error = reference_error
         self.caster = RayCaster(site.mesh)
-        self.silent = _silent(self.sensor.model)
+        self.noiseless_model = _without_noise(self.sensor.model)
         self.observations = 0
-        whole = _asked(self.sensor, self.silent).observe(self.caster, KeyedRandom(0))
+        whole = _sensor_for_cells(self.sensor, self.noiseless_model).observe(self.caster, KeyedRandom(0))
         self._viewpoint = whole.viewpoint
         self._patches, patch_cells = self._surround(whole)
         lattice = _lattice(whole)
@@ -87,12 +106,25 @@ class Reobserver:
 
     @cached_property
     def target(self) -> ReferenceSurface:
-        """The wall as it is, to register to."""
+        """The noiseless wall, which observations are registered to."""
         return ReferenceSurface.build(self.site.mesh.vertices, self.site.mesh.vertex_normals())
 
     def maps(self, model: Model, epochs: int, random: KeyedRandom) -> FloatArray:
-        """(epochs, k, n, n) differences, m, in the windows; NaN where not stable: of a noisy reference and later epochs, or of
-        points, to the wall as it is known: with the same error in all epochs."""
+        """Simulate difference maps in the windows.
+
+        Each map subtracts a later epoch from the same noisy reference epoch. Maps of points instead measure the distance to the
+        known wall; the simulated error of that wall is then the same in all epochs.
+
+        Parameters
+        ----------
+        model : Sensor model to simulate.
+        epochs : Number of maps.
+        random : Source of the random numbers.
+
+        Returns
+        -------
+        (epochs, k, n, n) differences, m; NaN outside stable ground.
+        """
         sources = [random.child("epoch", number) for number in range(1, epochs + 1)]
         if self.of_points:
             return np.stack([self._of_points(model, source, random.child("reference")) for source in sources])
@@ -101,7 +133,7 @@ class Reobserver:
         return np.where(self.windows.stable, reference - np.stack(later), np.nan)
 
     def _of_points(self, model: Model, random: KeyedRandom, reference: KeyedRandom) -> FloatArray:
-        """(k, n, n) mean differences of the points of each pixel to the wall as it is known, m."""
+        """Return the (k, n, n) mean distances, m, of each pixel's points from the known wall."""
         points = self._registered(model, random)[: self._lattice_start]
         if self.reference_error is not None:
             points = self.reference_error.moved(points, self.caster, reference)
@@ -109,11 +141,11 @@ class Reobserver:
         return self.windows.cut(values)
 
     def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """(k, n, n) heights, m, of one noisy observation's surface after registration, NaN where it has none."""
+        """Return the (k, n, n) heights, m, of one noisy observation's surface after registration; NaN without data."""
         return self._raster(self._surface(self._registered(model, random)))
 
     def _registered(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """(cells, 3) points of one observation, m, registered where the config has ICP."""
+        """Return the (cells, 3) points of one observation, m, registered if the config has ICP."""
         self.observations += 1
         points = self._observe(model, random)
         if self.config.icp is None:
@@ -121,16 +153,19 @@ class Reobserver:
         return self._registration(points, self.config.icp, random.child("register")).apply(points)
 
     @cached_property
-    def silent_heights(self) -> FloatArray:
+    def noiseless_heights(self) -> FloatArray:
         """(k, n, n) heights, m, of the surface that the sensor would give without noise."""
-        return self._raster(self._surface(self._observe(self.silent, KeyedRandom(0))))
+        return self._raster(self._surface(self._observe(self.noiseless_model, KeyedRandom(0))))
 
     def _observe(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """(cells, 3) points, m."""
-        return _asked(self.sensor, model, self.cells).observe(self.caster, random).points.reshape(-1, 3)
+        """Return the (cells, 3) points of one observation, wall frame, m."""
+        return _sensor_for_cells(self.sensor, model, self.cells).observe(self.caster, random).points.reshape(-1, 3)
 
     def _registration(self, points: FloatArray, icp: IcpConfig, random: KeyedRandom) -> RigidTransform:
-        """ICP to the wall as it is, from where the lattice's own points, which are known without noise, bring it."""
+        """Register the points to the noiseless wall by ICP.
+
+        The start is the rigid motion that brings the lattice's points to their known noiseless positions.
+        """
         lattice = points[self._lattice_start :]
         known = ~np.isnan(lattice[:, 0])
         first = _best_rigid(lattice[known], self._lattice_points[known])
@@ -138,7 +173,7 @@ class Reobserver:
         return register_to(self.target, first.apply(lattice[known]), config, random, threads=1).transform.after(first)
 
     def _surface(self, points: FloatArray) -> TriangleMesh:
-        """The patches as one mesh."""
+        """Mesh all patches and join them."""
         vertices, faces, count = [], [], 0
         for patch in self._patches:
             rows, columns = patch.shape
@@ -152,7 +187,7 @@ class Reobserver:
         return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
 
     def _raster(self, mesh: TriangleMesh) -> FloatArray:
-        """(k, n, n) heights of a mesh at the pixels' centres, m."""
+        """Return the (k, n, n) heights of a mesh at the centres of the windows' pixels, m."""
         x, y = self.windows.places()
         top = float(mesh.bounds[1, 2]) + 1.0
         origin = np.stack([x.ravel(), y.ravel(), np.full(x.size, top)], axis=1)
@@ -160,7 +195,7 @@ class Reobserver:
         return (top - distance).reshape(x.shape)
 
     def _surround(self, whole: Observation) -> tuple[list[_Patch], NDArray[np.int64]]:
-        """The cells around each window, as the noiseless observation shows them."""
+        """Find the cells around each window in the noiseless observation."""
         grid, side = self.windows.grid, self.windows.side * self.windows.grid.gsd
         x, y = whole.points[..., 0], whole.points[..., 1]
         patches, numbers, start = [], [], 0
@@ -170,7 +205,7 @@ class Reobserver:
             rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
             if len(rows) == 0:
                 raise InputError(
-                    "a window of the measured maps is not seen by the sensor", where="cameras, station", remedy="check the site"
+                    "the sensor does not see a window of the measured maps", where="cameras, station", remedy="check the site"
                 )
             span = [
                 slice(max(int(place[0]) - _MARGIN_CELLS, 0), min(int(place[-1]) + _MARGIN_CELLS + 1, size))
@@ -184,7 +219,7 @@ class Reobserver:
 
 
 def _best_rigid(points: FloatArray, goals: FloatArray) -> RigidTransform:
-    """The rotation and shift of (n, 3) points that bring them nearest to their (n, 3) goals (Kabsch 1976)."""
+    """Return the rigid motion of (n, 3) points that fits them to their (n, 3) goals by least squares (Kabsch 1976)."""
     middle, goal = points.mean(axis=0), goals.mean(axis=0)
     u, _, v = np.linalg.svd((points - middle).T @ (goals - goal))
     turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
@@ -193,44 +228,42 @@ def _best_rigid(points: FloatArray, goals: FloatArray) -> RigidTransform:
 
 
 def _lattice(whole: Observation) -> NDArray[np.int64]:
-    """Numbers of cells in equal steps over the view that have a point."""
+    """Return the flat indices of cells at equal steps over the view, where they have a point."""
     step = max(int(np.sqrt(np.count_nonzero(whole.valid) / _LATTICE_POINTS)), 1)
     number = np.arange(whole.depth.size).reshape(whole.depth.shape)[::step, ::step]
     return number[whole.valid[::step, ::step]]
 
 
-def _silent(model: Model) -> Model:
-    """The model's effects without its noise."""
+def _without_noise(model: Model) -> Model:
+    """Return the model with its effects but without its noise."""
     zero = {name: 0.0 for name in type(model.noise).model_fields if "sigma" in name or "ppm" in name}
     if isinstance(model, StereoModel):
         return StereoModel(noise=type(model.noise)(**zero), effects=model.effects)
     return TlsModel(noise=type(model.noise)(**zero), effects=model.effects)
 
 
-def _asked(sensor: StereoPair | LaserScanner, model: Model, cells: NDArray[np.uint32] | None = None) -> Any:
-    """The sensor with another model, asked for all its cells or for some."""
+def _sensor_for_cells(sensor: StereoPair | LaserScanner, model: Model, cells: NDArray[np.uint32] | None = None) -> Any:
+    """Return the sensor with another model, restricted to some cells if `cells` is given."""
     asked = replace(sensor, model=model, truth=False)  # type: ignore[arg-type]
     return asked if cells is None else restrict_to(asked, cells)
 
 
-def _checked(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
-    """The sensor, if it can be asked for single cells."""
+def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
+    """Return the sensor, or raise InputError if it cannot be simulated cell by cell."""
     if not isinstance(site.sensor, StereoPair | LaserScanner):
-        raise InputError("the noise of real matching is its own", where="matcher", allowed="simulated")
+        raise InputError("noise parameters need simulated matching", where="matcher", allowed="simulated")
     if site.further_stations:
-        raise InputError(
-            "maps of several stations are not calibrated", where="station", remedy="give the station of the maps alone"
-        )
+        raise InputError("cannot calibrate with several stations", where="station", remedy="keep only the station of the maps")
     if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
         raise InputError(
-            "windows are reconstructed from the sensor's own grid",
+            "calibration reconstructs the surface from the sensor's own grid",
             where="reconstruction, surface",
             allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
         )
     if names := effects_needing_neighbours(site.sensor.model):
         raise InputError(
-            f"{', '.join(names)}: looks at the whole picture or scan, and only windows of it are simulated",
+            f"{', '.join(names)}: needs the whole picture or scan, but calibration simulates only windows of it",
             where="sensor.effects",
-            remedy="leave it out of the model to be calibrated",
+            remedy="remove it from the model",
         )
     return site.sensor

@@ -1,17 +1,17 @@
-"""What is compared of measured and simulated noise: a vector of statistics of size and of pattern.
+"""Compute the summary statistics by which measured and simulated noise are compared: size and spatial pattern.
 
-All statistics are logarithms of lengths, m, pooled over the epochs, so that a calibration compares ratios. In windows k of maps
-e, m_ek is the median of a window and r = d - m_ek what is left:
+All statistics are logarithms of lengths, m, pooled over the epochs, so that a calibration compares ratios. For windows k of maps
+e, m_ek is the median of a window and r = d - m_ek its residuals:
 
-    size         StD, NMAD and half the width between the quantiles 2.5 and 97.5 % of r: the marginal distribution
-    variogram    sqrt(gamma(h)) of r at distances h along rows and columns, by Cressie and Hawkins (1980), which steps disturb
-                 little: gamma = (mean |r - r'|^(1/2))^4 / (2 (0.457 + 0.494/N))
+    size         StD, NMAD and half the width between the 2.5 % and 97.5 % quantiles of r: the marginal distribution
+    variogram    sqrt(gamma(h)) of r at distances h along rows and columns, by Cressie and Hawkins (1980), which is robust to
+                 steps: gamma = (mean |r - r'|^(1/2))^4 / (2 (0.457 + 0.494/N))
     deformation  RMS of m_ek in polynomials of degree 2 (bending) and 3 (twisting) over the wall, orthonormal on the windows'
-                 middles, and the RMS of the rest; a plane, which is registration's business, is left out
+                 centres, and the RMS of the rest; planes are left out, as registration removes them
     edges        StD and NMAD of r where the surface is steep (the steepest tenth of the pixels), StD elsewhere
-    incidence    NMAD of r in thirds of the pixels by slope against the sensor's line of sight, of the pixels that are not steep
+    incidence    NMAD of r in thirds of the remaining pixels, by incidence angle of the line of sight
 
-Large-scale modes have few draws (one per epoch), the rest has many; the covariance of the statistics over simulations says so.
+A large-scale mode has only one draw per epoch, the other statistics have many; the covariance over simulations accounts for that.
 """
 
 from __future__ import annotations
@@ -27,16 +27,25 @@ from pipeline.change.robust import nmad
 from scene.geometry.mesh import FloatArray
 
 _LAGS_PX = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+"""Distances of the variogram, pixels."""
 _STEEP = 0.9
+"""Quantile of the slope from which a pixel counts as steep."""
 _FLOOR_M = 1e-6
-"""Added to every length, so that a silent model has a logarithm."""
+"""Added to every length, so that a noiseless model has finite logarithms."""
 _LEAST_IN_CLASS = 10
+"""Values that a NMAD needs."""
 
 
 @dataclass(frozen=True)
-class Signature:
-    """How maps in windows become statistics. heights: (k, n, n), m, of the surface without noise; sight: (3,) unit vector
-    from the wall to the sensor, wall frame."""
+class SummaryStatistics:
+    """Computes the summary statistics of difference maps in windows.
+
+    Attributes
+    ----------
+    windows : The windows.
+    heights : (k, n, n) heights of the surface without noise, m.
+    sight : (3,) unit vector from the wall to the sensor, wall frame.
+    """
 
     windows: Windows
     heights: FloatArray
@@ -44,7 +53,7 @@ class Signature:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """One per statistic, as group.statistic."""
+        """Names of the statistics, as group.statistic."""
         return (
             "size.std", "size.nmad", "size.quantiles",
             *(f"variogram.{lag}px" for lag in self.lags),
@@ -53,8 +62,8 @@ class Signature:
             *("incidence.facing", "incidence.between", "incidence.oblique"),
         )  # fmt: skip
 
-    def of(self, maps: FloatArray) -> FloatArray:
-        """The statistics of (e, k, n, n) maps, m, NaN where they are not known."""
+    def compute(self, maps: FloatArray) -> FloatArray:
+        """Return the (m,) statistics of (e, k, n, n) difference maps, m, NaN where unknown."""
         middle = np.nanmedian(maps, axis=(2, 3))
         rest = maps - middle[..., None, None]
         lengths = [
@@ -68,19 +77,21 @@ class Signature:
 
     @cached_property
     def lags(self) -> tuple[int, ...]:
-        """Distances of the variogram, pixels: up to three quarters of a window."""
+        """Distances of the variogram, pixels, up to three quarters of a window."""
         return tuple(lag for lag in _LAGS_PX if lag <= 0.75 * self.windows.side)
 
     def _size(self, rest: FloatArray) -> list[float]:
+        """Return StD, NMAD and half the width of the central 95 %."""
         known = rest[~np.isnan(rest)]
         low, high = np.quantile(known, [0.025, 0.975])
         return [float(known.std()), _spread(known), float(high - low) / 2]
 
     def _variogram(self, rest: FloatArray) -> list[float]:
+        """Return the root of the semivariance at each distance."""
         return [_root_semivariance(rest, lag) for lag in self.lags]
 
     def _deformation(self, middle: FloatArray) -> list[float]:
-        """RMS of each mode over windows and epochs but the plane's, and of the rest. middle: (e, k)."""
+        """Return the RMS of each polynomial mode of the (e, k) medians, without the plane, and of the rest."""
         known = np.where(np.isnan(middle), np.nanmedian(middle, axis=1, keepdims=True), middle)
         found, left = [], known
         for _, basis in self._modes:
@@ -91,7 +102,10 @@ class Signature:
 
     @cached_property
     def _modes(self) -> tuple[tuple[str, FloatArray], ...]:
-        """(k, j) orthonormal polynomials by degree; fewer degrees where there are few windows, none for fewer than six."""
+        """Orthonormal polynomials of the windows' centres: for each degree its name and (k, j) columns.
+
+        A degree is left out if there are fewer than two windows for each coefficient.
+        """
         centre = self.windows.centres()
         x, y = ((centre - centre.mean(axis=0)) / np.maximum(np.ptp(centre, axis=0), 1e-9)).T
         degrees = ("plane", 0, 1), ("bend", 2, 2), ("twist", 3, 3)
@@ -108,28 +122,31 @@ class Signature:
         return tuple((degrees[place][0], orthonormal[:, begin[place] : begin[place + 1]]) for place in used)
 
     def _edges(self, rest: FloatArray) -> list[float]:
+        """Return StD and NMAD on steep ground, and StD elsewhere."""
         steep, other = rest[:, self._steep], rest[:, ~self._steep]
         steep, other = steep[~np.isnan(steep)], other[~np.isnan(other)]
         return [float(steep.std()), _spread(steep), float(other.std())]
 
     def _incidence(self, rest: FloatArray) -> list[float]:
+        """Return the NMAD of each class of incidence angle."""
         values = (rest[:, self._incidence_class == number] for number in range(3))
         return [_spread(part[~np.isnan(part)]) for part in values]
 
     @cached_property
     def _gradient(self) -> tuple[FloatArray, FloatArray]:
-        """dz/dx, dz/dy of the surface without noise, (k, n, n), 0 where it is not known."""
+        """dz/dx and dz/dy of the surface without noise, (k, n, n) each; 0 where unknown."""
         down, right = (np.gradient(self.heights, self.windows.grid.gsd, axis=axis) for axis in (1, 2))
         return np.nan_to_num(right), -np.nan_to_num(down)
 
     @cached_property
     def _steep(self) -> NDArray[np.bool_]:
+        """(k, n, n) mask of the steepest tenth of the stable pixels."""
         slope = np.hypot(*self._gradient)
         return slope > np.quantile(slope[self.windows.stable], _STEEP)
 
     @cached_property
     def _incidence_class(self) -> NDArray[np.int8]:
-        """(k, n, n) third by angle of incidence, 0 the most facing; -1 where steep."""
+        """(k, n, n) third by incidence angle, 0 the smallest angles; -1 where steep or not stable."""
         right, up = self._gradient
         cosine = (self.sight[2] - right * self.sight[0] - up * self.sight[1]) / np.sqrt(1 + right**2 + up**2)
         used = ~self._steep & self.windows.stable
@@ -138,12 +155,12 @@ class Signature:
 
 
 def _spread(values: FloatArray) -> float:
-    """NMAD; 0 for too few values."""
+    """Return the NMAD; 0 for too few values."""
     return nmad(values) if values.size >= _LEAST_IN_CLASS else 0.0
 
 
 def _root_semivariance(rest: FloatArray, lag: int) -> float:
-    """sqrt(gamma) at a distance of `lag` pixels along rows and columns."""
+    """Return sqrt(gamma) at a distance of `lag` pixels along rows and columns."""
     total, count = 0.0, 0
     for difference in (rest[..., lag:, :] - rest[..., :-lag, :], rest[..., :, lag:] - rest[..., :, :-lag]):
         root = np.sqrt(np.abs(difference))

@@ -1,4 +1,4 @@
-"""Difference maps of noise alone: nothing falls between two observations of one wall, so they show the sensor's noise only."""
+"""Simulate difference maps of noise alone, by the whole pipeline: nothing falls between two observations of one wall."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ from sensors.stereo.stereo_pair import StereoPair
 
 
 def with_model(site: SensorSite, model: StereoModel) -> SensorSite:
-    """The site with another model of its pair; InputError for one that is not seen by a simulated stereo pair."""
+    """Return the site with another model of its stereo pair; raise InputError if its sensor is not a simulated stereo pair."""
     if not isinstance(site.sensor, StereoPair):
-        raise InputError("noise maps are made of simulated matching", where="matcher", remedy="take the stereo sensor")
+        raise InputError(
+            "noise maps need simulated matching", where="matcher", remedy="use the stereo sensor with matcher: simulated"
+        )
     return replace(site, sensor=replace(site.sensor, model=model))
 
 
@@ -37,10 +39,21 @@ def noise_map(
     random: KeyedRandom,
     grid: Grid | None = None,
 ) -> NDArray[np.float32]:
-    """(h, w) differences, m, of two observations of the untouched wall (`caster`), NaN without data.
+    """Simulate the difference map of two observations of an unchanged wall.
 
-    before, after: one site, with the sensor as it is at each observation. Both draw noise of their own from `random`; the
-    second is registered to the first where the config has ICP. grid: of the map; none: over the first one's surface.
+    Both observations draw independent noise. The second is registered to the first if the config has ICP.
+
+    Parameters
+    ----------
+    config : Settings of surface, registration and difference map.
+    before, after : The same site, with the sensor as it is at each observation.
+    caster : The wall, for ray casting.
+    random : Source of the random numbers.
+    grid : Grid of the map; None: over the first observation's surface.
+
+    Returns
+    -------
+    (h, w) differences, m; NaN without data.
     """
     surface = _surface(config, before, caster, random.child("reference"))
     reference, target = reference_and_target(config, surface, caster.mesh, random.child("register", "reference"))
@@ -53,4 +66,5 @@ def noise_map(
 
 
 def _surface(config: SimulationConfig, site: SensorSite, caster: RayCaster, random: KeyedRandom) -> TriangleMesh:
+    """Observe the wall and reconstruct its surface."""
     return reconstruct(config, look(config, site, caster, random))
