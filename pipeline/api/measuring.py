@@ -208,7 +208,7 @@ class Diagnosis:
 
     def summary(self) -> str:
         """The verdict in some lines of text."""
-        return report.summary(self.found)
+        return report.summarise(self.found)
 
     def plot(self, kind: str = "maps") -> Picture:
         """A picture of the report: maps, profiles, gap, identifiability; or `before`, `after`: residuals over the wall."""
@@ -233,7 +233,7 @@ class Diagnosis:
 
     def write(self, out: Path | str) -> Path:
         """Write the files of `scarpsim gap`; returns report.html."""
-        return report.write(Path(out), self.found, self.measurement.held)
+        return report.write_report(Path(out), self.found, self.measurement.held)
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}, {len(self.found.effects)} effects>"
