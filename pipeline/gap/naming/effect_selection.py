@@ -347,7 +347,7 @@ def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
         f"non-parametric terms of {name}" if empirical else name for name, empirical in sorted(excluded - {NONPARAMETRIC_TERMS})
     )
     why = (
-        "the best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
+        "its best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
         "of it, and a misfit is left"
     )
     return [f"{what} left out: {why}" for what in said]
