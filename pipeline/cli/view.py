@@ -17,7 +17,9 @@ _PORT = 8050
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a run, a result of scarpsim gap, or a split of a data set")
+    parser.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="a run, a result of scarpsim gap or monitor, or a split of a data set"
+    )
     parser.add_argument(
         "second", type=Path, nargs="?", metavar="SECOND", help="another run of the same wall, beside the first by a slider"
     )

@@ -12,10 +12,10 @@ from plotly.colors import diverging, sequential
 
 from pipeline.view.results import Item, Layer, Patch, PointLayer, ViewWindow
 
-ITEM_TRACES = ("block", "detection", "scene change")
-_COLOURS = {"block": "#000000", "detection": "#D55E00", "scene change": "#009E73"}
+ITEM_TRACES = ("block", "detection", "event", "scene change")
+_COLOURS = {"block": "#000000", "detection": "#D55E00", "event": "#000000", "scene change": "#009E73"}
 """Black and Okabe and Ito's: they stand out from red, blue and grey, also for colour-blind readers."""
-_DASHES = {"block": "solid", "detection": "dash", "scene change": "dot"}
+_DASHES = {"block": "solid", "detection": "dash", "event": "solid", "scene change": "dot"}
 _SELECTED = "#E69F00"
 _GREYS = [[0.0, "#202020"], [1.0, "#f4f4f4"]]
 _PLAIN = "#9aa0a6"

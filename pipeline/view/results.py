@@ -68,7 +68,10 @@ class PointLayer:
 
 @dataclass(frozen=True)
 class Item:
-    """A thing to click on. kind: block, detection, scene change; box: x0, x1, y0, y1, z0, z1, m, z NaN where it is not known."""
+    """A thing to click on.
+
+    kind: block, detection, event, scene change; box: x0, x1, y0, y1, z0, z1, m, z NaN where it is not known.
+    """
 
     kind: str
     name: str

@@ -19,6 +19,7 @@ from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
 from pipeline.view.beside import check_same_wall
 from pipeline.view.gap_results import GapResults
+from pipeline.view.monitor_results import MONITOR_FILE, MonitorResults
 from pipeline.view.page import layout, register_callbacks
 from pipeline.view.results import Results
 from pipeline.view.run_results import RunResults
@@ -53,9 +54,14 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
         raise InputError("belong to a run", where="--detections", remedy="leave it out, or give the run's folder")
     if (folder / "gap.json").exists():
         return GapResults(folder)
+    if (folder / MONITOR_FILE).exists():
+        return MonitorResults(folder)
     if (folder / "annotations.json").exists():
         return TileResults(folder)
-    allowed = "a run (run.json), a result of scarpsim gap (gap.json), a split of a data set (annotations.json)"
+    allowed = (
+        "a run (run.json), a result of scarpsim gap (gap.json) or monitor (monitor.json), "
+        "a split of a data set (annotations.json)"
+    )
     raise InputError("holds nothing to look at", where=str(folder), allowed=allowed)
 
 
