@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from pipeline.change.tiles import TileConfig, starts_of_tiles
+from pipeline.change.tiles import TileConfig, tile_starts
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
 from scene.blocks.block import MOST_BLOCKS
@@ -119,7 +119,7 @@ def region(split: Split, share: float, grid: Grid, config: TileConfig) -> Region
     along the wall, so both see all of them. Tests use the whole wall. Raises InputError where a wall has too few columns.
     """
     step = config.size_px - config.overlap_px
-    columns = len(starts_of_tiles(grid.width, config))
+    columns = len(tile_starts(grid.width, config))
     if split == "test" or share == 0:
         return Region(0, float("inf"))
     kept = round(share * columns)
@@ -163,6 +163,6 @@ def check_filled(split: Split, where: Region, grid: Grid, config: TileConfig) ->
 def _most_filled(where: Region, grid: Grid, config: TileConfig) -> float:
     """The largest share of a tile within a region that lies on the wall, 0 where no tile lies in the region."""
     size = config.size_px
-    starts = (column for column in starts_of_tiles(grid.width, config) if where.holds(column, size))
+    starts = (column for column in tile_starts(grid.width, config) if where.holds(column, size))
     width = max((min(size, grid.width - column) for column in starts), default=0)
     return width * min(size, grid.height) / size**2
