@@ -36,9 +36,7 @@ _LEAST_POINTS = 2
 class M3c2Config(Config):
     """M3C2 by py4dgeo (extra `m3c2`)."""
 
-    core_step_px: int = Field(
-        5, ge=1, description="distance between core points, in pixels of the difference map"
-    )
+    core_step_px: int = Field(5, ge=1, description="distance between core points, in pixels of the difference map")
     normal_radius_m: float = Field(0.25, gt=0, description="radius of the neighbourhood in which normals are fitted")
     cylinder_radius_m: float = Field(0.08, gt=0, description="radius of the cylinder whose points are averaged (half of d)")
     maximum_distance_m: float = Field(2.0, gt=0, description="half length of the cylinder; deeper changes are not found")
