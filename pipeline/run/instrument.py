@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.report.page import true_minus
+from pipeline.report.page import with_minus_sign
 from pipeline.run.site import SensorSite
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
@@ -90,7 +90,10 @@ def _places(site: SensorSite) -> dict[str, str]:
         row: value
         for name, eye in site.viewpoints.items()
         for row, value in (
-            (f"Position ({name})", ", ".join(true_minus(each, 2) for each in site.frame.to_world(eye)) + " m (x, y, z, world)"),
+            (
+                f"Position ({name})",
+                ", ".join(with_minus_sign(each, 2) for each in site.frame.to_world(eye)) + " m (x, y, z, world)",
+            ),
             (f"Distance to the wall ({name})", _in_words(_ranges(site.mesh.vertices, eye))),
         )
     }

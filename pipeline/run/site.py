@@ -85,7 +85,7 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         pair = _stereo(config, cameras, frame, random)
         eyes = {name: frame.to_wall(position) for name, position in positions.items()}
         return SensorSite(wall.name, repairs, mesh, frame, pair, eyes)
-    stations = config.stations_of_the_scanner()
+    stations = config.station_configs()
     poses = [station.place(target) for station in stations]
     frame = config.frame.fit(wall.mesh.vertices, poses[0][0])
     positions = {f"station, number {number}": position for number, (position, _) in enumerate(poses, start=1)}
