@@ -105,7 +105,7 @@ def scatter(at: NDArray[Any], values: NDArray[Any], label: str, limit: float | N
     """Points (n, 2), m, coloured by values (n,); limit: of a scale on both sides of zero, red above."""
     from matplotlib.figure import Figure
 
-    from pipeline.report.figures import COLOURS, DPI, SEQUENTIAL, dress, png_bytes
+    from pipeline.report.figures import COLOURS, DPI, SEQUENTIAL, label_axes, png_bytes
 
     step = max(1, -(-len(at) // _MOST_DRAWN))
     figure = Figure(figsize=(9.6, 5.4), dpi=DPI, layout="constrained")
@@ -113,7 +113,7 @@ def scatter(at: NDArray[Any], values: NDArray[Any], label: str, limit: float | N
     scale = {"cmap": SEQUENTIAL} if limit is None else {"cmap": COLOURS, "vmin": -limit, "vmax": limit}
     drawn: Any = axes.scatter(*at[::step].T, c=values[::step], s=1.5, linewidths=0, **scale)
     axes.set_aspect("equal")
-    dress(axes, "x, m", "y, m")
+    label_axes(axes, "x, m", "y, m")
     figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
     return Picture(png_bytes(figure))
 

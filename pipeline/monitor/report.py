@@ -13,7 +13,7 @@ from pipeline.monitor.magnitude import PowerLaw, fit_power_law
 from pipeline.monitor.model import compared_in_words
 from pipeline.monitor.products import Followed, Result, event_raster
 from pipeline.monitor.significance import NORMAL_95
-from pipeline.report.figures import blocks_figure, difference_figure, dress, hillshade_figure, png_bytes
+from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import template
 
@@ -137,7 +137,7 @@ def _volumes_figure(result: Result) -> bytes:
         axes.errorbar(
             places, volumes, NORMAL_95 * np.sqrt(variances), color=colour, marker="o", markersize=3, capsize=2, label=kind
         )
-    dress(axes, "time (UTC)" if timed else "epoch", "volume against the reference [m³]")
+    label_axes(axes, "time (UTC)" if timed else "epoch", "volume against the reference [m³]")
     axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)
 
@@ -149,6 +149,6 @@ def _law_figure(volumes: list[float], law: PowerLaw) -> bytes:
     axes.loglog(ordered, np.arange(len(ordered), 0, -1), "o", markersize=3, color="0.3", label="rockfalls")
     line = np.geomspace(law.smallest_m3, ordered[-1], 50)
     axes.loglog(line, law.count * (line / law.smallest_m3) ** -law.exponent, color="#b2182b", label=f"V^-{law.exponent:.2f}")
-    dress(axes, "volume V [m³]", "rockfalls larger than V")
+    label_axes(axes, "volume V [m³]", "rockfalls larger than V")
     axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

@@ -13,7 +13,7 @@ from pipeline.gap.other.spread import SpreadTried
 from pipeline.gap.report.quantities import with_std
 from pipeline.gap.report.scale import scale_of
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
-from pipeline.report.page import true_minus
+from pipeline.report.page import with_minus_sign
 from sensors.effects.base import ShowsIn
 from sensors.effects.surface_empirical import SurfaceEmpirical
 
@@ -182,7 +182,7 @@ def number(value: float, digits: int = 4) -> str:
 
 def decimal(value: float) -> str:
     """With one decimal, without any from ten thousand on."""
-    return true_minus(value, 1) if abs(value) < 9999.95 else number(value, 5)
+    return with_minus_sign(value, 1) if abs(value) < 9999.95 else number(value, 5)
 
 
 def rounded(value: Any) -> Any:
