@@ -8,7 +8,7 @@ help:
 	@echo '                 with EXTRAS="detect notebook" those extras too; `scarpsim doctor` says what each is for'
 	@echo 'make setup-all   what tests, documentation and benchmarks need too; the targets below do it themselves'
 	@echo 'make demo        simulate both sensors on the demo wall, into a new folder under runs/'
-	@echo 'make test        lint, types and tests'
+	@echo 'make test        lint, spelling, types and tests'
 	@echo 'make docs        the documentation site, in site/index.html'
 	@echo 'make format      put the code into the project'"'"'s format'
 	@echo 'make benchmarks  every benchmark that makes its own data, each with its ratio to the limit measured in the same run'
@@ -29,6 +29,7 @@ demo: setup
 test: setup-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/pytest -n 2 --dist worksteal
 

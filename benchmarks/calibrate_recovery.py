@@ -1,11 +1,11 @@
 """Do calibrations find the noise that maps were simulated with, and do their intervals hold it as often as they say?
 
-    python benchmarks/calibrate_recovery.py [--sensor stereo|tls] [--trials 50] [--out DIR]
+    python benchmarks/calibrate_recovery.py [--sensor stereo|tls] [--trials 50] [--out DIR] [--write]
 
 Each trial has a wall and a seed of its own and draws its true noise at random; its maps are made by the whole simulation
 (`noise_map`: every cell, meshing, ICP of one noisy epoch to the other, rasters), not by the one that the calibration searches
-with. Finished trials are kept under --out, so an interrupted benchmark goes on where it was. The table goes into
-docs/explanation/calibration.md.
+with. Finished trials are kept under --out, so an interrupted benchmark goes on where it was. --write puts the
+table into docs/validation/calibration.md.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from scene.common.backend import dr
 from scene.common.keyed_random import KeyedRandom
 from scene.ray_casting.raycast import RayCaster
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "explanation" / "calibration.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "calibration.md"
 EPOCHS = 2
 SETTINGS = [
     "wall.width_m=9",
@@ -106,6 +106,7 @@ def main() -> None:
     parser.add_argument("--sensor", choices=("stereo", "tls"), default="tls")
     parser.add_argument("--trials", type=int, default=50)
     parser.add_argument("--out", type=Path, default=Path("runs/calibrate_recovery"))
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/calibration.md")
     arguments = parser.parse_args()
     dr.set_thread_count(1)  # kernels are small; run both sensors side by side
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -120,7 +121,13 @@ def main() -> None:
         )
     rows = table(found)
     print("\n".join(rows), f"\nCPU of a calibration: {np.median([one['cpu_s'] for one in found]):.0f} s")
-    begin, end = f"<!-- recovery {arguments.sensor} -->\n", "\n<!-- end -->"
+    if arguments.write:
+        _into_document(arguments.sensor, rows)
+
+
+def _into_document(sensor: str, rows: list[str]) -> None:
+    """Put a sensor's table between its two marks in docs/validation/calibration.md."""
+    begin, end = f"<!-- recovery {sensor} -->\n", "\n<!-- end -->"
     text = DOCUMENT.read_text()
     replacement = begin + "\n".join(rows) + end
     DOCUMENT.write_text(re.sub(re.escape(begin) + ".*?" + re.escape(end), lambda _: replacement, text, flags=re.DOTALL))

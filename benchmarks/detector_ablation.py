@@ -6,7 +6,8 @@
 Small and medium blocks at one level of noise out of sets as in detector_table.py. Every network
 starts from random weights; the score that counts is set on the validation images, F1 is of all tests together. What is in --out
 already is not made again. The first row is trained once for each of --seeds, which tells how much chance does; the others are
-trained with the first of them and set against the mean of that row. --write puts the table into docs/validation/detector.md.
+trained with the first of them and set against the mean of that row. --write puts the table into
+docs/validation/detector_training.md.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.products.run import LOWEST_SCORE, detect
 from pipeline.detection.training.training import train
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "detector.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "detector_training.md"
 MARKS = "<!-- ablation -->", "<!-- end of ablation -->"
 CONFIDENCE, OVERLAPS = 0.95, (0.25, 0.75)
 BATCH = 4
@@ -164,7 +165,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="for sets and detectors")
     parser.add_argument("--epochs", type=int, default=8, help="passes over the training images")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector_training.md")
     arguments = parser.parse_args()
     table = []
     for line in rows(arguments):

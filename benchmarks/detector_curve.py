@@ -4,7 +4,7 @@
 
 Each detector is named with its windows, and its folder. Sets and detections as in detector_table.py, the detections kept in a
 folder beside each set's that is named by the windows; maps are looked at as they are, whatever a detector's `head.mirrored` says.
-Means over the cells of both sensors at a score of 0.95, masks. --write puts the table into docs/validation/detector.md.
+Means over the cells of both sensors at a score of 0.95, masks. --write puts the table into docs/validation/detector_training.md.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("detectors", nargs="+", metavar="WINDOWS=DETECTOR")
     parser.add_argument("--set", type=Path, required=True, action="append", dest="folders", help="what detector_test.yaml makes")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector_training.md")
     arguments = parser.parse_args()
     table = printed(rows(arguments.folders, arguments.detectors))
     if arguments.write:
-        write_between(DOCS / "detector.md", MARKS, table)
+        write_between(DOCS / "detector_training.md", MARKS, table)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 
 The measurements are made by the challenge's generator, in a process of their own. Each is read and diagnosed with an empty kernel
 cache, as a new user's, and again with the kernels of that. To reach: 60 bare casts of the same rays, or 60 s. `--write` puts the
-table into docs/explanation/how_gap_works.md.
+table into docs/validation/gap.md.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sensors", nargs="*", default=list(CASES), help="tls, stereo")
     parser.add_argument("--points", type=int, nargs="+", default=[1_000_000])
-    parser.add_argument("--write", action="store_true", help="put the table into docs/explanation/how_gap_works.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/gap.md")
     parser.add_argument("--measurement", type=Path, help="diagnose this folder instead")
     parser.add_argument("--to", type=Path, help="file for its times")
     arguments = parser.parse_args()
@@ -123,7 +123,7 @@ def main() -> None:
                 found.setdefault(sensor, []).append(timed(made(sensor, points, Path(folder))))
     print(table(found))
     if arguments.write:
-        write_between(_ROOT / "docs/explanation/how_gap_works.md", _TABLE, table(found))
+        write_between(_ROOT / "docs/validation/gap.md", _TABLE, table(found))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     OMP_NUM_THREADS=1 python benchmarks/gap_reference_points.py [--out runs/reference_points] [--write]
 
 The scan is that of a workshop in closed form (benchmarks/workshop.py), the effects are those of the injections into real scans
-(benchmarks/gap_injections/formulas.py). --write: the table into docs/explanation/how_gap_works.md.
+(benchmarks/gap_injections/formulas.py). --write: the table into docs/validation/gap_reference_points.md.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pipeline.gap.report.in_words import values as in_words
 from pipeline.measurement.build import build
 from pipeline.measurement.request import Request
 
-PAGE, MARKS = Path("docs/explanation/how_gap_works.md"), ("<!-- reference points -->", "<!-- end of reference points -->")
+PAGE, MARKS = Path("docs/validation/gap_reference_points.md"), ("<!-- reference points -->", "<!-- end of reference points -->")
 STEP_DEG = 0.2
 MODEL = {"sensor": "tls", "noise": {"range_sigma_m": 0.001, "angle_sigma_rad": 5e-5}}
 PUT: dict[str, tuple[str, dict[str, float]]] = {

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import subprocess
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -210,15 +211,31 @@ def main() -> None:
     found = table(cases, arguments.out)
     print(found)
     if arguments.table:
-        arguments.table.write_text(f"{_HEAD}\n\n{found}\n")
+        arguments.table.write_text(f"{_HEAD}\n\n{_made_by(arguments)}\n\n{found}\n")
 
 
+def _made_by(arguments: argparse.Namespace) -> str:
+    """The table of how the results were made."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
+    words = f"python benchmarks/gap_thresholds.py --cases {arguments.cases} --seed {arguments.seed} --out DIR --table {_PAGE}"
+    row = f"| {arguments.cases} | {arguments.seed} | {commit} | `{words}` |"
+    return f"| cases | seed | commit | command |\n|---|---|---|---|\n{row}"
+
+
+_PAGE = "docs/validation/gap_thresholds.md"
 _HEAD = """# What each threshold does
 
-Each threshold of `pipeline/gap/decisions.py` at 0.7 and 1.4 times its value, on development cases of some thousand points made by
-`benchmarks/gap_thresholds.py`: in how many of the cases that ask for it the answer changes (verdict or names), and what
-becomes wrong, or right, by it. A threshold that is missing was asked for by no case; "-": its value may not be so large or small,
-or the time was up."""
+This page shows how far the answers of `scarpsim gap` depend on its thresholds. It is for developers who change one, and for users
+who wonder whether a default decides their case. `--set` changes a threshold for one diagnosis, and `gap.json` records the values:
+
+    scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
+
+Each threshold of `pipeline/gap/decisions.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand points
+of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose answer (verdict
+or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the run, is not listed.
+"-" means that the value is not allowed, or that the time was up.
+
+A few cases show which thresholds are near an edge, not how often they decide."""
 
 
 if __name__ == "__main__":

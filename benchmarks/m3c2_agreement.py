@@ -1,6 +1,6 @@
 """How M3C2 distances and difference maps agree, on the same epochs: `python benchmarks/m3c2_agreement.py [--config FILE]`.
 
-Prints a table for docs/explanation/comparison.md: each sensor, along the wall's normal and along the surface's own.
+Prints a table for docs/validation/m3c2.md: each sensor, along the wall's normal and along the surface's own.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """The simulated matching noise fitted to the errors of semi-global matching,
-and both in one table (docs/explanation/matching.md).
+and both in one table (docs/validation/matching.md).
 
 Fitted by differential evolution and a simplex search on two rendered walls, once for SGBM and once for SGBM with refinement;
 validated on walls and on real pictures (the Middlebury motorcycle) that the fit has not seen. Pixels are those of the matched

@@ -5,7 +5,7 @@
 The thesis carves its blocks out of Metashape's mesh of a wall, made from depth maps of a quarter of the images' resolution: its
 vertices are farther apart, and it is smoother than rock. Here the relief of a Glendale wall, sampled every centimetre, goes
 through a Gaussian filter and is sampled anew. Small blocks as in configs/datasets/detector_test.yaml, stereo pair, surfaces by
-vertices. --write puts the table into docs/validation/detector.md.
+vertices. --write puts the table into docs/validation/detector_bound.md.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--width", type=float, default=24.0)
     parser.add_argument("--height", type=float, default=14.0)
     parser.add_argument("--maps", type=int, default=2, help="at each level of noise")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector_bound.md")
     arguments = parser.parse_args()
     table = printed(rows({"width_m": arguments.width, "height_m": arguments.height}, arguments.maps))
     if arguments.write:

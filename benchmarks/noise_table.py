@@ -1,11 +1,12 @@
 """Noise of simulated difference maps of the Glendale site, after ICP and without blocks, against the thesis's tables 5-1 to 5-3.
 
     python benchmarks/noise_table.py [--maps 45] [--levels high medium low] [--parameters | --readings]
+        [--write]
 
 Each map differs two observations of one wall with noise drawn anew in both. Finished maps are kept under --out, so an interrupted
 run goes on where it was. --parameters: the noise of each parameter alone instead; --readings: the printed noise drawn in
 other ways; --faithful: glendale_high, medium and low by vertices against a reference without noise, as the data sets have them.
-Tables are printed and put into docs/explanation/noise.md.
+--write puts the table into docs/validation/noise.md.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from scene.common.keyed_random import KeyedRandom
 from scene.ray_casting.raycast import RayCaster
 from sensors.models.sensor_model import StereoModel, StereoNoise
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "explanation" / "noise.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "noise.md"
 LEVELS = ("high", "medium", "low")
 THESIS_MM = {"high": (23.8, 24.4), "medium": (14.0, 14.6), "low": (7.8, 8.5)}
 """Mean StD and mean RMSE over 45 maps."""
@@ -164,7 +165,7 @@ def single_parameters(model: StereoModel) -> dict[str, StereoModel]:
 
 
 def into_document(name: str, rows: list[str]) -> None:
-    """Put a table between its two marks in docs/explanation/noise.md."""
+    """Put a table between its two marks in docs/validation/noise.md."""
     text = DOCUMENT.read_text(encoding="utf-8")
     table = "\n".join(rows)
     marked = re.sub(rf"(<!-- {name} -->\n).*?(<!-- end -->)", lambda found: f"{found[1]}{table}\n{found[2]}", text, flags=re.S)
@@ -180,6 +181,7 @@ def main() -> None:
     parser.add_argument("--readings", action="store_true", help="the printed noise, read in four ways")
     parser.add_argument("--faithful", action="store_true", help="the levels as the data sets have them")
     parser.add_argument("--out", type=Path, default=Path("runs/noise_table"))
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/noise.md")
     asked = parser.parse_args()
     settings = [*SETTINGS, f"depth_map={asked.quality}", *(FAITHFUL if asked.faithful else [])]
     config = load_config(bundled_config("sites", "glendale"), settings, "stereo", None)
@@ -193,7 +195,8 @@ def main() -> None:
         name, rows = "readings", reading_table(measured, asked.maps)
     else:
         name, rows = "levels", level_table(measured, asked.levels, asked.maps)
-    into_document(name, rows)
+    if asked.write:
+        into_document(name, rows)
     print("\n".join(rows))
     print(f"{time.perf_counter() - start:.0f} s, peak memory {peak_memory_gb():.2f} GB")
 

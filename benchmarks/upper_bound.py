@@ -4,7 +4,7 @@
 
 A Glendale wall, blocks as in configs/datasets/detector_test.yaml, seen by the stereo pair; noise of 2.5, 5 and 7.5 cm. Beside the
 shares: median depth of a niche (rock removed over its outline) and the share of its bounding box that it fills. --write puts the
-table into docs/validation/detector.md.
+table into docs/validation/detector_bound.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from scene.common.keyed_random import KeyedRandom
 from scene.walls.contour import median_under
 from scene.walls.wall import Wall
 
-DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "detector.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "detector_bound.md"
 MARKS = "<!-- bound -->", "<!-- end of bound -->"
 WALL = "glendale-b"
 WAYS = (("direct", "medium", "relief"), ("vertices", "medium", "relief"), ("vertices", "medium", "mean_surface"))
@@ -92,7 +92,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--width", type=float, default=24.0)
     parser.add_argument("--height", type=float, default=14.0)
-    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector_bound.md")
     arguments = parser.parse_args()
     table = printed(rows(arguments.width, arguments.height))
     if arguments.write:

@@ -1,6 +1,6 @@
-"""Carries out the how-tos of docs/howto as they are written, and keeps their pictures.
+"""Carries out the how-to guides and tutorials as they are written, and keeps their pictures.
 
-    python docs/howtos.py [PAGE ...]        such as own_site; renews docs/images/howto_PAGE.png; minutes in all
+    python docs/howtos.py [PAGE ...]        such as own_site; renews the pictures in docs/images; minutes in all
 
 A page's blocks are its steps, in order: one with a title is a file to write (a Python file is then run), one of bash holds
 commands, a line each. What a page asks its reader to have is written by docs/example_data.py.
@@ -32,7 +32,20 @@ PICTURES = {
     "missing_effect": "diagnosis/profiles.png",
     "raw_scan": "from_raw/understood.png",
 }
-"""The pages, and the picture among their results that each shows."""
+"""The how-to guides, and the picture among their results that each shows."""
+TUTORIALS = {
+    "simulate_and_look": "",
+    "two_scans_to_a_finding": "finding/maps.png",
+    "detector_for_my_site": "found/other_tls_usual_all_test0001_r00000_c00512_detections.png",
+}
+"""The tutorials, likewise; the first shows the pictures of the demo."""
+NEEDS = {
+    "own_site": "site",
+    "two_scans_to_a_finding": "site",
+    "missing_effect": "measurement",
+    "raw_scan": "measurement",
+}
+"""Which example data of docs/example_data.py a page asks its reader to have."""
 _BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _PROGRAMS: dict[str, Callable[[list[str]], int]] = {"scarpsim": main, "simulate": simulate}
 _COLOURS, _WIDEST = 256, 1100
@@ -47,8 +60,9 @@ class Step:
 
 
 def steps(page: str) -> list[Step]:
-    """The steps of docs/howto/PAGE.md; blocks that are neither titled nor bash only show something."""
-    blocks = _BLOCK.findall((FOLDER / "howto" / f"{page}.md").read_text(encoding="utf-8"))
+    """The steps of a how-to guide or tutorial; blocks that are neither titled nor bash only show something."""
+    folder = "tutorials" if page in TUTORIALS else "howto"
+    blocks = _BLOCK.findall((FOLDER / folder / f"{page}.md").read_text(encoding="utf-8"))
     return [Step(title, text) for language, title, text in blocks if title or language == "bash"]
 
 
@@ -81,17 +95,20 @@ def _renew(page: str) -> None:
     import example_data
 
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        if page == "own_site":
+        if NEEDS.get(page) == "site":
             example_data.site(Path())
-        if page in ("missing_effect", "raw_scan"):
+        if NEEDS.get(page) == "measurement":
             example_data.measurement(Path("my_measurement"))
         sys.stderr.write(f"== {page}\n{carry_out(page)}\n")
-        with Image.open(PICTURES[page]) as picture:
+        if not (shown := (PICTURES | TUTORIALS)[page]):
+            return
+        with Image.open(shown) as picture:
             picture.thumbnail((_WIDEST, _WIDEST))
             small = picture.convert("RGB").quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-        small.save(FOLDER / "images" / f"howto_{page}.png", optimize=True)
+        kind = "tutorial" if page in TUTORIALS else "howto"
+        small.save(FOLDER / "images" / f"{kind}_{page}.png", optimize=True)
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:] or PICTURES:
+    for name in sys.argv[1:] or (*PICTURES, *TUTORIALS):
         _renew(name)

@@ -10,7 +10,6 @@ same, against the simulated matcher.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,9 +25,9 @@ from pipeline.formats.cameras.cameras import write_cameras_yaml
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.report.covariate_ranking import where
-from pipeline.gap.report.in_words import paragraph
+from pipeline.gap.report.in_words import values
 from pipeline.gap.report.report import summary, write
 from scene.appearance.illumination import IlluminationConfig
 from scene.appearance.texture import TextureConfig
@@ -161,38 +160,40 @@ def run(pairs: Iterator[Pair], out: Path) -> list[tuple[str, GapDiagnosis]]:
 
 
 def table(found: list[tuple[str, GapDiagnosis]]) -> str:
-    """Verdict, effects and the gap of each."""
-    rows = ["| matcher | verdict | what was named | before | after | floor | closed |", "|---|---|---|---|---|---|---|"]
+    """Verdict, effects with their standard deviations, and the gap of each."""
+    rows = [
+        "| matcher | points | verdict | what was named | before | after | floor | closed |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for name, each in found:
-        named = "; ".join(_entry(effect.entry) for effect in each.effects) or "nothing"
+        named = "; ".join(f"`{effect.effect.tag()}` ({values(effect)}){_class(effect)}" for effect in each.effects) or "nothing"
         gap = each.gap
         figures = ["", "", "", ""]
         if gap is not None:
             figures = [f"{1e3 * value:.2f} mm" for value in (gap.before, gap.after, gap.floor)]
             figures.append("within its uncertainty" if gap.closed is None else f"{100 * gap.closed:.0f} %")
-        rows.append(f"| {name} | {each.verdict} | {named} | " + " | ".join(figures) + " |")
+        cells = (name, f"{len(each.residuals):,}", each.verdict, named, *figures)
+        rows.append("| " + " | ".join(cells) + " |")
     return "\n".join(rows)
 
 
-def _entry(entry: dict[str, Any]) -> str:
-    values = {
-        key: float(f"{value:.3g}") if isinstance(value, float) else value
-        for key, value in entry.items()
-        if isinstance(value, str | float | int)
-    }
-    return "`" + json.dumps(values).replace('"', "") + "`"
+def _class(effect: Named) -> str:
+    """Words for what an effect cannot be told from, or for one that describes and does not explain."""
+    if effect.kind == "empirical":
+        return ", as a description"
+    names = ", ".join(f"`{name.partition('.')[2]}`" for name in effect.alike)
+    return f", cannot be told from {names}" if names else ""
 
 
 def page(name: str, title: str, before: str, found: list[tuple[str, GapDiagnosis]]) -> None:
     """docs/validation/gap_<...>.md up to the line that marks hand-written text, which is kept."""
-    path, mark = FOLDER / f"{_FILES[name]}.md", "## What it could and could not say"
-    kept = path.read_text().partition(mark)[2] if path.exists() else "\n"
-    parts = [f"# {title}", before, table(found)]
-    for matcher, each in found:
-        slug = f"{name}_{matcher.replace(', ', '_')}"
-        picture = slug_picture(slug)
-        parts += [f"**{matcher}**: {paragraph(each, where(each))}", f"![maps before and after, {matcher}]({picture})"]
-    path.write_text("\n\n".join(parts) + f"\n\n{mark}{kept}")
+    path = FOLDER / f"{_FILES[name]}.md"
+    kept = path.read_text().partition(_MARK)[2] if path.exists() else "\n"
+    parts = [f"# {title}", before, "## Results", table(found)]
+    for matcher, _ in found:
+        picture = slug_picture(f"{name}_{matcher.replace(', ', '_')}")
+        parts.append(f"![Maps of the residuals before and after, {matcher}]({picture})")
+    path.write_text("\n\n".join(parts) + f"\n\n{_MARK}{kept}")
 
 
 def slug_picture(slug: str) -> str:
@@ -207,10 +208,10 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     arguments = parser.parse_args()
     if arguments.example == "motorcycle":
-        name, title = "real_pair", "A worked example on real photographs"
+        name, title = "real_pair", "A pair of real photographs"
         pairs = motorcycle(arguments.data / "stereo_motorcycle")
     else:
-        name, title, pairs = "sgbm", "The simulated matcher against semi-global matching", rendered()
+        name, title, pairs = "sgbm", "A pair of rendered photographs", rendered()
     out = arguments.out / arguments.example
     found = run(pairs, out)
     for matcher, _ in found:
@@ -221,20 +222,42 @@ def main() -> None:
 
 
 _FILES = {"real_pair": "gap_real_photographs", "sgbm": "gap_rendered_photographs"}
+_MARK = "## What can be concluded"
 _INTRODUCTIONS = {
-    "real_pair": "Middlebury 2014's motorcycle (741 x 500 px, disparities measured with structured light) is matched by OpenCV's"
-    " semi-global matching; the reference is the surface of the measured disparities, cut where they jump by more than 1 px,"
-    " and the model believes in a nearly perfect matcher (0.05 px of white noise, no effects). Made by\n\n"
-    "    python docs/make_gap_examples.py motorcycle\n\n"
-    "which leaves the measurement folders and the whole reports in runs/gap_examples/motorcycle.",
-    "sgbm": "Rendered photographs of a wall 24 x 15 m in Glendale's style from 50 m (base 13 m, medium quality) are matched by"
-    " OpenCV's semi-global matching, with and without least-squares refinement; the model believes in a nearly"
-    " perfect matcher (0.05 px of the frame of white noise, no effects; a pixel of the matched pictures is 4 px of the frame)."
-    " Made by\n\n"
-    "    python docs/make_gap_examples.py sgbm\n\n"
-    "which leaves the measurement folders and the whole reports in runs/gap_examples/sgbm."
-    " [How matching works](../explanation/matching.md) has the matchers' errors in figures.",
+    "real_pair": """\
+This page shows what `scarpsim gap` says of a real matcher on real photographs, where the surface is known and the errors are not.
+It is for users of photogrammetric surfaces who want to see how far an answer goes on data that no simulation made.
+
+The scene is Middlebury 2014's motorcycle (741 x 500 px). OpenCV's semi-global matching gives the disparities, with and without
+least-squares refinement. The reference is the surface of the disparities that the data set measured with structured light, cut
+where they jump by more than 1 px. The model states a nearly perfect matcher: 0.05 px of white noise and no effects.
+
+The answers find the pixel locking of the plain matcher, which the refinement removes, and the fattened edges of both. They cannot
+tell the correlated errors of a matcher from errors of the cameras.
+
+Made by
+
+    python docs/make_gap_examples.py motorcycle
+
+which leaves the measurement folders and the reports in runs/gap_examples/motorcycle.""",
+    "sgbm": """\
+This page shows what `scarpsim gap` says of a real matcher on rendered photographs, where the truth is known: the cameras are
+perfect and the surface is exact, so whatever is found is due to the matcher. It is for users of photogrammetric surfaces.
+
+A wall of 24 m x 15 m in the style of Glendale is rendered from 50 m (base 13 m, medium quality) and matched by OpenCV's
+semi-global matching, with and without least-squares refinement. The model states a nearly perfect matcher: 0.05 px of white noise
+and no effects. Values are in pixels of the frame; a pixel of the matched pictures is 4 px of the frame.
+[Matching](../explanation/matching.md) has the errors of the matchers.
+
+The answers find the locking of the plain matcher and the low-pass of the refined one, and blame no camera.
+
+Made by
+
+    python docs/make_gap_examples.py sgbm
+
+which leaves the measurement folders and the reports in runs/gap_examples/sgbm.""",
 }
+"""What each page starts with: what was evaluated, and what it means."""
 
 
 if __name__ == "__main__":

@@ -66,20 +66,20 @@ MISTAKES = (
     _set(KEYS, "a misspelt key", "rockfall.cuont=3"),
     _set(KEYS, "a misspelt preset", "scanner.presett=riegl_vz400i"),
     _set(KEYS, "a parameter of another effect", "sensor={sensor: tls, effects: [{name: range_offset, scale_ppm: 10}]}"),
-    _set(KEYS, "a noise of the other sensor", "sensor={sensor: tls, noise: {parallax_sigma_px: 0.3}}"),
+    _set(KEYS, "noise of the other sensor", "sensor={sensor: tls, noise: {parallax_sigma_px: 0.3}}"),
     _set(KEYS, "keys of two kinds of wall", "wall={mesh: wall.ply, style: glendale}"),
-    _set(KEYS, "no value", "wall.style"),
-    _set(VALUES, "a word for a number", "scanner.azimuth_step_rad=fast"),
-    _set(VALUES, "zero for a number", "rockfall.count=0"),
-    _set(VALUES, "a fraction for a count", "rockfall.count=2.5"),
+    _set(KEYS, "a key without a value", "wall.style"),
+    _set(VALUES, "a word instead of a number", "scanner.azimuth_step_rad=fast"),
+    _set(VALUES, "a number that is too small", "rockfall.count=0"),
+    _set(VALUES, "a fraction instead of a count", "rockfall.count=2.5"),
     _set(VALUES, "a negative noise", "sensor={sensor: tls, noise: {range_sigma_m: -1}}"),
-    _set(VALUES, "the wrong case", "depth_map=Medium"),
+    _set(VALUES, "wrong upper or lower case", "depth_map=Medium"),
     _set(VALUES, "an unknown style of wall", "wall.style=Glendal"),
     _set(VALUES, "an unknown distribution", "rockfall.size_m={kind: gausian, mean: 1, sigma: 0.1}"),
-    _set(VALUES, "degrees for radians, a slope", "wall.slope_rad=70"),
-    _set(VALUES, "degrees for radians, a window", "scanner.zenith_limits_rad=[30, 130]"),
-    _set(VALUES, "degrees for radians, a step", "scanner.zenith_step_rad=0.04"),
-    _set(VALUES, "millimetres for metres, a focal length", "cameras.focal_length_m=50", start=STEREO),
+    _set(VALUES, "degrees instead of radians: a slope", "wall.slope_rad=70"),
+    _set(VALUES, "degrees instead of radians: a field of view", "scanner.zenith_limits_rad=[30, 130]"),
+    _set(VALUES, "degrees instead of radians: a step", "scanner.zenith_step_rad=0.04"),
+    _set(VALUES, "millimetres instead of metres: a focal length", "cameras.focal_length_m=50", start=STEREO),
     _set(VALUES, "an unknown effect", "sensor={sensor: tls, effects: [{name: range_ofset, offset_m: 0.01}]}"),
     _set(VALUES, "a misspelt parameter of an effect", "sensor={sensor: tls, effects: [{name: range_offset, offset: 0.004}]}"),
     _set(VALUES, "an unknown scanner", "scanner.preset=riegl_vz40"),
@@ -88,37 +88,37 @@ MISTAKES = (
     _set(SENSORS, "a sensor underground", "station.position_m=[3, -20, -60]"),
     _set(SENSORS, "a mirrored pose", "station={position_m: [3, -20, 1], rotation: [[0, 1, 0], [1, 0, 0], [0, 0, 1]]}"),
     _set(SENSORS, "a sensor out of range", "scanner.maximum_range_m=5"),
-    _set(SENSORS, "cameras whose pictures share nothing", "cameras.base_m=500", start=STEREO),
+    _set(SENSORS, "cameras whose pictures do not overlap", "cameras.base_m=500", start=STEREO),
     _set(SENSORS, "blocks larger than the wall", "rockfall.size_m=50"),
-    _set(SENSORS, "more blocks than there is room for", "rockfall.count=300"),
-    _set(SENSORS, "no wall left in the safe zone", "rockfall.safe_zone_offset_m=100"),
+    _set(SENSORS, "more blocks than fit on the wall", "rockfall.count=300"),
+    _set(SENSORS, "a safe zone that leaves no wall", "rockfall.safe_zone_offset_m=100"),
     _set(SENSORS, "pixels larger than the wall", "difference.gsd_m=50"),
     _set(SENSORS, "pixels too small for any computer", "difference.gsd_m=0.00001"),
-    _set(FILES, "a mesh that is not there", "wall={mesh: none.ply}"),
+    _set(FILES, "a mesh that does not exist", "wall={mesh: none.ply}"),
     _set(FILES, "NaN in a mesh", "wall={mesh: nan.ply}"),
     _set(FILES, "a mesh in millimetres", "wall={mesh: mm.ply}"),
     _set(FILES, "a truncated mesh", "wall={mesh: cut.ply}"),
-    _set(FILES, "a mesh of no known format", "wall={mesh: site.yaml}"),
+    _set(FILES, "a mesh in an unknown format", "wall={mesh: site.yaml}"),
     _set(FILES, "an unreadable XML", "cameras=cut.xml", start=STEREO),
-    _run(FILES, "a config that is not there", "simulate --sensor tls --config none.yaml"),
-    _run(FILES, "a file that is no config", "simulate --sensor tls --config wall.ply"),
+    _run(FILES, "a config that does not exist", "simulate --sensor tls --config none.yaml"),
+    _run(FILES, "a file that is not a config", "simulate --sensor tls --config wall.ply"),
     _run(FILES, "a config with tabs", "simulate --sensor tls --config tabs.yaml"),
-    _run(FILES, "a key twice", "simulate --sensor tls --config twice.yaml"),
-    _run(FILES, "a config that wants to run a program", "simulate --sensor tls --config tag.yaml"),
-    _run(FILES, "no measurement", "gap used"),
-    _run(FILES, "no difference map", "detect baseline used"),
+    _run(FILES, "the same key twice", "simulate --sensor tls --config twice.yaml"),
+    _run(FILES, "a config that tries to run a program", "simulate --sensor tls --config tag.yaml"),
+    _run(FILES, "a folder without a measurement", "gap used"),
+    _run(FILES, "a folder without a difference map", "detect baseline used"),
     _run(OUTPUT, "an output folder that is a file", "simulate --sensor tls --config site.yaml --out file"),
     _run(OUTPUT, "an output folder in use", "simulate --sensor tls --config site.yaml --out used"),
     _run(OUTPUT, "nothing to resume", "simulate --sensor tls --config site.yaml --out used --resume"),
     _run(OUTPUT, "a place that cannot be written", "simulate --sensor tls --config site.yaml --out /proc/run"),
-    _run(OUTPUT, "resumed with another seed", "simulate --sensor tls --config mesh.yaml --out begun --resume --seed 5"),
-    _run(OUTPUT, "a mesh replaced under the same name", "simulate --sensor tls --config mesh.yaml --out begun --resume"),
+    _run(OUTPUT, "resuming with another seed", "simulate --sensor tls --config mesh.yaml --out begun --resume --seed 5"),
+    _run(OUTPUT, "resuming after the mesh was replaced", "simulate --sensor tls --config mesh.yaml --out begun --resume"),
     _run(OUTPUT, "a config that init would overwrite", "init --out site.yaml"),
     _run(COMMANDS, "an unknown command", "simulat --sensor tls"),
     _run(COMMANDS, "an unknown flag", "simulate --senser tls"),
     _run(COMMANDS, "an unknown sensor", "simulate --sensor lidar"),
-    _run(COMMANDS, "per cent for a share", "detect baseline used --confidence 95"),
-    _run(COMMANDS, "an empty folder to look at", "view used"),
+    _run(COMMANDS, "a percentage instead of a share", "detect baseline used --confidence 95"),
+    _run(COMMANDS, "a folder without results", "view used"),
 )
 
 
@@ -146,10 +146,13 @@ def answer(mistake: Mistake) -> tuple[int, str, str]:
 
 def page(answers: dict[Mistake, str]) -> str:
     """docs/reference/mistakes.md."""
-    head = """# Likely mistakes and the answers
+    head = """# Common mistakes
 
-Each of these ends with exit status 2, one message and no traceback, and leaves no half-written results. `...` stands for
-`--config site.yaml --out out`, a small site. `python docs/make_mistakes.py` writes this page, and the tests try every row.
+This page is for users who got an error message and want to know what caused it. It shows common mistakes and their messages.
+A mistake ends the command with exit status 2 and leaves no half-written results. `...` stands for `--config site.yaml --out out`,
+a small site.
+
+`python docs/make_mistakes.py` writes this page, and the tests try every command on it.
 """
     parts = [head]
     for section in dict.fromkeys(mistake.section for mistake in answers):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene.common.lazy import lazily
+from scene.common.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from pipeline.api.building import carve as carve
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from pipeline.api.measuring import diagnose as diagnose
     from pipeline.api.measuring import measure as measure
     from pipeline.api.meshes import Mesh as Mesh
+    from pipeline.api.monitoring import Monitoring as Monitoring
+    from pipeline.api.monitoring import monitor as monitor
     from pipeline.api.pictures import Picture as Picture
     from pipeline.api.planning import Plans as Plans
     from pipeline.api.planning import SensorPlan as SensorPlan
@@ -64,6 +66,7 @@ _MODULES = {
     "pipeline.api.detecting": ("Detections", "detect"),
     "pipeline.api.measuring": ("Diagnosis", "Measurement", "diagnose", "measure"),
     "pipeline.api.meshes": ("Mesh",),
+    "pipeline.api.monitoring": ("Monitoring", "monitor"),
     "pipeline.api.pictures": ("Picture",),
     "pipeline.api.planning": ("Plans", "SensorPlan", "plan"),
     "pipeline.api.points": ("Points",),
@@ -72,4 +75,4 @@ _MODULES = {
     "pipeline.dataset.loaders": ("Sample", "Tiles"),
 }  # fmt: skip
 __all__ = [name for names in _MODULES.values() for name in names]  # noqa: PLE0604, RUF100
-__getattr__, __dir__ = lazily(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_attributes(__name__, {name: module for module, names in _MODULES.items() for name in names})

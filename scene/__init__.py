@@ -1,6 +1,6 @@
-"""Make rock walls and the blocks that fall from them, and trace rays against both.
+"""Make rock walls, carve blocks out of them, and trace rays against the result.
 
-No sensor is known here. The names below can be imported from `scene` itself, for sensors of one's own.
+Nothing here depends on a sensor. The names below can be imported from `scene` itself by code that adds a sensor of its own.
 Start with `walls`, `blocks` and `ray_casting`; `common` holds errors, config models and random numbers.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene.common.lazy import lazily
+from scene.common.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from scene.blocks.block import Blocks as Blocks
@@ -29,4 +29,4 @@ _MODULES = {
     "scene.ray_casting.raycast": ("RayCaster",),
 }
 __all__ = [name for names in _MODULES.values() for name in names]  # noqa: PLE0604, RUF100
-__getattr__, __dir__ = lazily(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_attributes(__name__, {name: module for module, names in _MODULES.items() for name in names})

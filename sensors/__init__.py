@@ -1,15 +1,15 @@
-"""Simulate the two sensors, a stereo pair and a terrestrial laser scanner, with their errors and noise.
+"""Simulate the two sensors, a stereo pair and a terrestrial laser scanner, with their systematic errors and noise.
 
-Surfaces and maps are made from observations in `pipeline`.
-The names below can be imported from `sensors` itself, for effects of one's own.
-Start with `laser/tls.py` or `stereo/stereo_pair.py`; each error of a sensor is one file in `effects`.
+Surfaces and maps are made from observations in `pipeline`. The names below can be imported from `sensors` itself by code that
+adds an effect or a sensor of its own. Start with `laser/tls.py` or `stereo/stereo_pair.py`; each error of a sensor is one file
+in `effects`.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from scene.common.lazy import lazily
+from scene.common.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from sensors.cameras.camera import Camera as Camera
@@ -35,4 +35,4 @@ _MODULES = {
     "sensors.signal_chain.pulses": ("PulseGeometry",),
 }
 __all__ = [name for names in _MODULES.values() for name in names]  # noqa: PLE0604, RUF100
-__getattr__, __dir__ = lazily(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_attributes(__name__, {name: module for module, names in _MODULES.items() for name in names})

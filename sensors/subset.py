@@ -1,6 +1,6 @@
-"""Sensors that are asked for some of their cells or pulses only: the same values there as in a whole observation.
+"""Observe only some cells or pulses of a sensor, with the same values as in a complete observation.
 
-Effects that look at neighbours need the whole observation (`looking_around`).
+Effects that depend on neighbouring cells need the complete observation (`effects_needing_neighbours`).
 """
 
 from __future__ import annotations
@@ -19,45 +19,49 @@ from sensors.signal_chain.pulses import Pulses
 from sensors.stereo.stereo_pair import StereoPair
 
 
-def looking_around(model: StereoModel | TlsModel) -> list[str]:
-    """Names of its effects that look at more than their own cell or pulse."""
+def effects_needing_neighbours(model: StereoModel | TlsModel) -> list[str]:
+    """Return the names of the model's effects that depend on more than their own cell or pulse."""
     return sorted({effect.name for effect in model.effects if effect.looks_at != "element"})
 
 
 @dataclass(frozen=True)
 class ChosenCells(StereoPair):
-    """A stereo pair that is asked for some cells of the left depth map only. chosen: (n,) their numbers, counted by row."""
+    """A stereo pair that observes only some cells of the left depth map. chosen: (n,) cell numbers, row by row."""
 
     chosen: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, dtype=np.uint32))
 
     @property
     def shape(self) -> tuple[int, int]:
+        """(n, 1), the shape of an observation."""
         return len(self.chosen), 1
 
     def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
+        """Return number and centre (u, v), px, of the chosen cells."""
         index = on_device(mi.UInt32, self.chosen)
         return index, *self.centres(index)
 
 
 @dataclass(frozen=True)
 class ChosenPulses(LaserScanner):
-    """A laser scanner that sends some pulses of its pattern only. chosen: (n,) their numbers, counted along the lines."""
+    """A laser scanner that emits only some pulses of its pattern. chosen: (n,) pulse numbers, line by line."""
 
     chosen: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, dtype=np.uint32))
 
     @property
     def shape(self) -> tuple[int, int]:
+        """(n, 1), the shape of an observation."""
         return len(self.chosen), 1
 
     def emit(self) -> Pulses:
+        """Return the chosen pulses before any effect."""
         return self.pulses_at(on_device(mi.UInt32, self.chosen))
 
 
 @overload
-def asked_for(sensor: StereoPair, cells: NDArray[np.uint32]) -> ChosenCells: ...
+def restrict_to(sensor: StereoPair, cells: NDArray[np.uint32]) -> ChosenCells: ...
 @overload
-def asked_for(sensor: LaserScanner, cells: NDArray[np.uint32]) -> ChosenPulses: ...
-def asked_for(sensor: StereoPair | LaserScanner, cells: NDArray[np.uint32]) -> ChosenCells | ChosenPulses:
-    """The sensor, asked for some cells or pulses (n,)."""
+def restrict_to(sensor: LaserScanner, cells: NDArray[np.uint32]) -> ChosenPulses: ...
+def restrict_to(sensor: StereoPair | LaserScanner, cells: NDArray[np.uint32]) -> ChosenCells | ChosenPulses:
+    """Return the same sensor restricted to some cells or pulses, given by their numbers (n,)."""
     own = {each.name: getattr(sensor, each.name) for each in fields(sensor)} | {"chosen": cells}
     return ChosenCells(**own) if isinstance(sensor, StereoPair) else ChosenPulses(**own)

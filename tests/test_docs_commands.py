@@ -1,7 +1,7 @@
 """Every command of README.md and docs/ does what its page says: it is run on a small scene, or resolved as if it were.
 
-A command that stands in none of the lists here fails `test_every_command_is_in_a_list`. The how-tos' commands are carried out by
-test_docs.py, those of docs/reference/mistakes.md by test_mistakes.py.
+A command that stands in none of the lists here fails `test_every_command_is_in_a_list`. test_docs.py carries out the commands of
+how-to guides and tutorials, and test_mistakes.py those of docs/reference/mistakes.md.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ COMPLETION = "scarpsim completion bash"
 VIEW = "scarpsim view runs/my_run"
 TRIED_ELSEWHERE = ("mistakes.md", "checks.md")
 """Pages whose commands test_mistakes.py and test_checks.py carry out."""
-RUN = (INIT, FIRST, MY_SITE, MY_SET, PLAN, SCRIPT, COMPLETION, VIEW)
+RUN = (INIT, MY_SITE, MY_SET, PLAN, SCRIPT, COMPLETION, VIEW)
 """Carried out by the tests of their own below."""
 
 RESOLVED = (
@@ -191,7 +191,6 @@ RESOLVED = (
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
 PARSED = (
-    "scarpsim icp-study runs/my_site",
     "scarpsim calibrate my_measurement --out calibration",
     "scarpsim dataset verify sets/small",
     "scarpsim dataset verify sets/small --report-only",
@@ -206,8 +205,8 @@ PARSED = (
     "scarpsim dataset split sets/ab --by sensor,noise,size --out sets/parts",
     "scarpsim dataset split sets/twelve --by sensor --out sets/twelve_by",
     "scarpsim dataset split sets/thirteen --by sensor --out sets/thirteen_by",
-    "scarpsim detect detector/best runs/bulga",
     "scarpsim detect detector/best runs/bulga --out found",
+    "scarpsim detect default runs/bulga --out found",
     "scarpsim detect default runs/bulga --unmirrored",
     "scarpsim detect default sets/direct/test --out found",
     "scarpsim evaluate sets/direct/test found/detections.json --by size_class --confidence 0.95",
@@ -219,6 +218,8 @@ PARSED = (
     "scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis",
     "scarpsim gap cloud.ply --reference wall.ply --photographs --out diagnosis",
     "scarpsim view diagnosis",
+    "scarpsim view finding",
+    "scarpsim view runs/scanner runs/pair",
     "scarpsim view runs/stereo runs/tls",
     "scarpsim view sets/small/test",
     "scarpsim doctor",
@@ -240,24 +241,18 @@ NAMED = (
     "scarpsim completion --help",
     "scarpsim simulate",
     "scarpsim calibrate",
-    "scarpsim calibrate MEASUREMENT --out calibration",
     "scarpsim compare",
     "scarpsim compare CONFIG [CONFIG ...] [--measured FOLDER ...] [--epochs N] [--sizes-m FIRST LAST | --blocks config] "
     "[--own-step]",
     "scarpsim detect",
-    "scarpsim detect default",
     "scarpsim export",
     "scarpsim gap",
     "scarpsim gap --identifiability",
     "scarpsim gap --identifiability CONFIG",
     "scarpsim gap MEASUREMENT --identifiability",
-    "scarpsim gap MEASUREMENT --out DIR",
-    "scarpsim measurement",
-    "scarpsim gap MEASUREMENT --out gap",
     "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",
-    "scarpsim inspect CONFIG",
     "scarpsim inspect my_site.yaml",
     "scarpsim dataset",
     "scarpsim surface",
@@ -288,7 +283,7 @@ def carry_out(command: str, *further: str) -> str:
 
 @pytest.fixture(scope="module", autouse=True)
 def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder where README's first commands were typed, with the other files that the pages speak of, as working folder."""
+    """The working folder: README's first commands were typed in it, and it holds the other files that the pages name."""
     before, folder = Path.cwd(), tmp_path_factory.mktemp("docs")
     os.chdir(folder)
     try:
@@ -322,7 +317,11 @@ def test_every_command_is_in_a_list() -> None:
     listed = [*RUN, *RESOLVED, *PARSED, *NAMED, *OF_A_STYLE_TO_COME, *OF_A_PACKAGE_TO_COME]
     assert len(set(listed)) == len(listed)
     carried_out = {
-        line for page in howtos.PICTURES for step in howtos.steps(page) if not step.file for line in step.text.splitlines()
+        line
+        for page in (*howtos.PICTURES, *howtos.TUTORIALS)
+        for step in howtos.steps(page)
+        if not step.file
+        for line in step.text.splitlines()
     }
     shown = {command for page in PAGES if page.name not in TRIED_ELSEWHERE for command in commands(page)}
     assert shown - carried_out - set(listed) == set(), "put these into one of the lists, at best RUN"
@@ -362,8 +361,8 @@ def test_the_first_simulation_is_of_the_mesh_and_the_scanner_that_were_asked_for
         assert words in report
 
 
-def test_the_run_folder_holds_what_the_readme_says() -> None:
-    """Files of a laser scanner's run; `depth_left.tif` is the pair's."""
+def test_the_run_folder_holds_what_its_page_says() -> None:
+    """The files of a laser scanner's run, by docs/reference/formats/run_folder.md."""
     for name in ("difference_001.tif", "annotations.json", "report.html"):
         assert (Path("runs/my_run") / name).stat().st_size > 0
     for name in ("points.laz", "surface.ply", "truth.ply", "blocks.json"):
@@ -386,7 +385,7 @@ def test_init_with_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert Path("scarpsim.yaml").read_text().endswith((configs_folder() / "datasets/small.yaml").read_text())
 
 
-def test_the_plan_says_what_the_readme_promises() -> None:
+def test_the_plan_has_the_maps_that_the_readme_promises() -> None:
     """Maps of precision, spacing, blind spots and the smallest block. Of the scanner here; a how-to inspects both sensors."""
     carry_out(PLAN, *TINY_WALL, "--sensor", "tls", "--set", "planning.gsd_m=0.5", "--quiet")
     maps = {path.stem for path in Path("plan").glob("*.tif")}

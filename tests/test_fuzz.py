@@ -133,7 +133,7 @@ def test_an_archive_is_no_wall(tmp_path: Path) -> None:
     """Nothing is unpacked, so an archive cannot fill memory or disk."""
     for name in ("wall.zip", "wall.tar.gz", "wall.bz2"):
         (tmp_path / name).write_bytes(b"PK")
-        with pytest.raises(InputError, match="is no mesh format"):
+        with pytest.raises(InputError, match="is not a mesh format"):
             ImportedWall(mesh=tmp_path / name).load()
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from scene.common.errors import InputError
-from scene.common.plug_ins import plugged
+from scene.common.plug_ins import load_plug_ins
 
 ROOT = Path(__file__).parents[1]
 MODULE = """
@@ -123,4 +123,4 @@ def test_wrong_entry_points_are_said_in_one_line(
     (info / "entry_points.txt").write_text(f"[scarpsim.tests]\n{entry}\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(InputError, match=problem):
-        plugged("scarpsim.tests", "a number", lambda value: isinstance(value, int), {"known"})
+        load_plug_ins("scarpsim.tests", "a number", lambda value: isinstance(value, int), {"known"})

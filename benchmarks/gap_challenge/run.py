@@ -15,6 +15,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import subprocess
 import sys
 import time
 import traceback
@@ -63,10 +64,17 @@ def run(
         with ProcessPoolExecutor(jobs, mp_context=_CONTEXT) as pool:
             list(pool.map(_make, [(case, _folder(out, case), _truth(out, case)) for case in missing]))
     _diagnose_all(open_cases, out, jobs, limit_s, keep)
-    found = {"settings": {"cases": count, "seed": seed, "small": small, **chosen}, **score([_pair(out, case) for case in cases])}
+    settings = {"cases": count, "seed": seed, "small": small, **chosen, "commit": _commit()}
+    found = {"settings": settings, **score([_pair(out, case) for case in cases])}
     (out / "results.json").write_text(json.dumps(found, indent=1))
     (out / "table.md").write_text(markdown(found))
     return found
+
+
+def _commit() -> str:
+    """The commit of the program, "" outside of a checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def _folder(out: Path, case: Case) -> Path:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 Json = dict[str, Any]
-_PAGE = "docs/validation/gap_challenge.md"
+_SENSORS = {"tls": "laser scanner", "stereo": "stereo pairs"}
 _ANSWERS = (
     "right, alone",
     "right, in a class",
@@ -18,43 +18,88 @@ _ANSWERS = (
     "error",
 )
 
-_ALWAYS = """Always on: a pose off by millimetres and some 10 microradians; an error of the reference of 0.2-0.8 mm (stereo 1-4
-mm), correlated over 1.5-6 m; albedo that varies smoothly and from point to point; 1-2 % of the returns missing, in a third of the
-cases shrubs (round patches without returns); fallen blocks and debris in all strata but `none`; optional fields absent in a
-quarter of the cases each; in one of eight laser cases an effect that the model has right already. Magnitudes: S/N, or S/N x
-sin(angle), from 2 to 120, even in its logarithm, where no more than three times the catalogue's largest typical size gives it."""
+_NUISANCES = """| always present | size |
+| --- | --- |
+| pose | wrong by millimetres and some 10 microradians |
+| error of the reference | 0.2 to 0.8 mm for the laser, 1 to 4 mm for stereo, correlated over 1.5 to 6 m |
+| albedo | varies smoothly and from point to point |
+| missing returns | 1 to 2 %; in a third of the cases also shrubs (round patches without returns) |
+| changes of the scene | fallen blocks and debris in all cases but those without an effect |
+| optional fields | each absent in a quarter of the cases |
+| effects that the model has right already | in one of eight laser cases |
 
+Strengths are spread evenly in their logarithm from 2 to 120, up to three times the catalogue's largest typical size."""
 
-_UNDECIDED = "undecided: the 95 % interval holds values that reach the goal and values that do not."
+_LABELS = {
+    "gap closed, all cases' metres summed": "gap closed, summed over all cases in metres",
+    "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation by the angle to the "
+    "nearest other effect, 1 - sin^2 (median)",
+    "the same, where that angle leaves it 5 % at most": "the same, where the expectation is 5 % at most",
+}
+"""Rows of the results whose names need more words on the page."""
+
+_READING = """"Undecided" means that the 95 % interval (Wilson) holds values that reach the goal and values that do not. The best
+wrong effect closes much of the gap wherever two signatures are alike: fitted freely, an effect at the angle a to the true one
+takes 1 - sin^2 a of its square, whatever the method."""
 
 
 def markdown(found: Json) -> str:
-    """docs/validation/gap_challenge.md, from results.json."""
+    """docs/validation/gap_challenge.md, or that of one sensor, from results.json."""
+    sensor = _SENSORS.get(found["settings"].get("sensor", ""), "both sensors")
     parts = [
-        "# The challenge of the missing effect",
-        f"{len(found['rows'])} measurements with hidden truth, made by `benchmarks/gap_challenge`, which shares no code with the "
-        "sensors or the diagnosis, each diagnosed by `scarpsim gap`. S/N: of the effect's signature after the pose fit, against "
-        "noise and the reference's correlated error; x sin(angle): what is left of it when the nearest "
-        "effect of another class is fitted too (signatures with sin < 0.1 make one class).",
-        _ALWAYS,
-        _figures(found["figures"], found["by_sensor"]),
-        _UNDECIDED,
-        _command(found["settings"]),
-        f"A case took {found['seconds'].get('median', 0):.0f} s (median), {found['seconds'].get('longest', 0):.0f} s at most.",
-        "## Beside two baselines\n\nBoth take residuals for independent and give one name: the effect with the largest |z| above "
-        "3, and the best by BIC if by more than 10.\n\n" + _baselines(found),
-        "## What was answered\n\nclear: S/N x sin(angle) of 8 or more; weak: less.\n\n" + _by_effect(found["by_effect"]),
-        "## Detection\n\nSingle effects: found at all by S/N; right class by S/N x sin(angle).\n\n" + _curves(found["detection"]),
+        f"# Measurements simulated in closed form: {sensor}",
+        _introduction(found),
+        _made_by(found),
+        "## Results\n\n" + _figures(found["figures"], found["by_sensor"]),
+        _READING,
+        "## What the measurements hold\n\n" + _NUISANCES,
+        "## Compared with two simple methods\n\nBoth take residuals as independent and give one name: the effect with the "
+        "largest |z| above 3, or the best effect by BIC if it is ahead by more than 10.\n\n" + _baselines(found),
+        "## Answers by effect\n\nThe numbers count clear cases; weak ones, with S/N x sin(angle) below 8, are in brackets.\n\n"
+        + _by_effect(found["by_effect"]),
+        "## Detection by strength\n\nSingle effects: found at all by S/N, in the right class by S/N x sin(angle).\n\n"
+        + _curves(found["detection"]),
         "## Coverage of the 90 % intervals\n\n" + _coverage(found["coverage"]),
-        "## All failures\n\n" + _failures(found["failures"]),
+        "## Failures\n\n" + _failures(found["failures"]),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _command(settings: Json) -> str:
+def _introduction(found: Json) -> str:
+    """What was evaluated, and what it comes to."""
+    figures = {row["what"].split(" at S/N")[0]: row for row in found["figures"]}
+
+    def counted(what: str) -> str:
+        return f"{figures[what]['successes']} of {figures[what]['count']}"
+
+    return f"""This page shows how often `scarpsim gap` names the right effect in {_cases(found)} simulated measurements whose
+truth it cannot see. It is for users who want to know how far to trust an answer. The generator (`benchmarks/gap_challenge`)
+works in closed form and shares no code with the sensors or the diagnosis.
+
+- {counted("right class")} clear effects are in the right class.
+- {counted("wrong names among committed answers")} answers that name an effect hold a wrong name.
+- {counted("false alarms on no-effect cases")} measurements without an effect raise a false alarm.
+
+S/N is the strength of an effect: its signature after the pose fit, against the noise and the correlated error of the reference.
+S/N x sin(angle) is what is left of it when the nearest effect of another class is fitted too. An effect is clear if that is 8 or
+more. Signatures with a sine below 0.1 form one class."""
+
+
+def _cases(found: Json) -> int:
+    """How many measurements were diagnosed."""
+    return next(int(row["count"]) for row in found["figures"] if row["what"] == "cases without an answer")
+
+
+def _made_by(found: Json) -> str:
+    settings, seconds = found["settings"], found["seconds"]
+    sensor = settings.get("sensor")
+    page = f"docs/validation/gap_challenge{f'_{sensor}' if sensor else ''}.md"
     words = f"python benchmarks/gap_challenge/run.py --cases {settings['cases']} --seed {settings['seed']}"
     chosen = "".join(f" --{key} {settings[key]}" for key in ("stratum", "sensor") if key in settings)
-    return f"From `{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table {_PAGE}`."
+    command = f"`{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table {page}`"
+    took = f"{seconds.get('median', 0):.0f} s (median), {seconds.get('longest', 0):.0f} s at most"
+    row = (_cases(found), settings["seed"], settings.get("commit", ""), took, command)
+    return _table(("cases", "seed", "commit", "time of a case", "command"), [row])
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
@@ -78,9 +123,13 @@ def _figures(figures: list[Json], by_sensor: dict[str, list[Json]]) -> str:
         said = reached[row["reached"]]
         return f"{value(row)}, {said}" if said else value(row)
 
-    head = ("what", "to reach", "both sensors", "laser", "stereo")
-    columns = zip(figures, by_sensor["tls"], by_sensor["stereo"], strict=True)
-    return _table(head, ((each[0]["what"], each[0]["goal"], *map(cell, each)) for each in columns))
+    shown = {_SENSORS[sensor]: rows for sensor, rows in by_sensor.items() if rows[-1]["count"]}
+    columns = {"both sensors": figures, **shown} if len(shown) > 1 else shown
+    lines = zip(*columns.values(), strict=True)
+    return _table(
+        ("what", "goal", *columns),
+        ((_LABELS.get(each[0]["what"], each[0]["what"]), each[0]["goal"], *map(cell, each)) for each in lines),
+    )
 
 
 def _baselines(found: Json) -> str:
@@ -111,6 +160,8 @@ def _by_effect(counts: Json) -> str:
 def _curves(detection: Json) -> str:
     rows = []
     for sensor, bins in detection.items():
+        if not any(row["cases"] or row["cases_by_angle"] for row in bins):
+            continue
         for row in bins:
             upper = "" if row["to"] is None else f"{row['to']:g}"
             rows.append(
@@ -140,7 +191,7 @@ def _failures(failures: list[Json]) -> str:
         )
         for f in sorted(failures, key=lambda f: (f["wrong"], f["sensor"]))
     )
-    return _table(("case", "sensor", "stratum", "wrong", "truth", "answer"), rows)
+    return _table(("case", "sensor", "effects", "what is wrong", "truth", "answer"), rows)
 
 
 def _last(error: str) -> str:

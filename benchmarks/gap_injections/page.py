@@ -14,97 +14,76 @@ _CLEAR, _STRONG = 8.0, 30.0
 
 _HEAD = """# Known effects put into real scans
 
-Made by
+This page shows whether `scarpsim gap` names a known effect in a real measurement. Real measurements disagree with their model in
+ways that no generator makes: edges, twigs, relief between points, rounded coordinates. The page is for users who want to know
+what to expect from data of their own. The [closed-form generator](gap_challenge.md) tests the same on simulated measurements.
 
-    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections --page docs/validation/gap_injections.md
+Each case is a measurement of ../shared/data into whose ranges, angles or disparities a known effect was put by a closed form
+(`benchmarks/gap_injections/formulas.py`, which uses NumPy and SciPy alone). It is then diagnosed as `scarpsim gap` does it. Made
+by
 
-(by this command, not by hand). Each row is a real measurement of ../shared/data into whose ranges, angles or disparities a known
-effect was put by a closed form (`benchmarks/gap_injections/formulas.py`, NumPy and SciPy alone), diagnosed as `scarpsim gap` does
-it. The measurements have disagreements of their own, which no generator makes: edges, twigs, relief between points, rounding. The
-table beside it, of [the challenge](gap_challenge.md), has measurements that a generator made.
+    OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections --page docs/validation/gap_injections.md"""
 
-- **right**: the effect is named, within 3 standard errors or 15 % of what was put in (a period within 5 %), and no other effect
-  is blamed. Of an effect of no catalogue (`off_...`): the answer is `unknown`, and no effect of the catalogue is blamed.
-- **class**: it is among those that the answer says cannot be told apart.
-- **described**: it is there with its size, but as an empirical term: the answer gives it for a description, not for the cause.
-- **size**: it alone is named, with another size.
-- **missed**: no effect of the catalogue is named (an empirical term may describe it); off the catalogue: no `unknown`.
-- **wrong**: another effect is blamed, alone or beside it, that was not named without the injection.
-- **refused**: one line of an error instead of an answer.
+_JUDGED = {
+    "right": (
+        "names the effect, within 3 standard errors or 15 % of its size (a period within 5 %), and blames no other; for "
+        "an effect outside the catalogue (`off_...`): `unknown`, and no effect of the catalogue is blamed"
+    ),
+    "class": "lists the effect among those that cannot be told apart",
+    "described": "has the effect with its size, but as an empirical term",
+    "size": "names the effect alone, with another size",
+    "missed": "names no effect of the catalogue; outside the catalogue: is not `unknown`",
+    "wrong": "blames another effect that was not named without the injection",
+    "refused": "is an error message",
+}
+"""What each judgement means."""
 
-S/N is that of what the effect does to the residuals beyond what a pose takes up, in white noise of the measurement's own spread
-(means), or of their larger variance (noise); real errors, which neighbours share, make it smaller."""
+_STRENGTH = (
+    "S/N is the signal-to-noise ratio of what the effect does to the residuals beyond what a pose takes up. The "
+    "noise is taken as white, with the spread of the measurement itself (systematic effects) or the larger variance"
+    " (noise effects). Real errors are shared by neighbours and make it smaller."
+)
 
-_SHOWED = """## What the failures showed
+_CAUSES = {
+    "ground of the forest, noise of 1 and 2 mm": (
+        "the relief between the points of the reference is as large (2.3 mm), and counts as [the reference's "
+        "error](../explanation/how_gap_works.md#references-made-of-points)"
+    ),
+    "effects of more than ten typical sizes that the pose nearly undoes": (
+        "they are left out on purpose; what is named in their place has them in its class"
+    ),
+    "angle noise of 1 mrad": (
+        "it moves points beyond their triangle, and a noise that depends on the incidence is named beside it"
+    ),
+    "`trees`, a constant offset": "an error of an angle and a wave of the range describe it as well",
+    "`rocks`": (
+        "residuals spread 2.4 times what the model predicts, and neighbours share most of that (relief, coordinates "
+        "rounded to 6 cm); its own intensity bias of -0.022 m adds to what was put in"
+    ),
+    "`light`, effects of hundredths of a pixel": (
+        "its noise is 0.009 px with 3 % of the points far out, and camera effects as small as that are blamed"
+    ),
+    "`light`, 3 px of the principal point, 5 px of the focal length": (
+        "the picture moves by 2 to 3 px over edges that are known to 0.01 px, so that edges count as change or noise"
+    ),
+    "a wave along rows of S/N 120": "it is found, but does not hold on the validation blocks",
+}
+"""Where cases fail, and why."""
 
-Mended after the run of 23 November 2026, which was right in 37 of 68 and wrong in 12:
-
-- **Incidence** (6 to 9, 24, 25, 34, 46). Where the reference is a half of the scan, its triangles lean by noise and by relief
-  between points: on the forest's ground 1 / cos i of the triangles and of planes through 24 points correlate by 0.5, and after
-  the pose fit by 0.03 to 0.09, so that the candidate that is true explained nothing. References made of points are asked for
-  planes now (`incidence` in measurement.yaml). Smoothing the reference itself would be wrong: points that are left out of it
-  lie farther from a smoothed surface, so most of the lean is relief.
-- **Two crashes** (59, 61): a large effect turned all rays off the reference.
-- **A free form that wins and then fails on held-out blocks** (41, 42 to 51) left nothing: all is named again without any. On the
-  rock face the answer is now, with and without what was put in, a bias of -0.022 m per unit of log intensity: with the +0.02 m
-  put in by 44 nothing is left of it, which speaks for the file having it.
-- **The score on held-out blocks of pairs** compared a pixel with the middle of the depth map's cell, half a pixel beside it.
-
-Mended on 24 November 2026, after 45 of 76 right and 9 wrong:
-
-- **Noise of the right size as an empirical term** (22, 35): a noise of the catalogue that explains more than nine tenths of what
-  a free form does is named, and the rest is a note.
-- **Right names under `unknown`** (1, 10, 11, 39, 40), and an offset that was missed (17): what remains is tested beside the terms
-  that describe it, and a place on the wall is no cause.
-
-Since the evening of 24 November 2026 the error of a reference made of points is carried beside the instrument's noise, edges
-between its points have no say, and residuals that spread far more than predicted are no agreement
-([why](README.md#references-made-of-points)). These 76 gained nothing by it, 45 right and 12 wrong after 48 and 10: on the
-forest's ground and on the rocks most of that error is relief. A fifth of the points fewer are looked at, and more relief counts
-as the reference's:
-
-- missed since: 21 and 22 (noise of 1 and 2 mm beside relief of 2.3 mm; the second is described, as growing with the range), 34
-  and 39;
-- 41 (an offset of 10 mm among trees) is described as an error of an angle beside a wave of the range; 50 has an incidence bias
-  beside it;
-- the rock face's own intensity bias is named less often than before (42, 44), and no gap is closed by it.
-
-Asked again on 25 November 2026, `light` alone (`--only light`, not in the table below): 11 of 18 right, 6 wrong, 1 missed,
-after 9, 8 and none.
-
-- **Noise on nodes, 0.1 px every 32 px** (66) was taken for white noise, and beside it a locking that was none: of a map of which
-  every second row is compared, rows lie twice as far apart as columns, which the semivariogram of the noise did not know. It is
-  named now (0.097 px every 27 px).
-- **Bands of columns** (69, S/N 428) are `unknown` with a curve that repeats, before three effects were named; the wave of S/N 120
-  (53) is missed, before a skew was named.
-- 66 was asked a second time, once mended. 59 was `several`, though the gap grew; by its numbers that is `unknown` since, which
-  was not asked again.
-
-Not mended:
-
-- **Effects of more than ten times their usual size that the pose nearly undoes** (15, 37, 40) are left out on purpose; what is
-  named in their place has them in its class now.
-- **Angle noise of 1 mrad** (28) moves a point beyond its triangle; a noise by the incidence is named beside it since.
-- **The structured light is too good** (53, 56, 60 and others of `light`): its noise is 0.009 px with 3 % of the points far out,
-  and camera effects of as little are blamed. In answers on the matcher what it has without an injection does not count.
-- **Large camera errors in a precise measurement with steps** (59, 61): 3 px of the principal point or 5 px of the focal length
-  move the picture by 2 to 3 px, over the edges of a scene that is known to 0.01 px. The effects are fitted to first order, so
-  that edges count as change or noise. 0.3 px (58) are named.
-- **Dropped on held-out blocks** (53): a wave along rows of S/N 120 is found, and dropped since it does not hold there.
-- **The rock face** spreads 2.4 times what the model predicts, most of it shared by neighbours (relief between points, coordinates
-  rounded to 6 cm): what is weak beside that is not found (42, 46, 47, 49, 51). It has a bias of its own by the intensity, of
-  -0.022 m: 44 and 45 are judged without it, and come out as the sum.
-"""
+_DISPARITIES = ("light", "matcher")
 
 
 def page(rows: list[Json], bases: dict[str, Json]) -> str:
     """docs/validation/gap_injections.md."""
+    failed = [row for row in rows if row["judgement"] not in ("right", "class")]
     parts = [
         _HEAD,
-        "## The measurements as they are\n\n" + _bases(bases),
-        "## In short\n\n" + _counts(rows),
-        _because_of_the_base(rows),
-        _SHOWED,
+        "## Results\n\n" + _in_short(rows) + "\n\n" + _counts(rows),
+        "## How answers are judged\n\n" + _table(("judged", "the answer"), _JUDGED.items()),
+        _STRENGTH,
+        "## The measurements without an injected effect\n\n" + _bases(bases),
+        "## Why cases fail\n\n" + _table(("where", "why"), _CAUSES.items()),
+        f"## Failures\n\n{len(failed)} of {len(rows)} cases.\n\n" + _rows(failed),
         "## All injections\n\n" + _rows(rows),
     ]
     return "\n\n".join(parts) + "\n"
@@ -122,9 +101,7 @@ def _bases(bases: dict[str, Json]) -> str:
         found = bases[name]
         last = found.get("as_diagnosed", found["as_it_is"])
         rows.append([f"`{name}`", BASES[name].about, f"{last['points']:,}", _verdict(found["as_it_is"]), _base_words(found)])
-    return _table(
-        ("name", "what", "points", "answer", "with the noise that it proposes, which is what effects are put into"), rows
-    )
+    return _table(("name", "what", "points", "answer", "answer with the noise that it proposes; effects are put into this"), rows)
 
 
 def _base_words(found: Json) -> str:
@@ -154,13 +131,24 @@ def _counts(rows: list[Json]) -> str:
     return _table(("injections", "number", *_KINDS), lines)
 
 
-def _because_of_the_base(rows: list[Json]) -> str:
-    right = [row for row in rows if row["judgement"] in ("right", "class") and not row["effect"].startswith("off_")]
-    spoiled = [row for row in right if row["verdict"] == "unknown"]
-    return (
-        f"Of the {len(right)} injections of the catalogue that were named right or within their class, the verdict is `unknown` "
-        f"all the same in {len(spoiled)}: what the measurement had before stays open."
+def _in_short(rows: list[Json]) -> str:
+    """What the counts come to."""
+    good = [row for row in rows if row["judgement"] in ("right", "class")]
+    known = [row for row in good if not row["effect"].startswith("off_")]
+    spoiled = [row for row in known if row["verdict"] == "unknown"]
+    said = []
+    for words, on_disparities in (("laser scans", False), ("disparities", True)):
+        group = [row for row in rows if (row["base"] in _DISPARITIES) is on_disparities]
+        right = sum(row in good for row in group)
+        wrong = sum(row["judgement"] == "wrong" for row in group)
+        said.append(
+            f"On {words}, {right} of {len(group)} answers are right or hold the effect in their class, and {wrong} blame another."
+        )
+    said.append(
+        f"In {len(spoiled)} of the {len(known)} good answers on effects of the catalogue the verdict is still `unknown`, because "
+        "the disagreement that the measurement had before stays unexplained."
     )
+    return " ".join(said)
 
 
 def _rows(rows: list[Json]) -> str:

@@ -16,11 +16,21 @@ from . import laser_effects, stereo_effects
 OUTCOMES = ("alone", "class", "more", "part", "wrong name", "unknown", "no_gap", "insufficient_data", "error")
 RIGHT = {"none": ("no_gap",), "change": ("no_gap",), "off": ("unknown",), "one": ("alone", "class"), "two": ("alone", "class")}
 CLEAR = 12.0
-_ABOUT = """Written by someone who knew what effects, measurement folders and answers are (`EFFECTS.md`, `CONTRACT.md`, `GAP.md`)
-and nothing of the program: walls with joints, benches, overhangs and roofs; references that are wrong by a bend, a fractal, in
-strips or in tiles; scans with gaps, shrubs and lost double echoes; pairs that converge, with a matcher's noise on grids; sizes by
-their signal-to-noise ratio, from 6 to 100, no more than a few times the catalogue's. More: a right name beside another one; part:
-one of two effects.
+_NAMING, _BLAMING = ("alone", "class", "more", "part", "wrong name"), ("wrong name", "more")
+_TITLES = {"tls": "Laser scans", "stereo": "Stereo pairs"}
+_ABOUT = """The generator (`benchmarks/gap_judge`) was written from the descriptions of effects, measurement folders and answers
+alone, without knowledge of the program. So it makes other assumptions than the [first generator](gap_challenge.md):
+
+| part | what it makes |
+|---|---|
+| walls | joints, benches, overhangs and roofs |
+| error of the reference | a bend, a fractal, strips or tiles |
+| laser scans | gaps, shrubs, lost double echoes |
+| stereo pairs | converging cameras, a matcher's noise on grids |
+| strength of an effect | signal-to-noise ratio of 6 to 100, no more than a few times the catalogue's typical size |
+"""
+_WORDS = """"More" is a right name beside another one, and "part" one of two effects. "Ratio" is the signal-to-noise ratio of an
+effect, and "apart" what the nearest other effect leaves of it. Intervals are binomial, 95 %.
 """
 LEVEL_90 = float(norm.ppf(0.95))
 EDGED = ("strips", "tiles")
@@ -111,14 +121,44 @@ def share(count: int, total: int) -> str:
     return f"{count}/{total} ({100 * count / total:.0f} %; {100 * low:.0f}-{100 * high:.0f})"
 
 
-def table(results: list[Result], command: str) -> str:
-    """Markdown: for each sensor the outcomes by kind, the rates, and the cases that are not right. command: that made it."""
-    text = f"# What a second judge found\n\nFrom `{command}`; intervals are binomial, 95 %.\n\n{_ABOUT}"
+def table(results: list[Result], command: str, commit: str) -> str:
+    """Markdown: for each sensor the outcomes by kind, the rates, and the cases that are not right.
+
+    command, commit: what made it, and of which program.
+    """
+    made_by = f"Made by `{command}`, commit {commit}."
+    text = f"# Measurements of a second generator\n\n{_in_short(results)}\n{_ABOUT}\n{made_by}\n\n{_WORDS}"
     for sensor in ("tls", "stereo"):
         mine = [each for each in results if each.truth["sensor"] == sensor]
         if mine:
-            text += f"\n## {sensor}\n\n{_outcomes(mine)}\n{_rates(mine)}\n### Not right\n\n{_not_right(mine)}"
+            text += (
+                f"\n## {_TITLES[sensor]}\n\n{_outcomes(mine)}\n{_rates(mine)}\n### Failures of the {_TITLES[sensor].lower()}\n\n"
+            )
+            text += _not_right(mine)
     return text
+
+
+def _in_short(results: list[Result]) -> str:
+    """What was evaluated, and what it comes to."""
+    clear = [each for each in results if each.truth["kind"] in ("one", "two") and each.clarity >= CLEAR]
+    quiet = [each for each in results if each.truth["kind"] == "none"]
+    spoke = [each for each in results if each.outcome in _NAMING]
+    wrong = [each for each in spoke if each.outcome in _BLAMING]
+    moved = [each for each in results if each.truth["kind"] == "change"]
+    right = sum(each.right for each in clear)
+    rejected, blamed = (sum(map(_alarmed, group)) for group in (quiet, moved))
+    return f"""This page shows how `scarpsim gap` does on {len(results)} simulated measurements of a generator that does not share
+the program's assumptions. It is for users who want to know how far the results of one generator carry over to other data.
+
+- {right} of {len(clear)} clear effects (ratio of {CLEAR:.0f} or more, the nearest other apart) are answered rightly.
+- {len(wrong)} of {len(spoke)} answers that name an effect hold a wrong name.
+- {rejected} of {len(quiet)} measurements without an effect are rejected; an effect is named in {_named(quiet)} of them.
+- {blamed} of {len(moved)} measurements with nothing but changes of the scene are rejected.
+"""
+
+
+def _named(results: list[Result]) -> int:
+    return sum(each.outcome in _NAMING for each in results)
 
 
 def _outcomes(results: list[Result]) -> str:
@@ -135,7 +175,7 @@ def _rates(results: list[Result]) -> str:
     clear = [each for each in results if each.truth["kind"] in ("one", "two") and each.clarity >= CLEAR]
     quiet = [each for each in results if each.truth["kind"] == "none"]
     moved = [each for each in results if each.truth["kind"] == "change"]
-    spoke = [each for each in results if each.outcome in ("alone", "class", "more", "part", "wrong name")]
+    spoke = [each for each in results if each.outcome in _NAMING]
     p = [each.answer["remaining"]["p_value"] for each in quiet if each.answer.get("remaining", {}).get("p_value") is not None]
     inside, judgeable = sum(each.inside for each in results), sum(each.intervals for each in results)
     jumping, even = ([each for each in quiet if (each.truth["error"]["kind"] in EDGED) is edged] for edged in (True, False))
@@ -145,9 +185,9 @@ def _rates(results: list[Result]) -> str:
         "of these, the reference wrong in strips or tiles": _count(jumping, _alarmed),
         "the reference wrong by a bend or a fractal": _count(even, _alarmed),
         "false alarms, change only": _count(moved, _alarmed),
-        "wrong names among answers that name": _count(spoke, lambda each: each.outcome in ("wrong name", "more")),
+        "wrong names among answers that name": _count(spoke, lambda each: each.outcome in _BLAMING),
         "90 % intervals that hold the truth": share(inside, judgeable),
-        "p-value of the rest below 0.01, no effect": share(sum(each < 0.01 for each in p), len(p)),
+        "p-value of what remains below 0.01, no effect": share(sum(each < 0.01 for each in p), len(p)),
         "median seconds": f"{np.median([each.answer['said']['seconds'] for each in results]):.0f}",
     }
     return "| | |\n|---|---|\n" + "".join(f"| {key} | {value} |\n" for key, value in rows.items())
@@ -162,7 +202,7 @@ def _count(results: list[Result], wanted: Callable[[Result], bool]) -> str:
 
 
 def _not_right(results: list[Result]) -> str:
-    rows = ["| case | truth | ratio (apart from) | judged | answer | p of the rest |", "|---|---|---|---|---|---|"]
+    rows = ["| case | truth | ratio (apart from) | judged | answer | p of what remains |", "|---|---|---|---|---|---|"]
     for each in results:
         if not each.right or each.outside:
             named = "; ".join(_said(effect) for effect in each.answer["effects"]) or each.answer["verdict"]

@@ -64,7 +64,9 @@ def main() -> None:
     results = [judge.judged(given.out, folder.name) for folder in folders]
     sensor = f" --sensor {given.sensor}" if given.sensor else ""
     command = f"python benchmarks/gap_judge/run.py --cases {given.cases} --seed {given.seed}{sensor} --out DIR --table FILE"
-    (given.table or given.out / "table.md").write_text(judge.table(results, command))
+    revision = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(revision, capture_output=True, text=True, check=False).stdout.strip()
+    (given.table or given.out / "table.md").write_text(judge.table(results, command, commit))
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray, TriangleMesh
-from scene.geometry.point_planes import normals_of
+from scene.geometry.point_planes import estimate_normals
 from scene.meshes.rounding import check_steps, rounded_axes
 from scene.ray_casting.raycast import RayCaster
 from scene.walls.imported import ImportedWall
@@ -93,7 +93,7 @@ def make_blocks(
     turn = np.zeros_like(place) if rotations_rad is None else _table(rotations_rad, "rotations_rad", len(place))
     if not (size > 0).all():
         raise InputError(f"holds {size.min():g} m", where="sizes", allowed="above 0")
-    return solids.given_blocks(place, size, turn, shape, subdivisions)
+    return solids.make_regular_blocks(place, size, turn, shape, subdivisions)
 
 
 def place_blocks(mesh: TriangleMesh, seed: int = 1, **keys: Any) -> solids.Blocks:
@@ -154,7 +154,7 @@ def register(moving: Any, reference: Any, seed: int = 1, **keys: Any) -> icp.Reg
     config = parse(icp.IcpConfig, keys, "register")
     points, normals = _surface_points(reference, "reference")
     if normals is None and config.method == "point_to_plane" and len(points) >= _FEWEST_FOR_NORMALS:
-        normals = normals_of(points)
+        normals = estimate_normals(points)
     return icp.register(_surface_points(moving, "moving")[0], points, normals, config, KeyedRandom(seed))
 
 

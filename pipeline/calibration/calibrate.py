@@ -30,7 +30,7 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Side
 from sensors.effects.base import Effect
-from sensors.models.sensor_model import OrientationNoise, Spread
+from sensors.models.sensor_model import DrawnParameter, OrientationNoise
 from sensors.stereo.stereo_pair import StereoPair
 
 _ALIKE = 0.9
@@ -292,7 +292,7 @@ def _patterns(simulator: WindowSimulator, pair: StereoPair) -> OrientationPatter
     still, maps = simulator.heights(simulator.noiseless_model, KeyedRandom(0)), []
     for name, sigma in moving.items():
         side: Side = "both" if pair.model.noise.orientation_drawn == "both_alike" else "left"
-        alone = OrientationNoise(**{name: Spread(mean=sigma)}).draw(side, KeyedRandom(0))
+        alone = OrientationNoise(**{name: DrawnParameter(mean=sigma)}).draw(side, KeyedRandom(0))
         effects: tuple[Effect, ...] = tuple(effect for effect in alone if not effect.is_null)
         model = simulator.noiseless_model.model_copy(update={"effects": (*pair.model.effects, *effects)})
         maps.append(still - simulator.heights(model, KeyedRandom(0)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from scene.common.errors import InputError, nearest
 from scene.geometry.mesh import FloatArray
-from sensors.models.sensor_model import OrientationNoise, Spread, StereoModel, TlsModel
+from sensors.models.sensor_model import DrawnParameter, OrientationNoise, StereoModel, TlsModel
 
 Model = StereoModel | TlsModel
 ORIENTATION = "orientation"
@@ -82,9 +82,9 @@ def _orientation(base: OrientationNoise, found: dict[str, float]) -> Orientation
     factor = found.get(ORIENTATION, 1.0)
     changed: dict[str, Any] = {}
     for name in type(base).model_fields:
-        spread: Spread = getattr(base, name)
+        spread: DrawnParameter = getattr(base, name)
         sigma = found.get(f"{ORIENTATION}.{name}", spread.sigma * factor)
-        changed[name] = Spread(mean=spread.mean, sigma=sigma)
+        changed[name] = DrawnParameter(mean=spread.mean, sigma=sigma)
     return base.model_copy(update=changed)
 
 

@@ -33,7 +33,7 @@ class ReferenceError:
         if not isinstance(measurement, TlsMeasurement) or not measurement.reference_error_m:
             return None
         planes = measurement.planes
-        return cls(measurement.reference_error_m, planes is None or planes.of_noise, measurement.viewpoint)
+        return cls(measurement.reference_error_m, planes is None or planes.noise_dominates, measurement.viewpoint)
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
         """Shift points as if the wall's vertices had errors, so that their distances from the given wall contain these errors.

@@ -38,7 +38,7 @@ from sensors.laser.tls import LaserScanner
 from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.signal_chain.observation import Observation
 from sensors.stereo.stereo_pair import StereoPair
-from sensors.subset import asked_for, looking_around
+from sensors.subset import effects_needing_neighbours, restrict_to
 
 _LATTICE_POINTS = 4000
 """Points used to register an observation; with more, the result is no nearer to a registration by all points."""
@@ -245,7 +245,7 @@ def _without_noise(model: Model) -> Model:
 def _sensor_for_cells(sensor: StereoPair | LaserScanner, model: Model, cells: NDArray[np.uint32] | None = None) -> Any:
     """Return the sensor with another model, restricted to some cells if `cells` is given."""
     asked = replace(sensor, model=model, truth=False)  # type: ignore[arg-type]
-    return asked if cells is None else asked_for(asked, cells)
+    return asked if cells is None else restrict_to(asked, cells)
 
 
 def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
@@ -260,7 +260,7 @@ def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair 
             where="reconstruction, surface",
             allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
         )
-    if names := looking_around(site.sensor.model):
+    if names := effects_needing_neighbours(site.sensor.model):
         raise InputError(
             f"{', '.join(names)}: needs the whole picture or scan, but calibration simulates only windows of it",
             where="sensor.effects",

@@ -25,7 +25,7 @@ KINDS: dict[str, type[BaseModel]] = {
 """What a file of each kind holds once it is read; `_written` adds the short forms that a file may have."""
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _NUMBER, _NAME = {"type": "number"}, {"type": "string"}
-_NUMBERS_ALONE = ("Spread", "Constant")
+_NUMBERS_ALONE = ("DrawnParameter", "Constant")
 """Sections for which a plain number may stand."""
 
 

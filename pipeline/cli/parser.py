@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from typing import NoReturn
 
 from scene.common.errors import InputError, nearest
+
+_NEGATIVE_NUMBERS = re.compile(r"^-\.?\d[\d.,eE+-]*$")
+"""A negative number, or several with commas between, is a value and no option: --position -3.5,20,1."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -21,6 +25,7 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+        self._negative_number_matcher = _NEGATIVE_NUMBERS
 
     def parse(self, words: list[str]) -> argparse.Namespace:
         """Parse the words after the command's name; a misspelt flag is named before the one that is then missing."""

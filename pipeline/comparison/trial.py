@@ -25,7 +25,7 @@ from pipeline.run.epoch import as_observed
 from pipeline.run.registered import reference_and_target, reference_sensor
 from pipeline.run.site import SensorSite, prepare_site
 from scene.blocks.block import RockfallConfig, place_blocks
-from scene.blocks.carve import carve, carved_records
+from scene.blocks.carve import block_records, carve
 from scene.blocks.distributions import Gaussian
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -153,7 +153,7 @@ def compare(
             carved = carve(sites[0].mesh, blocks)
             after = RayCaster(as_observed(config, carved.mesh))
             truths.append(
-                _true_epoch(number, carved_records(blocks, carved.removed_volume_m3), untouched, cast_raster(after, grid))
+                _true_epoch(number, block_records(blocks, carved.removed_volume_m3), untouched, cast_raster(after, grid))
             )
         for run in runs:
             with progress.stage(f"{run.setup.name}: epoch {number}"):

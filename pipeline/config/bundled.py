@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from scene.common.errors import InputError, nearest
-from scene.common.plug_ins import plugged
+from scene.common.plug_ins import load_plug_ins
 
 PLUG_INS = {"scanners": "scarpsim.scanners", "noise": "scarpsim.noise", "sites": "scarpsim.sites"}
 """The groups of entry points by which other packages name configs of a kind, each the path of a YAML file."""
@@ -26,7 +26,7 @@ def named_configs(kind: str) -> dict[str, Path]:
     if kind not in PLUG_INS:
         return own
     needs = "the path of a YAML file, as text or Path"
-    further = plugged(PLUG_INS[kind], needs, lambda value: isinstance(value, str | Path) and Path(value).is_file(), own)
+    further = load_plug_ins(PLUG_INS[kind], needs, lambda value: isinstance(value, str | Path) and Path(value).is_file(), own)
     return own | {name: Path(path) for name, path in further.items()}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.export.exported_run import ExportedRun
 from pipeline.export.perspective import colours_of, difference_at
 from pipeline.formats.meshes.gltf import GltfPart, write_gltf
-from scene.geometry.mesh import WALL, TriangleMesh, renumbered
+from scene.geometry.mesh import WALL, TriangleMesh, compact_vertices
 
 
 def save_gltf(run: ExportedRun, number: int, path: Path) -> None:
@@ -20,7 +20,7 @@ def save_gltf(run: ExportedRun, number: int, path: Path) -> None:
     label = np.full(len(surface.faces), WALL) if surface.face_block is None else surface.face_block
     parts = []
     for block in np.unique(label).tolist():
-        used, faces = renumbered(surface.faces[label == block])
+        used, faces = compact_vertices(surface.faces[label == block])
         mesh = TriangleMesh(surface.vertices[used], faces)
         parts.append(GltfPart("wall" if block == WALL else f"block_{block}", mesh, colours[used]))
     write_gltf(path, parts)

@@ -15,7 +15,8 @@ from pipeline.formats.rasters.geotiff import read_raster
 from pipeline.formats.units import AxisUnits, agreed_units
 from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.station import Station
-from pipeline.surface.triangulation import SeenSurface, triangulated
+from pipeline.surface.raster_mesh import mesh_of_raster
+from pipeline.surface.triangulation import SeenSurface, triangulate_seen_points
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.meshes.ply import read_elements
@@ -71,7 +72,7 @@ def from_file(
         return Reference(mesh, 0.0, words, (limit,))
     scans = read_scans(path, unit, option="--reference-unit")
     points = np.concatenate([scan.cloud.points for scan in scans])
-    surface = triangulated(points, position, rotation, str(path))
+    surface = triangulate_seen_points(points, position, rotation, str(path))
     said = f"cloud {path.name}: {len(points):,} points, meshed as seen {seen_from}, {len(surface.mesh.faces):,} triangles"
     words = tuple(dict.fromkeys(f"cloud {path.name}: {word}" for scan in scans for word in scan.cloud.notes))
     limits = (
@@ -102,28 +103,22 @@ def from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Ref
     known = np.isfinite(heights)
     if not known.any() or min(heights.shape) < 2:
         raise InputError("holds no heights", where=str(path), remedy="export the elevation model again")
-    x, y = np.meshgrid(
-        grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd, grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
-    )
-    number = (np.cumsum(known) - 1).reshape(known.shape)
-    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
-    whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
-    if not whole.any():
+    mesh = mesh_of_raster(heights.astype(np.float64), grid)
+    if not len(mesh.faces):
         raise InputError("has no four neighbouring pixels with heights", where=str(path), remedy="export a whole elevation model")
-    faces = np.concatenate([np.stack(each, axis=-1)[whole] for each in ((a, c, d), (a, d, b))]).astype(np.int32)
-    vertices = np.stack([x[known] * metres, y[known] * metres, heights[known].astype(np.float64) * up], axis=1)
+    mesh = mesh.with_vertices(mesh.vertices * np.array([metres, metres, up]))
     words = f"elevation model {path.name}: {int(known.sum()):,} heights every {grid.gsd * metres:.3g} m, taken as exact"
     limit = (
         "an elevation model has one height at each place: overhangs are missing, and steep faces are chords between pixels, "
         "whose error looks like one of the sensor"
     )
-    return Reference(TriangleMesh(vertices, faces), 0.0, (words, *notes), (limit,))
+    return Reference(mesh, 0.0, (words, *notes), (limit,))
 
 
 def half_of(scan: RawScan, station: Station) -> Reference:
     """Every other line (or pulse, where these are much finer) as the surface, with the rest to be compared with it."""
     even, what = _halves(scan, station)
-    surface = triangulated(scan.cloud.points[even], station.position, station.rotation, scan.name)
+    surface = triangulate_seen_points(scan.cloud.points[even], station.position, station.rotation, scan.name)
     said = f"half of the scan itself ({what}): {int(even.sum()):,} points, {len(surface.mesh.faces):,} triangles"
     limits = (
         "both halves are of one scan: nothing that changes slowly over the wall can be seen (offset, scale, index, eccentricity, "

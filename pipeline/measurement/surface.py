@@ -20,7 +20,7 @@ from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.measurement.units import check_extent, check_same_unit
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
-from scene.meshes.winding import facing
+from scene.meshes.winding import orient_to_sensors
 from scene.walls.imported import read_mesh
 from sensors.models.sensor_model import StereoModel, StereoNoise
 
@@ -104,7 +104,7 @@ def _reference(request: Request, points: FloatArray) -> tuple[Reference, tuple[s
 
 def _wound_to(mesh: TriangleMesh, eye: FloatArray, where: str) -> TriangleMesh:
     centre = mesh.vertices.mean(axis=0)
-    turned = facing(mesh.with_vertices(mesh.vertices - centre), [eye - centre], where)[0]
+    turned = orient_to_sensors(mesh.with_vertices(mesh.vertices - centre), [eye - centre], where)[0]
     return turned.with_vertices(mesh.vertices)
 
 

@@ -14,7 +14,7 @@ from sensors.cameras.camera import Camera, CameraPair, Side
 from sensors.cameras.rectification import Rectification, rectify
 from sensors.effects.base import Stage, apply_stage
 from sensors.effects.matching_noise import NodeNoise
-from sensors.models.sensor_model import OrientationNoise, Spread, StereoModel
+from sensors.models.sensor_model import DrawnParameter, OrientationNoise, StereoModel
 from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 
@@ -147,7 +147,7 @@ def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
         for name in type(noise).model_fields:
             sigma = getattr(noise, name).sigma
             if sigma > 0:
-                moved = OrientationNoise(**{name: Spread(mean=sigma)}).draw(side, KeyedRandom(0))
+                moved = OrientationNoise(**{name: DrawnParameter(mean=sigma)}).draw(side, KeyedRandom(0))
                 real = apply_stage(moved, Stage.CAMERA, pair.cameras, KeyedRandom(0)).in_wall_frame(pair.frame)
                 error = _recorded(nominal, geometry, real, points) - points
                 covariance += np.einsum("ni,nj->nij", error, error)

@@ -1,5 +1,4 @@
-"""Register a surface on a reference with ICP.
+"""Register a surface to a reference with ICP.
 
-What is compared afterwards is in `pipeline/change`.
-Start with `register.py`.
+What is compared afterwards is in `pipeline/change`. Start with `register.py`.
 """

@@ -1,7 +1,7 @@
-"""Pairs of points with the nearest of a reference, summed up fast and repeatably.
+"""Pair points with the nearest points of a reference, and sum up the pairs fast and reproducibly.
 
-Points are visited in an order in which neighbours in memory are neighbours in space, and sums are taken over blocks of fixed size
-in a fixed order, so that the result has the same bits for any number of threads.
+Points are visited in an order in which neighbours in memory are neighbours in space. Sums are taken over blocks of fixed size
+in a fixed order, so that the result is the same to the bit for any number of threads.
 """
 
 from __future__ import annotations
@@ -18,21 +18,35 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 LEAST_POINTS = 6
-"""Of a cloud that is registered: one per unknown."""
+"""Fewest points of a cloud that is registered: one per unknown."""
 _SEES = "check that the sensor sees the wall: its place, its direction, its range, for cameras their overlap"
+"""Advice when there are too few points."""
 _BLOCK = 2**14
-"""Points per block of the sums: its arrays fit a core's cache."""
+"""Number of points per block of the sums; its arrays fit a core's cache."""
 ON_A_LINE = 1e-12
 """Share of the largest variance below which the second one makes a cloud a line."""
 _SCATTERED = 0.05
-"""Share of a cloud's extent that neighbours in memory may be apart before it is worth sorting."""
+"""Share of a cloud's extent by which neighbours in memory may differ before sorting pays."""
 
 Map = Callable[[Callable[[FloatArray], FloatArray], Iterable[FloatArray]], Iterable[FloatArray]]
+"""`map`, or the `map` method of an executor."""
 
 
 @dataclass(frozen=True)
 class ReferenceSurface:
-    """Points of the reference, (m, 3) about `origin` (3,), m, their unit normals (m, 3) or None, and their search tree."""
+    """The points of the reference with a search tree.
+
+    Attributes
+    ----------
+    origin : (3,) array
+        Origin of the local coordinates, m.
+    points : (m, 3) array
+        Points relative to `origin`, m.
+    normals : (m, 3) array, optional
+        Unit normals.
+    tree : scipy.spatial.cKDTree
+        Search tree of the points.
+    """
 
     origin: FloatArray
     points: FloatArray
@@ -41,10 +55,19 @@ class ReferenceSurface:
 
     @classmethod
     def build(cls, points: FloatArray, normals: FloatArray | None = None) -> ReferenceSurface:
-        """Index a reference once for any number of registrations.
+        """Index a reference once, for any number of registrations.
 
-        points: (m, 3), m; normals: (m, 3) of any length, sign irrelevant, or None. Raises InputError where there are fewer than
-        six points, values that are not finite, normals of length zero, or points on one line.
+        Parameters
+        ----------
+        points : (m, 3) array
+            Points, m.
+        normals : (m, 3) array, optional
+            Normals of any length and sign.
+
+        Raises
+        ------
+        InputError
+            If there are fewer than six points, values that are not finite, normals of length zero, or points on one line.
         """
         from scipy.spatial import cKDTree
 
@@ -59,12 +82,25 @@ class ReferenceSurface:
     def moments(
         self, blocks: list[FloatArray], pose: RigidTransform, gate: float, normals: FloatArray | None, map_blocks: Map
     ) -> FloatArray:
-        """The sum of u u^T over all pairs of a point p and its nearest reference point q that are nearer than `gate`, m.
+        """Sum u u^T over all pairs of a point p and its nearest reference point q that are closer than `gate`.
 
-        u is one pair's column, g the pose's translation:
+        u is the column vector of one pair, with g the pose's translation:
         with normals n:  ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8);
-        without:         (p - g, q - p, 1), so that it is (7, 7). The last element is the number of pairs.
-        blocks: (k, 3) each, m; pose: moves them to coordinates about `origin`; map_blocks: `map`, or an executor's.
+        without:         (p - g, q - p, 1), so that it is (7, 7).
+        The last element is the number of pairs.
+
+        Parameters
+        ----------
+        blocks : list of (k, 3) arrays
+            The moving points, m.
+        pose : RigidTransform
+            Moves them to coordinates relative to `origin`.
+        gate : float
+            Largest distance of a pair, m.
+        normals : (m, 3) array, optional
+            The reference's normals, for point_to_plane.
+        map_blocks : Map
+            Applies a function to all blocks.
         """
 
         def block_moments(block: FloatArray) -> FloatArray:
@@ -80,12 +116,12 @@ class ReferenceSurface:
 
 
 def _point_columns(arm: FloatArray, offset: FloatArray) -> FloatArray:
-    """(7, k) columns from p - g and p - q, (3, k) each."""
+    """Return the columns (7, k) from p - g and p - q, (3, k) each."""
     return np.concatenate([arm, -offset, np.ones((1, arm.shape[1]))])
 
 
 def _plane_columns(arm: FloatArray, offset: FloatArray, normal: FloatArray) -> FloatArray:
-    """(8, k) columns from p - g, p - q and n, (3, k) each."""
+    """Return the columns (8, k) from p - g, p - q and n, (3, k) each."""
     columns = np.ones((8, arm.shape[1]))
     for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         columns[axis] = arm[i] * normal[j] - arm[j] * normal[i]
@@ -95,12 +131,14 @@ def _plane_columns(arm: FloatArray, offset: FloatArray, normal: FloatArray) -> F
 
 
 def blocks_of(points: FloatArray) -> list[FloatArray]:
-    """The points in blocks of a fixed size, the last one shorter."""
+    """Divide the points into blocks of a fixed size; the last one is shorter."""
     return [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
 
 
 def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
-    """An index that puts neighbours in space next to each other: the points' own order (a sensor's rows), else Morton's curve."""
+    """Return an index that makes neighbours in space neighbours in memory: the points' own order (a sensor's rows), or Morton's
+    curve.
+    """
     stride = max(len(points) // _BLOCK, 1)
     steps = np.abs(points[1::stride] - points[:-1:stride]).max(axis=1)
     if np.median(steps) <= _SCATTERED * np.ptp(points[::stride], axis=0).max():
@@ -112,14 +150,14 @@ def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
 
 
 def _spread_bits(number: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Ten bits, each moved to three times its place, so that three numbers interleave to a Morton code."""
+    """Move each of ten bits to three times its position, so that three numbers interleave to a Morton code."""
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         number = (number | number << np.uint32(shift)) & np.uint32(mask)
     return number
 
 
 def checked_cloud(points: FloatArray, name: str) -> FloatArray:
-    """(n, 3) points as they are; InputError where they cannot determine a pose."""
+    """Return points (n, 3) unchanged. Raises InputError if they cannot determine a pose."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"expected shape (n, 3), got {points.shape}", where=name)
@@ -129,18 +167,22 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     if not finite.all():
         bad = int((~finite.all(axis=1)).sum())
         raise InputError(f"{bad:,} of {len(points):,} points are not finite", where=name, remedy="remove them before registering")
-    if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(points):  # a sample may be one column of a grid
+    if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(
+        points
+    ):  # the sample alone may be one column of a grid
         raise InputError("the points lie on one line, which determines no pose", where=name)
     return points
 
 
 def _on_a_line(points: FloatArray) -> bool:
+    """Return whether the points lie on a line."""
     local = points - points.mean(axis=0)
     variances = np.linalg.eigvalsh(np.einsum("ni,nj->ij", local, local))
     return not variances[1] > ON_A_LINE * variances[2]
 
 
 def _unit(normals: FloatArray, count: int) -> FloatArray:
+    """Normalise the normals. Raises InputError if their number or length is wrong."""
     if np.shape(normals) != (count, 3):
         raise InputError(f"expected shape ({count}, 3), got {np.shape(normals)}", where="reference normals")
     length = np.sqrt(np.einsum("ni,ni->n", normals, normals))

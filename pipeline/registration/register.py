@@ -1,18 +1,17 @@
-"""Registration of an epoch's points to the reference surface by the iterative closest point algorithm (ICP).
+"""Register an epoch's points to the reference surface by the iterative closest point algorithm (ICP).
 
-Every iteration pairs each moving point p (at its current pose) with its nearest reference point q (normal n) and takes the step,
-a rotation R = exp(w) about the moving points' centroid g and a shift t, that makes the mean square of the residuals r least:
+Every iteration pairs each moving point p (at its current pose) with its nearest reference point q (normal n). It then takes the
+step, a rotation R = exp(w) about the moving points' centroid g and a shift t, that minimises the mean square of the residuals r:
 
     point_to_plane   r = n . (p + w x (p - g) + t - q)      Chen and Medioni (1992), linearised as Low (2004), equations 3 to 8
     point_to_point   r = R (p - g) + g + t - q              Besl and McKay (1992), R by the SVD of Kabsch (1976), no reflections
 
-Poses are moved by the exact exponential map, so they stay rigid whatever the linearisation. Direction: the result maps moving to
-reference coordinates, x_reference = R x_moving + t.
+Poses are updated with the exact exponential map, so they remain rigid despite the linearisation. The result maps moving to
+reference coordinates, x_reference = R x_moving + t. The search starts with a random subsample and ends with all points (coarse to
+fine).
 
-The search starts on a random subset and ends on all the points (coarse to fine).
-
-Where it fails: an offset larger than the roughness is wide ends in a wrong minimum; a shift along a smooth wall is known only as
-well as its roughness tells it; normals estimated from noise determine nothing, but look as if they did.
+Limits: an initial offset larger than the width of the wall's features may end in a wrong minimum. A shift along a smooth wall is
+determined only by its roughness. Normals that were estimated from noise seem to determine a motion but do not.
 """
 
 from __future__ import annotations
@@ -42,31 +41,33 @@ from scene.common.threads import executor
 from scene.geometry.mesh import FloatArray
 
 _LEVELS = (2**13, 2**17)
-"""Sizes of the random subsets that come before all the points; each is used where the points are at least four times as many."""
+"""Sizes of the random subsamples used before all points; each is used if there are at least four times as many points."""
 _UNDETERMINED = 1e-6
-"""Motions whose mean squared effect on the residuals, per squared metre moved, is below this share of the largest are left out:
-a wall whose normals vary by less than 1 mrad is a plane."""
+"""Motions whose mean squared effect on the residuals, per squared metre moved, is below this share of the largest are not
+estimated. A wall whose normals vary by less than 1 mrad is a plane.
+"""
 
 
 class IcpConfig(Config):
-    """The iterative closest point algorithm; the eight parameters of the thesis (3.6) and the error that is minimised.
+    """The iterative closest point algorithm: the eight parameters of the thesis (3.6), and the error that is minimised.
 
-    `threshold` and `delta_threshold` both end the search, whichever is met first. `threshold` looks at one number, the error of
-    the fit: near the minimum it changes with the square of the motion, so it says when going on no longer pays. `delta_threshold`
-    looks at every point's residual and what the last step changed in it: that is in proportion to the motion, so it says when the
-    pose stands still. Neither is asked before the outlier threshold has reached its final value. The error counts outliers at the
-    outlier threshold, because the inliers' RMS alone stands still, or rises, while a better pose brings more points in.
+    `threshold` and `delta_threshold` both end the search, whichever is met first. `threshold` applies to the error of the fit.
+    Near the minimum this changes with the square of the motion, so it tells when further iterations no longer pay.
+    `delta_threshold` applies to the change of the points' residuals in the last step. This is proportional to the motion, so
+    it tells when the pose is stationary. Neither is checked before the outlier threshold has reached its final value. The
+    error counts outliers at the outlier threshold, because the RMS of the inliers alone stays constant, or rises, when a
+    better pose turns outliers into inliers.
     """
 
     method: Literal["point_to_plane", "point_to_point"] = Field(
         "point_to_plane", description="distance that is minimised: along the reference's normals, or between the points"
     )
-    max_iteration: int = Field(100, ge=1, description="most iterations, converged or not; the last one uses all the points")
+    max_iteration: int = Field(100, ge=1, description="most iterations, converged or not; the last one uses all points")
     outlier_distance_threshold: float = Field(
         0.1,
         gt=0,
         description="m; a point farther than this from its nearest reference point is an outlier. "
-        "At least three sigma of the noise and the reference's point spacing",
+        "Use at least three sigma of the noise, and the reference's point spacing",
     )
     outlier_threshold_decay_iteration: int = Field(
         5,
@@ -75,23 +76,25 @@ class IcpConfig(Config):
         description="iteration k from which outlier_distance_threshold T applies; at iteration i before it, T 2^(k - i) does. "
         "1: T from the first iteration",
     )
-    remove_outlier: bool = Field(True, description="leave outliers out of the fit; false: every point counts")
+    remove_outlier: bool = Field(True, description="exclude outliers from the fit; false: every point is used")
     threshold: float = Field(
         1e-8,
         ge=0,
-        description="m; converged when the RMS error (outliers counted at the outlier threshold) improved by less than this from "
-        "one iteration to the next; a rise by more is no end either. 0: never",
+        description="m; converged when the RMS error (outliers counted at the outlier threshold) changed by less than this from "
+        "one iteration to the next. 0: never",
     )
     delta_threshold: float = Field(
         1e-4,
         ge=0,
         description="m; converged when a step changed the points' residuals by less than this (RMS over the points). 0: never",
     )
-    subsample_points: bool = Field(False, description="fit a random part of the moving points")
+    subsample_points: bool = Field(False, description="fit a random subsample of the moving points")
     subsample_ratio: float = Field(0.9, ge=0, lt=1, description="share of the moving points that subsampling leaves out")
 
     def outlier_threshold_m(self, iteration: int) -> float:
-        """The outlier threshold, m, at an iteration (counted from 1): T 2^max(k - i, 0), infinite without outlier removal."""
+        """Return the outlier threshold, m, at an iteration counted from 1: T 2^max(k - i, 0); infinite without outlier
+        removal.
+        """
         if not self.remove_outlier:
             return float("inf")
         return self.outlier_distance_threshold * 2.0 ** max(self.outlier_threshold_decay_iteration - iteration, 0)
@@ -99,12 +102,27 @@ class IcpConfig(Config):
 
 @dataclass(frozen=True)
 class IcpIteration:
-    """One iteration: the pairs it found and the step it took.
+    """One iteration: the pairs that it found and the step that it took.
 
-    points: moving points in use; inliers: those nearer to the reference than outlier_threshold_m; rms_m: of the inliers'
-    residuals after the step (point_to_plane: to first order in its rotation), with the pairs found before it; error_m: the same
-    with every outlier counted at the outlier threshold; residual_change_m: RMS over the inliers of what the step changed in their
-    residuals; step_m: RMS over all the points of how far the step moved them; undetermined: motions left out, of six.
+    Attributes
+    ----------
+    points : int
+        Moving points in use.
+    inliers : int
+        Those closer to the reference than the outlier threshold.
+    outlier_threshold_m : float
+        Outlier threshold of this iteration, m.
+    rms_m : float
+        RMS of the inliers' residuals after the step, with the pairs found before it, m (point_to_plane: to first order in the
+        rotation).
+    error_m : float
+        The same with every outlier counted at the outlier threshold, m.
+    residual_change_m : float
+        RMS over the inliers of the change of their residuals in the step, m.
+    step_m : float
+        RMS over all points of the distance that the step moved them, m.
+    undetermined : int
+        Number of motions, of six, that were not estimated.
     """
 
     points: int
@@ -117,7 +135,7 @@ class IcpIteration:
     undetermined: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it: an infinite outlier threshold is null."""
+        """Return the values for JSON; an infinite outlier threshold becomes null."""
         values = dataclasses.asdict(self)
         return values | {"outlier_threshold_m": _finite(self.outlier_threshold_m)}
 
@@ -126,9 +144,16 @@ class IcpIteration:
 class Registration:
     """The transform that brings moving points to the reference, x_reference = R x + t, and how it was found.
 
-    rms_m: of the inliers' residuals at the end; points, inliers: in use, and within the outlier threshold, in the last iteration;
-    reason: why it stopped, in words; undetermined: how many of the six motions the surface does not determine (0 for a rough
-    wall, 3 for a plane with point_to_plane); history: every iteration.
+    Attributes
+    ----------
+    transform : RigidTransform
+        Moving to reference coordinates.
+    converged : bool
+        Whether a threshold was met.
+    reason : str
+        Why the search stopped, in words.
+    history : tuple of IcpIteration
+        Every iteration.
     """
 
     transform: RigidTransform
@@ -138,40 +163,45 @@ class Registration:
 
     @property
     def rotation(self) -> FloatArray:
-        """(3, 3) R."""
+        """(3, 3) rotation R."""
         return self.transform.rotation
 
     @property
     def translation(self) -> FloatArray:
-        """(3,) t, m."""
+        """(3,) translation t, m."""
         return self.transform.translation
 
     @property
     def iterations(self) -> int:
+        """Number of iterations."""
         return len(self.history)
 
     @property
     def rms_m(self) -> float:
+        """RMS of the inliers' residuals in the last iteration, m."""
         return self.history[-1].rms_m
 
     @property
     def points(self) -> int:
+        """Number of points in use in the last iteration."""
         return self.history[-1].points
 
     @property
     def inliers(self) -> int:
+        """Number of points within the outlier threshold in the last iteration."""
         return self.history[-1].inliers
 
     @property
     def undetermined(self) -> int:
+        """How many of the six motions the surface does not determine: 0 for a rough wall, 3 for a plane with point_to_plane."""
         return self.history[-1].undetermined
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """(..., 3) moving points in reference coordinates, m."""
+        """Transform moving points (..., 3) to reference coordinates, m."""
         return self.transform.apply(points)
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the values for JSON."""
         names = ("rms_m", "iterations", "points", "inliers", "undetermined", "converged", "reason")
         return (
             self.transform.to_dict()
@@ -180,7 +210,7 @@ class Registration:
         )
 
     def summary(self) -> str:
-        """One line in millimetres."""
+        """Describe the result on one line, in millimetres."""
         end = "converged" if self.converged else "not converged"
         return (
             f"{end} after {self.iterations} iterations ({self.reason}), RMS {self.rms_m * 1e3:.2f} mm, "
@@ -190,7 +220,9 @@ class Registration:
 
 @dataclass(frozen=True)
 class Fit:
-    """How well points fit a reference: `inliers` of `points` within the outlier threshold, their residuals' RMS (NaN: none)."""
+    """How well points fit a reference: the number of points, of inliers within the outlier threshold, and the RMS of the inliers'
+    residuals (NaN if there are none).
+    """
 
     points: int
     inliers: int
@@ -208,10 +240,24 @@ def register(
 ) -> Registration:
     """Find the rigid transform that brings `moving` to `reference`.
 
-    moving: (n, 3), reference: (m, 3), one frame, m, without NaN; reference_normals: (m, 3) of any length, sign irrelevant, or
-    None for point_to_point; random draws the subsets; threads: None for all cores, without effect on the result.
-    Raises InputError where there are fewer than six points, values that are not finite, points on one line, or fewer than six
-    pairs within the outlier threshold.
+    Parameters
+    ----------
+    moving, reference : (n, 3) and (m, 3) arrays
+        Points in the same frame, m, without NaN.
+    reference_normals : (m, 3) array or None
+        Normals of any length and sign; may be None for point_to_point.
+    config : IcpConfig
+        Settings of the algorithm.
+    random : KeyedRandom
+        Source of the subsamples.
+    threads : int, optional
+        Number of threads, by default one per core. It does not affect the result.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than six points, values that are not finite, points on one line, or fewer than six pairs within the
+        outlier threshold.
     """
     return register_to(ReferenceSurface.build(reference, reference_normals), moving, config, random, threads=threads)
 
@@ -219,17 +265,22 @@ def register(
 def register_to(
     surface: ReferenceSurface, moving: FloatArray, config: IcpConfig, random: KeyedRandom, *, threads: int | None = None
 ) -> Registration:
-    """`register` to a reference that was indexed before, for many runs against one reference."""
+    """Register points to a reference that is already indexed, for many registrations to one reference. Arguments as in
+    `register`.
+    """
     normals = _normals(surface, config)
     moving = checked_cloud(moving, "moving points")
-    if threads == 1:  # a pool of one thread would only cost the hand-over
+    if threads == 1:  # a pool would only add overhead
         return _Alignment(surface, normals, moving, config, map).run(random)
     with executor(threads) as pool:
         return _Alignment(surface, normals, moving, config, pool.map).run(random)
 
 
 def fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, threads: int | None = None) -> Fit:
-    """How well (n, 3) points, m, fit where they are: residuals by `config.method`, inliers by its final outlier threshold."""
+    """Measure how well points (n, 3), m, fit the reference without moving them.
+
+    Residuals are defined by `config.method`, inliers by its final outlier threshold.
+    """
     normals = _normals(surface, config)
     local = checked_cloud(points, "points") - surface.origin
     gate = config.outlier_threshold_m(config.outlier_threshold_decay_iteration)
@@ -242,7 +293,7 @@ def fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, thr
 
 
 def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
-    """The normals that the method uses: those of the reference, or None for point_to_point."""
+    """Return the normals that the method needs: those of the reference, or None for point_to_point."""
     if config.method == "point_to_point":
         return None
     if surface.normals is None:
@@ -254,7 +305,19 @@ def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
 
 @dataclass(frozen=True)
 class _Step:
-    """A rotation (3, 3) about the centroid and a shift (3,), m, the mean square that they leave and the change that they make."""
+    """One step of the search.
+
+    Attributes
+    ----------
+    rotation, shift : (3, 3) and (3,) arrays
+        Rotation about the centroid, and shift, m.
+    mean_squares : float
+        Mean square of the residuals after the step, m2.
+    residual_change_m : float
+        RMS of the change of the residuals, m.
+    undetermined : int
+        Number of motions that were not estimated.
+    """
 
     rotation: FloatArray
     shift: FloatArray
@@ -264,7 +327,7 @@ class _Step:
 
 
 class _Alignment:
-    """One registration: the moving points about their centroid, coarse to fine."""
+    """One registration, coarse to fine. Moving points are stored relative to their centroid."""
 
     def __init__(
         self, surface: ReferenceSurface, normals: FloatArray | None, moving: FloatArray, config: IcpConfig, map_blocks: Map
@@ -275,7 +338,7 @@ class _Alignment:
         self.covariance = np.einsum("ni,nj->ij", self.local, self.local) / len(self.local)
 
     def run(self, random: KeyedRandom) -> Registration:
-        """Iterate on each level until it converges, on the last until the end."""
+        """Iterate on each subsample until it converges, and on all points until the end."""
         levels = self._levels(random)
         pose = RigidTransform(np.eye(3), self.centroid - self.surface.origin)
         history: list[IcpIteration] = []
@@ -294,7 +357,7 @@ class _Alignment:
         return Registration(self._in_full_coordinates(pose), converged, reason, tuple(history))
 
     def _levels(self, random: KeyedRandom) -> list[list[FloatArray]]:
-        """Blocks of nested random subsets, the last one of all the points in use."""
+        """Return nested random subsamples as blocks; the last one is all points in use."""
         total = len(self.local)
         used = round(total * (1 - self.config.subsample_ratio)) if self.config.subsample_points else total
         if used < LEAST_POINTS:
@@ -308,7 +371,7 @@ class _Alignment:
         return [blocks_of(self.local if size == total else self.local[_smallest(draw, size)]) for size in sizes]
 
     def _iterate(self, blocks: list[FloatArray], pose: RigidTransform, gate: float) -> tuple[RigidTransform, IcpIteration]:
-        """Pair, solve, move: the next pose and the record of it."""
+        """Take one iteration: pair the points, solve for the step, and return the next pose and its record."""
         moments = self.surface.moments(blocks, pose, gate, self.normals, self.map_blocks)
         points, inliers = sum(map(len, blocks)), int(moments[-1, -1])
         if inliers < LEAST_POINTS:
@@ -331,7 +394,7 @@ class _Alignment:
         return RigidTransform(step.rotation @ pose.rotation, pose.translation + step.shift), record
 
     def _plane_step(self, moments: FloatArray) -> _Step:
-        """Gauss-Newton on (w, t), with w scaled by the cloud's radius so that all six unknowns are metres moved."""
+        """Solve for (w, t) by Gauss-Newton, with w scaled by the cloud's radius so that all six unknowns are metres moved."""
         radius = float(np.sqrt(np.trace(self.covariance)))
         scale = np.repeat([1 / radius, 1.0], 3)
         count = moments[-1, -1]
@@ -344,7 +407,7 @@ class _Alignment:
         return _Step(rotation, unknowns[3:], max(squares, 0.0), float(np.sqrt(max(change, 0.0))), undetermined)
 
     def _stop_reason(self, history: list[IcpIteration]) -> str:
-        """Why the level of the last iteration has converged, in words; empty while it has not."""
+        """Return why the present subsample has converged, in words; "" if it has not."""
         last, before = history[-1], history[-2] if len(history) > 1 else None
         if len(history) < self.config.outlier_threshold_decay_iteration and self.config.remove_outlier:
             return ""
@@ -357,6 +420,7 @@ class _Alignment:
         return ""
 
     def _too_few(self, blocks: list[FloatArray], pose: RigidTransform, gate: float, inliers: int) -> InputError:
+        """Make the error for too few pairs within the outlier threshold."""
         distance, _ = self.surface.tree.query(pose.apply(blocks[0]))
         return InputError(
             f"only {inliers} of {sum(map(len, blocks)):,} points lie within {gate:g} m of the reference, "
@@ -366,13 +430,14 @@ class _Alignment:
         )
 
     def _in_full_coordinates(self, pose: RigidTransform) -> RigidTransform:
+        """Convert a pose between local coordinates to full coordinates."""
         return RigidTransform(pose.rotation, pose.translation + self.surface.origin - pose.rotation @ self.centroid)
 
 
 def _point_step(moments: FloatArray) -> _Step:
-    """Kabsch's rotation (determinant +1) and the shift that goes with it, from the pairs' p - g and d = q - p.
+    """Compute Kabsch's rotation (determinant +1) and the corresponding shift from the pairs' p - g and d = q - p.
 
-    With d small, everything is written in M = R - I and d: exact to the last digits where points already coincide.
+    Everything is expressed by M = R - I and d, which are small, so that no precision is lost where points nearly coincide.
     """
     count = moments[-1, -1]
     mean_p, mean_d = moments[:3, 6] / count, moments[3:6, 6] / count
@@ -390,9 +455,9 @@ def _point_step(moments: FloatArray) -> _Step:
 
 
 def _least_norm(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, int]:
-    """The shortest least-squares solution of a symmetric system (6, 6), and how many of its directions are undetermined.
+    """Return the shortest least-squares solution of a symmetric system (6, 6), and how many of its directions are undetermined.
 
-    Eigenvectors whose eigenvalue is below `_UNDETERMINED` times the largest are left out (a pseudo-inverse).
+    Eigenvectors with an eigenvalue below `_UNDETERMINED` times the largest are left out (pseudo-inverse).
     """
     values, vectors = np.linalg.eigh(matrix)
     kept = values > _UNDETERMINED * values[-1]
@@ -401,9 +466,10 @@ def _least_norm(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, int]
 
 
 def _smallest(draw: FloatArray, size: int) -> NDArray[np.intp]:
-    """(size,) indices of the `size` smallest numbers drawn, in increasing order of the index."""
+    """Return the indices (size,) of the smallest numbers drawn, in ascending order."""
     return np.sort(np.argpartition(draw, size - 1)[:size])
 
 
 def _finite(value: float) -> float | None:
+    """Return None for an infinite value, which JSON cannot hold."""
     return value if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Rigid transforms of points."""
+"""Define rigid transforms of points."""
 
 from __future__ import annotations
 
@@ -12,44 +12,56 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """x' = R x + t, with R a proper rotation (3, 3) and t (3,), m."""
+    """x' = R x + t, with a proper rotation R (3, 3) and t (3,), m."""
 
     rotation: FloatArray
     translation: FloatArray
 
     @classmethod
     def identity(cls) -> RigidTransform:
+        """Return the transform that moves nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
     def about(cls, centre: FloatArray, rotation_vector: FloatArray, translation: FloatArray) -> RigidTransform:
-        """x' = exp(w) (x - centre) + centre + t; w (3,) in rad turns counter-clockwise seen against its direction."""
+        """Make x' = exp(w) (x - centre) + centre + t.
+
+        Parameters
+        ----------
+        centre : (3,) array
+            Centre of the rotation, m.
+        rotation_vector : (3,) array
+            w, rad; the rotation is counter-clockwise seen against its direction (right-handed).
+        translation : (3,) array
+            t, m.
+        """
         rotation = rotation_matrix(rotation_vector)
         return cls(rotation, centre + translation - rotation @ centre)
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """(..., 3) moved points, m; NaN stays NaN."""
+        """Transform points (..., 3), m; NaN stays NaN."""
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         rows = zip(self.rotation, self.translation, strict=True)
         return np.stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows], axis=-1)
 
     def after(self, first: RigidTransform) -> RigidTransform:
-        """Both in one: `first`, then this."""
+        """Return the transform that applies `first`, then this one."""
         return RigidTransform(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
     def inverse(self) -> RigidTransform:
+        """Return the inverse transform."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     @property
     def rotation_vector(self) -> FloatArray:
-        """(3,) axis times angle, rad, of a rotation by less than pi."""
+        """(3,) axis times angle, rad, for a rotation by less than pi."""
         sine = np.array([self.rotation[i, j] - self.rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0))]) / 2
         norm = float(np.linalg.norm(sine))
         angle = float(np.arctan2(norm, (np.trace(self.rotation) - 1) / 2))
         return sine * (angle / norm) if norm > 0 else sine
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it: rotation, translation_m and, for people, rotation_vector_rad."""
+        """Return the values for JSON: rotation, translation_m and, for readers, rotation_vector_rad."""
         return {
             "rotation": self.rotation.tolist(),
             "translation_m": self.translation.tolist(),
@@ -58,7 +70,10 @@ class RigidTransform:
 
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
-    """(3, 3) exponential map of a rotation vector (3,), rad: I + sin(a)/a W + (1 - cos(a))/a^2 W^2 (Rodrigues), a = |w|."""
+    """Return the matrix exponential (3, 3) of a rotation vector w (3,), rad.
+
+    Rodrigues: I + sin(a)/a W + (1 - cos(a))/a^2 W^2, with a = |w|.
+    """
     x, y, z = rotation_vector
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = float(np.linalg.norm(rotation_vector))

@@ -9,7 +9,7 @@ from pipeline.run.site import SensorSite
 from pipeline.surface.depth_maps import DepthMap
 from pipeline.surface.mesh import mesh_observation
 from pipeline.surface.reconstruct import colmap_surface
-from pipeline.surface.stations import Joined, join
+from pipeline.surface.stations import JoinedStations, join_stations
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh
@@ -32,7 +32,7 @@ class Look:
 
     observation: Observation
     depth_maps: DepthMaps | None
-    joined: Joined | None = None
+    joined: JoinedStations | None = None
     vertices: TriangleMesh | None = None
 
     @property
@@ -81,10 +81,10 @@ def reconstruct(config: SimulationConfig, seen: Look) -> TriangleMesh:
 
 def _join_stations(
     config: SimulationConfig, site: SensorSite, scene: RayCaster, first: Observation, random: KeyedRandom
-) -> Joined | None:
+) -> JoinedStations | None:
     """Observe from the further stations of a laser scanner, if there are any, and join all."""
     if not (isinstance(site.sensor, LaserScanner) and site.further_stations):
         return None
     others = [each.observe(scene, random.child("station", number)) for number, each in enumerate(site.further_stations, start=2)]
     scanners = site.sensor, *site.further_stations
-    return join(scanners, [first, *others], config.stations, config.surface, config.difference, random.child("stations"))
+    return join_stations(scanners, [first, *others], config.stations, config.surface, config.difference, random.child("stations"))

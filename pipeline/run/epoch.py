@@ -20,7 +20,7 @@ from pipeline.run.displacement import displacement
 from pipeline.run.registered import reference_and_target, reference_sensor
 from pipeline.run.site import SensorSite
 from scene.blocks.block import Blocks, place_blocks
-from scene.blocks.carve import Carved, carve, carved_records
+from scene.blocks.carve import Carved, block_records, carve
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import WALL, FloatArray, TriangleMesh
 from scene.ray_casting.raycast import RayCaster
@@ -96,7 +96,7 @@ def observe_epoch(
         blocks = place_blocks(config.rockfall, site.mesh, keyed.child("blocks"), reference.caster)
         carved = carve(site.mesh, blocks)
         carved = replace(carved, mesh=as_observed(config, carved.mesh))
-        records = carved_records(blocks, carved.removed_volume_m3)
+        records = block_records(blocks, carved.removed_volume_m3)
     with progress.stage(f"epoch {number}: observe"):
         after = RayCaster(carved.mesh)
         seen = look(config, site, after, keyed.child("observe"))
@@ -127,7 +127,7 @@ def observe_epoch(
 
 def as_observed(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:
     """The wall in the state that sensors meet: wet where the config says so."""
-    return mesh if config.wetness is None else config.wetness.wetted(mesh)
+    return mesh if config.wetness is None else config.wetness.with_wet_patches(mesh)
 
 
 def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: FloatArray) -> list[dict[str, Any]]:

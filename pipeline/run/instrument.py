@@ -11,7 +11,7 @@ from pipeline.run.site import SensorSite
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.laser.tls import LaserScanner
-from sensors.models.sensor_model import OrientationNoise, Spread
+from sensors.models.sensor_model import DrawnParameter, OrientationNoise
 from sensors.stereo.exchanged import StereoSensor, pair_of
 from sensors.stereo.stereo_matched import MatchedStereoPair
 from sensors.stereo.stereo_pair import REDUCTION
@@ -64,7 +64,7 @@ def _pair_figures(sensor: StereoSensor, site: SensorSite) -> dict[str, str]:
 
 def _is_drawn(noise: OrientationNoise) -> bool:
     """Whether any orientation parameter differs from its calibrated value."""
-    return any(getattr(noise, name) != Spread() for name in type(noise).model_fields)
+    return any(getattr(noise, name) != DrawnParameter() for name in type(noise).model_fields)
 
 
 def _effects(effects: Sequence[Effect]) -> str:

@@ -10,7 +10,7 @@ from pipeline.config.simulation import SensorName, SimulationConfig
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray, TriangleMesh
-from scene.meshes.winding import check_near, facing
+from scene.meshes.winding import check_distances, orient_to_sensors
 from scene.walls.imported import ImportedWall
 from scene.walls.wall import Wall, build_wall
 from sensors.cameras.camera import CameraPair
@@ -80,12 +80,12 @@ def _faced(
 
     positions: world frame.
     """
-    check_near(wall.mesh.vertices, positions, wall.name)
+    check_distances(wall.mesh.vertices, positions, wall.name)
     mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
     if origin == "rule":
         return mesh, wall.repairs
     eyes = [frame.to_wall(position) for position in positions.values()]
-    mesh, words = facing(mesh, eyes, wall.file or wall.name, cleaned=origin == "file")
+    mesh, words = orient_to_sensors(mesh, eyes, wall.file or wall.name, cleaned=origin == "file")
     return mesh, (*wall.repairs, *([words] if words else []))
 
 

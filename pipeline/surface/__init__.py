@@ -1,5 +1,4 @@
 """Turn observed points into a surface: triangulated grids, fused depth maps, several stations, Poisson reconstruction.
 
-Comparing surfaces is the work of `pipeline/change`.
-Start with `reconstruct.py`.
+Surfaces are compared in `pipeline/change`. Start with `reconstruct.py`.
 """

@@ -1,6 +1,6 @@
-"""Depth maps with the camera of their own pixels: resampling to a pinhole camera, and surface normals.
+"""Represent depth maps with the camera of their own pixels; resample them to a pinhole camera and compute surface normals.
 
-Inverse depth is what both interpolate: for a pinhole camera and a plane n.P = d, with P = Z (x, y, 1), it is linear in the image,
+Both use inverse depth. For a pinhole camera and a plane n.P = d, with P = Z (x, y, 1), it is linear in the image,
     1/Z = (n_x x + n_y y + n_z) / d,
 so that a plane is resampled exactly and its normal is the direction of the gradient (n_x, n_y, n_z).
 """
@@ -16,30 +16,40 @@ from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera
 
 _SNAP_PX = 1e-6
-"""A pixel this near to a sample's centre takes the sample as it is: a map without distortion keeps its values and holes."""
+"""A pixel closer than this to a sample's centre takes the sample unchanged: a map without distortion keeps its values and
+holes.
+"""
 _LEAST_SAMPLES = 6
-"""Samples in a window that a plane is fitted to; three would follow the noise."""
+"""Fewest samples in a window to which a plane is fitted; three would follow the noise."""
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """camera: of the map's own pixels, wall frame; depth: (h, w) along the camera's axis, m, NaN where there is no data."""
+    """A depth map.
+
+    Attributes
+    ----------
+    camera : Camera
+        Camera of the map's own pixels, wall frame.
+    depth : (h, w) array
+        Depth along the camera's axis, m; NaN without data.
+    """
 
     camera: Camera
     depth: FloatArray
 
     def points(self) -> FloatArray:
-        """(h, w, 3) the surface points, wall frame, m."""
+        """Return the surface points (h, w, 3), wall frame, m."""
         x, y = self.camera.tangents(*_centres(self.camera))
         local = np.stack([x, y, np.ones_like(x)], axis=-1) * self.depth[..., None]
         return local @ self.camera.rotation.T + self.camera.position
 
 
 def pinhole(source: DepthMap, depth_step_m: float) -> DepthMap:
-    """The map without lens distortion, at the same f and principal point: bilinear in inverse depth.
+    """Resample the map without lens distortion, with the same f and principal point, bilinearly in inverse depth.
 
-    Where the four samples around a pixel differ by more than `depth_step_m` the nearest one counts; where one of them has no
-    data there is none.
+    Where the four samples around a pixel differ by more than `depth_step_m`, the nearest one is used. Where one of them has no
+    data, neither has the result.
     """
     plain = replace(source.camera, b1=0.0, b2=0.0, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0)
     u, v = source.camera.pixel(*plain.tangents(*_centres(plain)))
@@ -52,9 +62,10 @@ def pinhole(source: DepthMap, depth_step_m: float) -> DepthMap:
 
 
 def normals(source: DepthMap, radius: int) -> NDArray[np.float64]:
-    """(h, w, 3) unit normals in the camera's frame, towards the camera, of a map of a pinhole camera.
+    """Compute unit normals (h, w, 3) in the camera's frame, towards the camera, from a map of a pinhole camera.
 
-    Least squares of a plane in a window of 2 radius + 1 pixels; NaN where there is no depth, or fewer than six samples around.
+    A plane is fitted by least squares in a window of 2 radius + 1 pixels. The result is NaN where there is no depth, or fewer
+    than six samples in the window.
     """
     valid = np.isfinite(source.depth)
     inverse = np.where(valid, 1.0 / np.where(valid, source.depth, 1.0), 0.0)
@@ -74,17 +85,19 @@ def normals(source: DepthMap, radius: int) -> NDArray[np.float64]:
 
 
 def _centres(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Pixel coordinates (u, v) of all pixels' centres, each (h, w)."""
+    """Return the pixel coordinates (u, v) of all pixel centres, (h, w) each."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return u, v
 
 
 def _snapped(place: FloatArray) -> FloatArray:
+    """Round positions that lie very close to a whole number."""
     whole = np.round(place)
     return np.where(np.abs(place - whole) < _SNAP_PX, whole, place)
 
 
 def _interpolated(depth: FloatArray, column: FloatArray, row: FloatArray, step_m: float) -> FloatArray:
+    """Interpolate inverse depth bilinearly; at a depth step take the nearest sample."""
     left, top = np.floor(column).astype(int), np.floor(row).astype(int)
     right, below = np.ceil(column).astype(int), np.ceil(row).astype(int)
     across, down = column - left, row - top
@@ -96,7 +109,9 @@ def _interpolated(depth: FloatArray, column: FloatArray, row: FloatArray, step_m
 
 
 def _moments(valid: FloatArray, radius: int) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...], FloatArray]:
-    """Mean column and row offset of the samples in each window, their (co)variances (columns, rows, mixed), and their number."""
+    """Return mean column and row offset of the samples in each window, their (co)variances (columns, rows, mixed), and their
+    number.
+    """
     count = _window(valid, radius)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean_j, mean_i = _window(valid, radius, 1, 0) / count, _window(valid, radius, 0, 1) / count
@@ -108,8 +123,8 @@ def _moments(valid: FloatArray, radius: int) -> tuple[FloatArray, FloatArray, tu
 def _covariances(
     valid: NDArray[np.bool_], inverse: FloatArray, count: FloatArray, mean_j: FloatArray, mean_i: FloatArray, radius: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean inverse depth in each window and its covariances with the column and the row offset."""
-    middle = float(inverse[valid].mean()) if valid.any() else 0.0  # taken out first, for the differences of sums are small
+    """Return the mean inverse depth in each window and its covariances with the column and the row offset."""
+    middle = float(inverse[valid].mean()) if valid.any() else 0.0  # subtracted first, against cancellation
     rest = np.where(valid, inverse - middle, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = _window(rest, radius) / count
@@ -119,7 +134,7 @@ def _covariances(
 
 
 def _window(values: FloatArray, radius: int, power_j: int = 0, power_i: int = 0) -> FloatArray:
-    """Sum of values times j^power_j i^power_i over each pixel's window, j and i the column and row offset from the pixel."""
+    """Sum values times j^power_j i^power_i over each pixel's window, with j and i the column and row offset from the pixel."""
     from scipy import ndimage
 
     offset = np.arange(-radius, radius + 1, dtype=float)

@@ -1,12 +1,12 @@
-"""From points to a surface: grid triangulation of an organised observation, Poisson reconstruction of an unorganised cloud.
+"""Make surfaces from points: grid triangulation of an organised observation, Poisson reconstruction of an unorganised cloud.
 
-Grid triangulation joins each sample to its neighbours in the sensor's own rows and columns: four samples make a cell, a cell two
-triangles along its shorter diagonal, or one where a corner is missing. An edge is cut at a depth discontinuity, where its ends
-differ in range r (distance from the viewpoint) by more than a step and it lies nearly along the line of sight:
+Grid triangulation connects each sample with its neighbours in the sensor's own rows and columns. Four samples make a cell, and a
+cell makes two triangles along its shorter diagonal, or one if a corner is missing. An edge is cut at a depth discontinuity, where
+its ends differ in range r (distance from the viewpoint) by more than a step and it lies nearly along the line of sight:
 
     |r_2 - r_1| > depth_step_m   and   |r_2 - r_1| > |p_2 - p_1| cos(grazing_angle_rad)
 
-The first condition keeps noise from tearing a densely sampled surface, the second keeps a steep but continuous slope whole.
+The first condition prevents noise from tearing a densely sampled surface; the second preserves a steep but continuous slope.
 """
 
 from __future__ import annotations
@@ -21,33 +21,37 @@ from pydantic import Field
 from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.common.extras import how_to_install
-from scene.common.native_output import stderr_dropped
+from scene.common.native_output import suppress_stderr
 from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, area_normals
 from sensors.signal_chain.observation import Observation
 
 BoolArray = NDArray[np.bool_]
 
 _POISSON_DEPTH_LIMIT = 12
-"""The deepest octree chosen by itself: 4,096 cells along the cloud's longest side."""
+"""Deepest octree that is chosen automatically: 4,096 cells along the cloud's longest side."""
 _FINER = 4
-"""Levels of the octree below the one whose cells are as large as the spacing: finer cells hold nothing and take hours."""
+"""Levels of the octree allowed below the one with cells as large as the spacing: finer cells are empty and take hours."""
 _NORMAL_NEIGHBOURS = 30
+"""Number of neighbours from which Open3D estimates a normal."""
 _VOTES = 4096
-"""Triangles asked for the winding of an organised grid; all but folded ones agree."""
+"""Number of triangles that decide the winding of an organised grid; all but folded ones agree."""
 
 
 class SurfaceConfig(Config):
-    """How points become a surface."""
+    """How points are converted to a surface."""
 
     method: Literal["grid", "poisson"] = Field("grid", description="grid triangulation, or Open3D's Poisson reconstruction")
-    depth_step_m: float = Field(0.3, ge=0, description="a smaller range difference of neighbouring samples is never cut")
+    depth_step_m: float = Field(0.3, ge=0, description="edges with a smaller range difference are never cut [m]")
     grazing_angle_rad: float = Field(
-        0.15, ge=0, lt=np.pi / 2, description="an edge at a larger angle to the line of sight is never cut; 0 cuts nothing"
+        0.15,
+        ge=0,
+        lt=np.pi / 2,
+        description="edges at a larger angle to the line of sight are never cut; 0: no edge is cut [rad]",
     )
-    holes: Literal["keep", "fill"] = Field("keep", description="leave missing samples open, or interpolate the small holes")
-    maximum_hole_px: int = Field(64, ge=1, description="holes: fill, the largest hole that is filled, in missing samples")
+    holes: Literal["keep", "fill"] = Field("keep", description="leave holes open, or interpolate small ones")
+    maximum_hole_px: int = Field(64, ge=1, description="with holes: fill, the largest hole that is filled, in missing samples")
     poisson_depth: int | None = Field(
-        None, ge=4, le=16, description="depth of the octree; null: its cells as large as the points' spacing"
+        None, ge=4, le=16, description="depth of the octree; null: cells as large as the points' spacing"
     )
     poisson_trim_spacings: float = Field(
         3.0, gt=0, description="the Poisson surface ends this many median point spacings from the nearest point"
@@ -55,10 +59,10 @@ class SurfaceConfig(Config):
 
 
 def mesh_observation(observation: Observation, config: SurfaceConfig) -> TriangleMesh:
-    """The surface through an observation's points, wall frame, counter-clockwise seen from its viewpoint.
+    """Make the surface through an observation's points, wall frame, counter-clockwise as seen from its viewpoint.
 
-    The vertices are the samples that some triangle uses, in the sensor's order, each with its block in `vertex_block`.
-    Raises InputError where no triangle is left.
+    Vertices are the samples that belong to a triangle, in the sensor's order, each with its block in `vertex_block`. Raises
+    InputError if there is no triangle.
     """
     points, block = observation.points, observation.block
     if config.method == "poisson":
@@ -79,11 +83,22 @@ def mesh_observation(observation: Observation, config: SurfaceConfig) -> Triangl
 
 
 def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, config: SurfaceConfig) -> TriangleMesh:
-    """Screened Poisson reconstruction (Kazhdan and Hoppe 2013, by Open3D) of an unorganised cloud, wall frame.
+    """Make a surface from an unorganised cloud by screened Poisson reconstruction (Kazhdan and Hoppe 2013, by Open3D).
 
-    points: (n, 3), m; block: (n,) labels; viewpoint: (3,), m, the side that the normals and the winding look to. Poisson
-    closes the surface where there are no points; vertices farther from every point than `poisson_trim_spacings` median spacings
-    are trimmed. Labels come from the nearest point. Single-threaded: with more threads Open3D gives other bytes in every run.
+    Poisson reconstruction closes the surface where there are no points; vertices farther from every point than
+    `poisson_trim_spacings` median spacings are removed. It runs in one thread, because Open3D's result is not reproducible
+    with more.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+        The cloud, wall frame, m.
+    block : (n,) array
+        Block labels. A vertex takes that of the nearest point.
+    viewpoint : (3,) array
+        Position to which normals and winding point, m.
+    config : SurfaceConfig
+        Settings of the reconstruction.
     """
     if len(points) <= _NORMAL_NEIGHBOURS:
         raise InputError(f"{len(points)} points are too few", where="Poisson surface", allowed="more than 16")
@@ -101,9 +116,24 @@ def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, confi
 def labelled_surface(
     vertices: FloatArray, faces: IntArray, points: FloatArray, labels: tuple[FloatArray, IntArray], config: SurfaceConfig
 ) -> TriangleMesh:
-    """A surface made from `points` by others, without what lies `poisson_trim_spacings` median spacings from them or farther.
+    """Trim a reconstructed surface to the neighbourhood of its points, and label its vertices.
 
-    labels: (n, 3) points and their (n,) blocks; each vertex takes that of the nearest. Raises InputError where nothing is left.
+    Parameters
+    ----------
+    vertices, faces : (n, 3) arrays
+        The surface.
+    points : (k, 3) array
+        The points from which it was made. Vertices farther from all of them than `poisson_trim_spacings` median spacings are
+        removed.
+    labels : (points, blocks)
+        Points (n, 3) and their block labels (n,). A vertex takes that of the nearest point.
+    config : SurfaceConfig
+        Settings of the reconstruction.
+
+    Raises
+    ------
+    InputError
+        If nothing is left.
     """
     from scipy.spatial import cKDTree
 
@@ -121,13 +151,15 @@ def labelled_surface(
 
 
 def octree_depth(points: FloatArray) -> int:
-    """The octree depth whose cells are as large as the median spacing of (n, 3) points; InputError where they coincide."""
+    """Return the octree depth whose cells are as large as the median spacing of points (n, 3). Raises InputError if they
+    coincide.
+    """
     longest = float(np.ptp(points, axis=0).max())
     return int(np.clip(np.ceil(np.log2(longest / median_spacing(points))), 4, _POISSON_DEPTH_LIMIT))
 
 
 def median_spacing(points: FloatArray) -> float:
-    """Return the median distance of points (n, 3) to their nearest neighbours, m. Raises InputError where most coincide."""
+    """Return the median distance of points (n, 3) to their nearest neighbour, m. Raises InputError if most coincide."""
     from scipy.spatial import cKDTree
 
     spacing = float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))
@@ -138,10 +170,16 @@ def median_spacing(points: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class _Cells:
-    """The triangles of each cell of an organised (h, w) grid; all arrays (h-1, w-1) bool.
+    """The triangles of each cell of an organised (h, w) grid; all arrays are (h-1, w-1) bool.
 
-    A cell's corners are a, b in its first row and c, d in its second. falling: it is split along a-d into (a, c, d) and
-    (d, b, a), else along b-c into (a, c, b) and (d, b, c); first, second: which of the two triangles exist.
+    A cell has corners a, b in its first row and c, d in its second.
+
+    Attributes
+    ----------
+    first, second : array
+        Which of the cell's two triangles exist.
+    falling : array
+        Whether the cell is split along a-d into (a, c, d) and (d, b, a), or along b-c into (a, c, b) and (d, b, c).
     """
 
     first: BoolArray
@@ -149,7 +187,7 @@ class _Cells:
     falling: BoolArray
 
     def used(self, shape: tuple[int, ...]) -> BoolArray:
-        """(h, w) the samples that some triangle uses."""
+        """Return the samples (h, w) that belong to a triangle."""
         used = np.zeros(shape, dtype=bool)
         used[:-1, :-1] |= self.first | (self.second & self.falling)
         used[:-1, 1:] |= self.second | (self.first & ~self.falling)
@@ -158,7 +196,9 @@ class _Cells:
         return used
 
     def faces(self, used: BoolArray) -> IntArray:
-        """(m, 3) triangles over the numbered `used` samples, all of one winding; the first of every cell, then the second."""
+        """Return the triangles (m, 3) over the numbered `used` samples, consistently wound; first all first triangles, then the
+        second ones.
+        """
         number = _numbers(used)
         a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
         first = [a[self.first], c[self.first], np.where(self.falling, d, b)[self.first]]
@@ -167,9 +207,11 @@ class _Cells:
 
 
 def _triangulate(points: FloatArray, viewpoint: FloatArray, config: SurfaceConfig) -> _Cells:
-    """Split every cell of (h, w, 3) points where it gives most triangles, in a tie along the shorter diagonal."""
+    """Split every cell of points (h, w, 3) such that most triangles result; in a tie along the shorter diagonal."""
     local = points - viewpoint
-    coordinates = np.ascontiguousarray(np.moveaxis(local, 2, 0), dtype=np.float32)  # for tests only: micrometres suffice
+    coordinates = np.ascontiguousarray(
+        np.moveaxis(local, 2, 0), dtype=np.float32
+    )  # float32 suffices for deciding which edges to cut
     distance = np.sqrt(np.einsum("ijk,ijk->ij", local, local))
     edges = _Edges(coordinates, distance.astype(np.float32), config)
     along_rows, _ = edges.join(np.s_[:, :-1], np.s_[:, 1:])
@@ -185,14 +227,14 @@ def _triangulate(points: FloatArray, viewpoint: FloatArray, config: SurfaceConfi
 
 @dataclass(frozen=True)
 class _Edges:
-    """Edges between samples; coordinates: (3, h, w) float32, relative to the viewpoint, m; distance: (h, w) from it, m."""
+    """Edges between samples. coordinates: (3, h, w) float32, relative to the viewpoint, m; distance: (h, w) from it, m."""
 
     coordinates: NDArray[np.float32]
     distance: NDArray[np.float32]
     config: SurfaceConfig
 
     def join(self, start: tuple[slice, ...], end: tuple[slice, ...]) -> tuple[BoolArray, NDArray[np.float32]]:
-        """Whether the edges from `start` to `end` samples are whole (False at NaN), and their squared lengths, m2."""
+        """Return whether the edges from `start` to `end` samples are kept (False at NaN), and their squared lengths, m2."""
         squared = np.square(self.coordinates[0][end] - self.coordinates[0][start])
         for axis in (1, 2):
             squared += np.square(self.coordinates[axis][end] - self.coordinates[axis][start])
@@ -204,12 +246,12 @@ class _Edges:
 
 
 def _numbers(used: BoolArray) -> IntArray:
-    """The new index of each kept element, in order; meaningless where `used` is False."""
+    """Return the new index of each used element, in order; without meaning where `used` is False."""
     return (np.cumsum(used, dtype=np.int32) - np.int32(1)).reshape(used.shape)
 
 
 def _oriented(faces: IntArray, vertices: FloatArray, viewpoint: FloatArray) -> IntArray:
-    """The faces, all reversed where most of a sample of them are clockwise seen from the viewpoint."""
+    """Reverse all faces if most of a sample of them are clockwise as seen from the viewpoint."""
     corners = vertices[faces[:: max(len(faces) // _VOTES, 1)]]
     normal = area_normals(corners)
     towards = np.einsum("ij,ij->i", normal, viewpoint - corners[:, 0])
@@ -217,10 +259,11 @@ def _oriented(faces: IntArray, vertices: FloatArray, viewpoint: FloatArray) -> I
 
 
 def _fill_holes(points: FloatArray, block: IntArray, maximum_px: int) -> tuple[FloatArray, IntArray]:
-    """Interpolate the holes of at most `maximum_px` missing samples that do not touch the grid's border.
+    """Interpolate holes of at most `maximum_px` missing samples that do not touch the border of the grid.
 
-    A filled point is the mean of the linear interpolations along its row and its column, weighted by the inverse widths of the
-    hole there: an affine combination, so a hole in a plane is filled exactly. Its label is that of the nearest of the four ends.
+    A filled point is the mean of linear interpolations along its row and its column, weighted by the inverse width of the
+    hole. This is an affine combination, so a hole in a plane is filled exactly. Its label is that of the nearest of the four
+    ends.
     """
     missing = np.isnan(points[..., 0])
     rows, columns = np.nonzero(_small_holes(missing, maximum_px))
@@ -242,7 +285,7 @@ def _fill_holes(points: FloatArray, block: IntArray, maximum_px: int) -> tuple[F
 
 
 def _small_holes(missing: BoolArray, maximum_px: int) -> BoolArray:
-    """(h, w) the missing samples in 4-connected holes of at most `maximum_px`, away from the border."""
+    """Return the missing samples (h, w) in 4-connected holes of at most `maximum_px`, away from the border."""
     from scipy import ndimage
 
     holes, _ = ndimage.label(missing)
@@ -253,7 +296,9 @@ def _small_holes(missing: BoolArray, maximum_px: int) -> BoolArray:
 
 
 def _ends(missing: BoolArray, axis: int) -> tuple[IntArray, IntArray]:
-    """(h, w) index along `axis` of the last sample at or before each place and of the next at or after it (-1, n: none)."""
+    """Return the index (h, w) along `axis` of the last sample at or before each position, and of the next at or after it (-1, n:
+    none).
+    """
     size = missing.shape[axis]
     place = np.arange(size, dtype=np.int32).reshape((-1, 1) if axis == 0 else (1, -1))
     before = np.maximum.accumulate(np.where(missing, np.int32(-1), place), axis=axis)
@@ -262,9 +307,9 @@ def _ends(missing: BoolArray, axis: int) -> tuple[IntArray, IntArray]:
 
 
 def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[FloatArray, IntArray]:
-    """Open3D's reconstruction, with normals that look to the viewpoint; returns vertices and faces."""
+    """Run Open3D's reconstruction with normals that point to the viewpoint. Returns vertices and faces."""
     try:
-        import open3d  # takes seconds to load and is needed here only
+        import open3d  # slow to load, and only needed here
     except ImportError as error:
         remedy = how_to_install("poisson")
         raise InputError(f"poisson needs Open3D, which does not load ({error})", where="surface.method", remedy=remedy) from None
@@ -272,6 +317,6 @@ def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[Flo
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     cloud.orient_normals_towards_camera_location(np.asarray(viewpoint, dtype=float))
-    with stderr_dropped():
+    with suppress_stderr():
         surface, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return np.asarray(surface.vertices).copy(), np.asarray(surface.triangles, dtype=np.int32).copy()

@@ -1,8 +1,9 @@
-"""Cameras and depth maps as Agisoft Metashape loads them, with the script for its Python console beside them.
+"""Write cameras and depth maps for Agisoft Metashape, with a script for its Python console that loads them.
 
-Metashape takes depth maps from outside by `Chunk.importDepthImages` (Metashape Python Reference 2.2, class Metashape.Chunk); it
-wants each beside an image of the same name and shape, with the depth along the camera's axis and 0 where there is none. Poses and
-calibrations come by `Chunk.importCameras`, matched by label. So images, depth maps and cameras all are of the depth map's pixels.
+Metashape imports depth maps with `Chunk.importDepthImages` (Metashape Python Reference 2.2, class Metashape.Chunk). It needs
+each beside an image of the same name and shape, with the depth along the camera's axis and 0 where there is none. Poses and
+calibrations are imported with `Chunk.importCameras` and matched by label. Images, depth maps and cameras therefore all have
+the depth map's pixels.
 """
 
 from __future__ import annotations
@@ -50,12 +51,13 @@ if sorted(loaded) != sorted(SIDES) or unposed:
     raise RuntimeError("depth maps: %s; cameras without a pose: %s" % (loaded, unposed))
 print("Loaded: %s. Next: Workflow > Build Model, source data: Depth maps." % ", ".join(loaded))
 '''
+"""Script that a user runs in Metashape."""
 
 
 def write_metashape_export(folder: Path, left: DepthMap, right: DepthMap) -> None:
     """Write cameras.xml, depth/, images/ and load_depth_maps.py into `folder`, all in the wall frame, m.
 
-    The images are shaded depth: no photograph is needed, and none is there where the matching is simulated.
+    The images are shaded depth, because there is no photograph when the matching is simulated.
     """
     maps = dict(zip(SIDES, (left, right), strict=True))
     write_metashape(folder / "cameras.xml", {side: source.camera for side, source in maps.items()})
@@ -68,7 +70,7 @@ def write_metashape_export(folder: Path, left: DepthMap, right: DepthMap) -> Non
 
 
 def _shaded(depth: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(h, w) grey by the slope of the depth from row to row, 0 where there is no depth."""
+    """Shade the depth map: grey values (h, w) by the slope of the depth from row to row, 0 without depth."""
     slope = np.diff(depth, axis=0, prepend=depth[:1])
     valid = np.isfinite(slope)
     scale = np.quantile(np.abs(slope[valid]), 0.9) if valid.any() else 0.0

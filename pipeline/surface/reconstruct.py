@@ -1,10 +1,11 @@
-"""From an observation to a surface: `direct`, the sensor's own grid; `vertices`, the wall's own, each measured by the pair
-(sensors/stereo/stereo_vertices.py); or `colmap`, an outside reconstruction of the depth maps.
+"""Reconstruct a surface from two depth maps with COLMAP, and define the names of all methods of reconstruction.
 
-`colmap` is the analogue of handing depth maps to Metashape. Both depth maps, freed of the lens distortion, go into a COLMAP
-workspace; its stereo fusion joins what agrees in both (Schoenberger et al. 2016, "Pixelwise View Selection for Unstructured
-Multi-View Stereo", section 4.4), its Poisson reconstruction (Kazhdan and Hoppe 2013) makes the surface. COLMAP's dense Delaunay
-meshing is not in PyPI's pycolmap, which is built without CGAL.
+The methods are `direct`, which triangulates the sensor's own grid; `vertices`, in which the pair measures the wall's own
+vertices (sensors/stereo/stereo_vertices.py); and `colmap`, which is the analogue of handing depth maps to Metashape. For
+`colmap`, both depth maps, with lens distortion removed, are written to a COLMAP workspace. COLMAP's stereo fusion joins what
+agrees in both (Schoenberger et al. 2016, "Pixelwise View Selection for Unstructured Multi-View Stereo", section 4.4), and its
+Poisson reconstruction (Kazhdan and Hoppe 2013) makes the surface. COLMAP's dense Delaunay meshing is missing in PyPI's
+pycolmap, which is built without CGAL.
 """
 
 from __future__ import annotations
@@ -29,19 +30,25 @@ from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh
 
 Reconstruction = Literal["direct", "vertices", "colmap"]
 NAMES = ("left.png", "right.png")
-"""The images of the workspace; they are grey, for fusion only copies their colours."""
+"""The images of the workspace. They are grey, because fusion only copies their colours."""
 _LANDMARKS = 200
-"""Points of the sparse model: fusion takes images as neighbours that share some."""
+"""Number of points of the sparse model. Fusion considers images as neighbours if they share some."""
 
 
 class FusionConfig(Config):
     """COLMAP's stereo fusion and Poisson reconstruction (`colmap stereo_fusion`, `colmap poisson_mesher`)."""
 
     minimum_pixels: int = Field(2, ge=1, description="depth pixels that a fused point needs (COLMAP: 5; two images give two)")
-    maximum_reprojection_px: float = Field(2.0, gt=0, description="between the depth maps, in their pixels [px]")
-    maximum_depth_ratio: float = Field(0.01, gt=0, description="difference of depths over depth")
-    maximum_normal_angle_rad: float = Field(0.35, gt=0, le=np.pi, description="between normals (COLMAP: 10 degrees) [rad]")
-    normal_radius_px: int = Field(1, ge=1, le=20, description="radius of the window that normals are fitted in, depth map pixels")
+    maximum_reprojection_px: float = Field(
+        2.0, gt=0, description="largest reprojection error between the depth maps, in their pixels [px]"
+    )
+    maximum_depth_ratio: float = Field(0.01, gt=0, description="largest difference of depths, as a share of the depth")
+    maximum_normal_angle_rad: float = Field(
+        0.35, gt=0, le=np.pi, description="largest angle between normals (COLMAP: 10 degrees) [rad]"
+    )
+    normal_radius_px: int = Field(
+        1, ge=1, le=20, description="radius of the window in which normals are fitted, depth map pixels"
+    )
     point_weight: float = Field(
         4.0, ge=0, description="Poisson: weight of the points against the gradient field (COLMAP: 1; Kazhdan and Hoppe: 4)"
     )
@@ -52,8 +59,21 @@ def write_workspace(
 ) -> None:
     """Write the depth maps as a COLMAP workspace that its `stereo_fusion` reads, in the wall frame.
 
-    landmarks: (n, 3) points of the sparse model. The folder then holds images/, sparse/ and stereo/. COLMAP's fusion puts the
-    centre of the top-left pixel at (0, 0) (colmap/mvs/fusion.cc), unlike its camera models: the principal points are so.
+    The folder then contains images/, sparse/ and stereo/. COLMAP's fusion puts the centre of the top-left pixel at (0, 0)
+    (colmap/mvs/fusion.cc), unlike its camera models; the principal points are written accordingly.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write.
+    left, right : DepthMap
+        The depth maps.
+    landmarks : (n, 3) array
+        Points of the sparse model, wall frame, m.
+    surface : SurfaceConfig
+        Gives the depth step at which maps are not interpolated.
+    radius : int
+        Radius of the window in which normals are fitted, px.
     """
     cameras = {}
     for name, source in zip(NAMES, (left, right), strict=True):
@@ -71,10 +91,25 @@ def write_workspace(
 def colmap_surface(
     left: DepthMap, right: DepthMap, points: FloatArray, block: IntArray, surface: SurfaceConfig, fusion: FusionConfig
 ) -> TriangleMesh:
-    """The surface that COLMAP makes of two depth maps, wall frame.
+    """Make the surface that COLMAP reconstructs from two depth maps, wall frame.
 
-    points: (n, 3), m, and block: (n,), the observation that labels come from. Single-threaded, so that equal maps give equal
-    bytes. Raises InputError where pycolmap is missing and where nothing is fused.
+    It runs in one thread, so that equal maps give equal bytes.
+
+    Parameters
+    ----------
+    left, right : DepthMap
+        The depth maps.
+    points, block : (n, 3) and (n,) arrays
+        The observation from which labels are taken, m.
+    surface : SurfaceConfig
+        Settings of the Poisson reconstruction.
+    fusion : FusionConfig
+        Settings of the fusion.
+
+    Raises
+    ------
+    InputError
+        If pycolmap is missing or nothing is fused.
     """
     pycolmap = _pycolmap()
     with tempfile.TemporaryDirectory(prefix="scarpsim_colmap_") as name:
@@ -99,6 +134,7 @@ def colmap_surface(
 
 
 def _fusion_options(pycolmap: Any, fusion: FusionConfig) -> Any:
+    """Convert the config to pycolmap's options."""
     return pycolmap.StereoFusionOptions(
         min_num_pixels=fusion.minimum_pixels,
         max_reproj_error=fusion.maximum_reprojection_px,
@@ -109,6 +145,7 @@ def _fusion_options(pycolmap: Any, fusion: FusionConfig) -> Any:
 
 
 def _pycolmap() -> Any:
+    """Import pycolmap. Raises InputError if it is not installed."""
     try:
         import pycolmap  # an extra, and needed here only
     except ImportError:
@@ -119,6 +156,7 @@ def _pycolmap() -> Any:
 
 
 def _write_grey(path: Path, shape: tuple[int, ...]) -> None:
+    """Write a uniform grey image."""
     path.parent.mkdir(parents=True, exist_ok=True)
     grey: NDArray[np.uint8] = np.full(shape, 128, dtype=np.uint8)
     cv2.imwrite(str(path), grey)

@@ -1,9 +1,9 @@
-"""Several stations of a laser scanner: registered to the first without targets, and merged into one surface.
+"""Register several stations of a laser scanner to the first one without targets, and merge them into one surface.
 
-Every station's grid becomes a mesh of its own. Those of the further stations are registered to the first one's by ICP; what that
-finds is how far their surveyed poses were wrong, against the first. Where several stations see the wall, the surface is that of
-the one with the best expected precision there; where only one sees it, that one's: the surface covers all that any station saw.
-Choosing instead of averaging keeps the seams of other stations' occlusions and errors of registration out of the surface.
+The grid of every station becomes a mesh. Those of the further stations are registered to the first one's by ICP, which
+corrects the errors of their surveyed poses relative to the first. Where several stations see the wall, the surface of the one
+with the best expected precision is used; elsewhere that of the only one. The surface thus covers everything that any station
+saw. Selecting instead of averaging keeps seams (from occlusions of other stations and registration errors) out of the surface.
 """
 
 from __future__ import annotations
@@ -29,24 +29,31 @@ from sensors.laser.tls import LaserScanner
 from sensors.signal_chain.observation import Observation
 
 _CELL_PX = 16
-"""Side of the cells in which precision is compared, in pixels of the difference map: it changes slowly over the wall."""
+"""Side of the cells in which precision is compared, in pixels of the difference map; it changes slowly over the wall."""
 _FACES = 1 << 20
+"""Number of faces processed at a time."""
 
 
 class StationsConfig(Config):
-    """How several stations of a laser scanner become one surface."""
+    """How several stations of a laser scanner are joined into one surface."""
 
     icp: IcpConfig | None = Field(
-        IcpConfig(), description="registration of the further stations to the first; none: surveyed poses as they are"
+        IcpConfig(), description="registration of the further stations to the first; none: surveyed poses are used unchanged"
     )
 
 
 @dataclass(frozen=True)
-class Joined:
+class JoinedStations:
     """All stations in the frame of the first one's surveyed pose.
 
-    observations: of each station, points moved by its registration; surface: merged; registrations: of the second station and
-    those after it, empty where they were left out.
+    Attributes
+    ----------
+    observations : tuple of Observation
+        One per station, with points moved by its registration.
+    surface : TriangleMesh
+        The merged surface.
+    registrations : tuple of Registration
+        Of the second station and those after it; empty without registration.
     """
 
     observations: tuple[Observation, ...]
@@ -54,35 +61,53 @@ class Joined:
     registrations: tuple[Registration, ...]
 
 
-def join(
+def join_stations(
     scanners: Sequence[LaserScanner],
     observations: Sequence[Observation],
     config: StationsConfig,
     surface: SurfaceConfig,
     raster: DifferenceConfig,
     random: KeyedRandom,
-) -> Joined:
-    """Register the observations of `scanners` to the first and merge their surfaces at the resolution of `raster`."""
+) -> JoinedStations:
+    """Register the observations of several stations to the first and merge their surfaces.
+
+    Parameters
+    ----------
+    scanners : sequence of LaserScanner
+        The stations.
+    observations : sequence of Observation
+        What they observed, in the same order.
+    config : StationsConfig
+        Settings of the registration.
+    surface : SurfaceConfig
+        How points are converted to surfaces.
+    raster : DifferenceConfig
+        Gives the resolution at which surfaces are merged.
+    random : KeyedRandom
+        Source of the registration's subsamples.
+    """
     meshes = [mesh_observation(observation, surface) for observation in observations]
-    registrations = () if config.icp is None else tuple(_registered(meshes, config.icp, random))
+    registrations = () if config.icp is None else tuple(_register_to_first(meshes, config.icp, random))
     for number, found in enumerate(registrations, start=1):
         meshes[number] = meshes[number].with_vertices(found.apply(meshes[number].vertices))
     moved = [_moved(seen, found) for seen, found in zip(observations[1:], registrations, strict=bool(registrations))]
-    return Joined((observations[0], *(moved or observations[1:])), merged(scanners, meshes, raster), registrations)
+    return JoinedStations(
+        (observations[0], *(moved or observations[1:])), merge_stations(scanners, meshes, raster), registrations
+    )
 
 
-def _registered(meshes: Sequence[TriangleMesh], config: IcpConfig, random: KeyedRandom) -> Iterator[Registration]:
-    """Of every mesh after the first to the first."""
+def _register_to_first(meshes: Sequence[TriangleMesh], config: IcpConfig, random: KeyedRandom) -> Iterator[Registration]:
+    """Yield the registration of every mesh after the first to the first."""
     target = ReferenceSurface.build(meshes[0].vertices, meshes[0].vertex_normals())
     for number, mesh in enumerate(meshes[1:], start=2):
         yield register_to(target, mesh.vertices, config, random.child(number))
 
 
-def merged(scanners: Sequence[LaserScanner], meshes: Sequence[TriangleMesh], config: DifferenceConfig) -> TriangleMesh:
-    """One mesh of the stations' (wall frame): each triangle that some pixel needs whose best station is its own.
+def merge_stations(scanners: Sequence[LaserScanner], meshes: Sequence[TriangleMesh], config: DifferenceConfig) -> TriangleMesh:
+    """Merge the stations' meshes (wall frame): keep each triangle that covers a pixel for which its station is the best.
 
-    Where two stations meet, their triangles overlap by less than one of them. At every pixel's centre there is a surface if any
-    station has one.
+    Where two stations meet, their triangles overlap by less than one of them. Every pixel centre has a surface if any station
+    has one there.
     """
     bounds = np.stack([np.min([mesh.bounds[0] for mesh in meshes], axis=0), np.max([mesh.bounds[1] for mesh in meshes], axis=0)])
     grid = raster_grid(bounds, config)
@@ -97,6 +122,7 @@ def merged(scanners: Sequence[LaserScanner], meshes: Sequence[TriangleMesh], con
 
 
 def _moved(seen: Observation, found: Registration) -> Observation:
+    """Apply a registration to an observation."""
     further = seen.further and replace(seen.further, points=found.apply(seen.further.points))
     points = found.apply(seen.points)
     offset = None if seen.offset is None else seen.offset + (points - seen.points)[..., :2].astype(np.float32)
@@ -104,10 +130,11 @@ def _moved(seen: Observation, found: Registration) -> Observation:
 
 
 def _variance(scanner: LaserScanner, grid: Grid, height_m: float) -> NDArray[np.float32]:
-    """(h, w) variance of the mean of a station's points per area, m4: sigma_n^2 A at the middle of the cell that holds a pixel.
+    """Return the expected variance (h, w) of the mean of a station's points per unit area, m4, per pixel.
 
-    sigma_n is a point's standard deviation along the wall's normal by the sensor model (`tls_geometry`) and A the wall's area
-    per point, R^2 sin z d_az d_ze / cos i, both on the plane z = `height_m`. Huge but finite where seen from behind.
+    It is sigma_n^2 A at the centre of the cell that contains the pixel. sigma_n is a point's standard deviation along the
+    wall's normal by the sensor model (`tls_geometry`), and A the area of wall per point, R^2 sin z d_az d_ze / cos i, both on
+    the plane z = `height_m`. It is very large but finite where the wall is seen from behind.
     """
     rows, columns = (-(-size // _CELL_PX) for size in grid.shape)
     side = _CELL_PX * grid.gsd
@@ -124,7 +151,7 @@ def _variance(scanner: LaserScanner, grid: Grid, height_m: float) -> NDArray[np.
 
 
 def _needed(mesh: TriangleMesh, grid: Grid, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(m,) faces within whose bounding box, over the wall's plane, lies a pixel of `own`, or part of one."""
+    """Return the faces (m,) whose bounding box, projected on the wall's plane, touches a pixel of `own`."""
     sums = np.pad(np.cumsum(np.cumsum(own, axis=0, dtype=np.int32), axis=1, dtype=np.int32), ((1, 0), (1, 0)))
     column = np.clip(np.floor(grid.columns(mesh.vertices[:, 0])), 0, grid.width - 1).astype(np.int32)
     row = np.clip(np.floor(grid.rows(mesh.vertices[:, 1])), 0, grid.height - 1).astype(np.int32)
@@ -138,7 +165,7 @@ def _needed(mesh: TriangleMesh, grid: Grid, own: NDArray[np.bool_]) -> NDArray[n
 
 
 def _concatenated(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """One mesh of labelled ones."""
+    """Concatenate labelled meshes."""
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     labels = [mesh.vertex_block for mesh in meshes if mesh.vertex_block is not None]
     return TriangleMesh(

@@ -1,8 +1,9 @@
-"""A surface through the points of a cloud as one place sees them: Delaunay triangles over azimuth and zenith angle.
+"""Triangulate the points of a cloud as seen from one place: Delaunay triangles over azimuth and zenith angle.
 
-Unlike Poisson's, it passes through the points and invents nothing behind them; it is a surface for rays from (near) that place
-only. Edges are cut at steps of depth like those of grid triangulation (`pipeline.surface.mesh`): longer in range than a step, and
-nearly along the line of sight. Of the points of one cell of a fine raster of directions the median range is taken.
+Unlike a Poisson surface, this surface passes through the points and adds nothing where there are none. It is valid only for
+rays from (near) that place. Edges are cut at depth steps, as in grid triangulation (`pipeline.surface.mesh`): where they are
+longer in range than a step and nearly along the line of sight. Of the points in one cell of a fine raster of directions, the
+one with the median range is used.
 """
 
 from __future__ import annotations
@@ -18,22 +19,36 @@ from scene.meshes.rounding import rounded_axes
 from sensors.signal_chain.polar import polar
 
 _STEP_M, _STEP_SHARE = 0.1, 0.02
-"""A smaller step of range is never cut: m, and share of the range."""
+"""Range steps smaller than this, in m and as a share of the range, are never cut."""
 _GRAZING_RAD = 0.15
+"""Edges at a smaller angle to the line of sight may be cut, rad."""
 _LONGEST = 6.0
-"""An edge longer than so many typical ones bridges a hole and is cut; along and across lines have their own."""
+"""An edge longer than this many typical edges bridges a hole and is cut. Edges along and across scan lines are treated
+separately.
+"""
 _MOST_POINTS = 2_000_000
+"""Approximate limit on the number of points that are triangulated."""
 _COARSE_M = 5e-3
-"""Rounding to larger steps tilts triangles: their vertices are averaged."""
+"""Coordinates rounded to larger steps than this tilt triangles, so their vertices are averaged, m."""
 _BETWEEN, _OF_SEVEN = np.sqrt(1 / 2), np.sqrt(1 / 7)
-"""Noise in the middle between two vertices, in that of one; and of a mean of a point and its six neighbours."""
+"""Noise midway between two vertices, and noise of the mean of a point and its six neighbours, relative to that of one vertex."""
 
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """mesh: in the points' frame, counter-clockwise seen from the viewpoint; spacing_m: median length of its edges; roughness_m:
-    robust standard deviation of a point about the mean of its neighbours, of noise and of relief between neighbours; smoothed:
-    whether each vertex is the mean of its own and its neighbours' points, since the coordinates are rounded coarsely."""
+    """A surface as seen from one place.
+
+    Attributes
+    ----------
+    mesh : TriangleMesh
+        In the points' frame, counter-clockwise as seen from the viewpoint.
+    spacing_m : float
+        Median length of its edges, m.
+    roughness_m : float
+        Robust standard deviation of a point from the mean of its neighbours, m: noise and relief between neighbours.
+    smoothed : bool
+        Whether each vertex is the mean of its own and its neighbours' points, because the coordinates were coarsely rounded.
+    """
 
     mesh: TriangleMesh
     spacing_m: float
@@ -42,15 +57,32 @@ class SeenSurface:
 
     @property
     def error_m(self) -> float:
-        """Standard deviation of its vertices along the rays, as far as they tell; of averaged ones, which share their points,
-        that of vertices that do not share any and leave the surface between them as noisy."""
+        """Estimated standard deviation of the vertices along the rays, m.
+
+        Averaged vertices share points, so for them it is that of independent vertices that would make the surface equally
+        noisy between them.
+        """
         return float(np.nan_to_num((_OF_SEVEN / _BETWEEN if self.smoothed else 1.0) * self.roughness_m))
 
 
-def triangulated(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray, where: str) -> SeenSurface:
-    """The surface through points (n, 3), m, seen from `viewpoint` (3,) m with `rotation` (3, 3), scanner to the points' frame.
+def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray, where: str) -> SeenSurface:
+    """Make the surface through points as seen from one place.
 
-    Raises InputError where no triangle is left.
+    Parameters
+    ----------
+    points : (n, 3) array
+        The cloud, m.
+    viewpoint : (3,) array
+        Position of the sensor, in the points' frame, m.
+    rotation : (3, 3) array
+        Scanner to the points' frame.
+    where : str
+        Name of the cloud in error messages.
+
+    Raises
+    ------
+    InputError
+        If no triangle is left.
     """
     from scipy.spatial import Delaunay, QhullError
 
@@ -63,7 +95,7 @@ def triangulated(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray
         faces = Delaunay(plane).simplices.astype(np.int32)
     except (QhullError, ValueError):
         raise InputError("the points lie in one line of sight, of which no surface can be made", where=where) from None
-    faces = faces[_whole(local, distance, plane, faces)]
+    faces = faces[_uncut(local, distance, plane, faces)]
     if not len(faces):
         raise InputError("no triangle is left between the points", where=where, remedy="give a denser cloud, or a mesh")
     faces = _towards(faces, local)
@@ -76,7 +108,7 @@ def triangulated(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray
 
 
 def _averaged(points: FloatArray, edges: NDArray[np.int32]) -> FloatArray:
-    """(n, 3) the mean of each point and its neighbours, a neighbour along two triangles counted once."""
+    """Return the mean (n, 3) of each point and its neighbours. A neighbour along two triangles counts once."""
     ends = np.unique(np.sort(edges, axis=1), axis=0)
     ends = np.concatenate([ends, ends[:, ::-1]])
     count = 1 + np.bincount(ends[:, 0], minlength=len(points))
@@ -87,7 +119,7 @@ def _averaged(points: FloatArray, edges: NDArray[np.int32]) -> FloatArray:
 
 
 def _one_per_direction(distance: FloatArray, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
-    """Indices of points: of those of one cell (a third of the median angular spacing) the one of median range."""
+    """Select points: in each cell of directions (a third of the median angular spacing) the one with the median range."""
     span = float(np.ptp(azimuth) * np.ptp(zenith))
     cell = max(np.sqrt(span / len(distance)) / 3, np.sqrt(span / (9 * _MOST_POINTS)), 1e-7)
     code = np.floor((azimuth - azimuth.min()) / cell).astype(np.int64) << 32
@@ -99,7 +131,7 @@ def _one_per_direction(distance: FloatArray, azimuth: FloatArray, zenith: FloatA
 
 
 def _plane(azimuth: FloatArray, zenith: FloatArray) -> FloatArray:
-    """(n, 2) angles as lengths on the sphere; azimuth begins behind its widest gap."""
+    """Convert angles to lengths on the unit sphere, (n, 2); azimuth starts behind its widest gap."""
     ordered = np.sort(azimuth)
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     begin = ordered[(int(np.argmax(gaps)) + 1) % len(ordered)]
@@ -107,8 +139,8 @@ def _plane(azimuth: FloatArray, zenith: FloatArray) -> FloatArray:
     return np.stack([np.mod(azimuth - begin, 2 * np.pi) * level, zenith], axis=1)
 
 
-def _whole(local: FloatArray, distance: FloatArray, plane: FloatArray, faces: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(m,) triangles none of whose edges is cut."""
+def _uncut(local: FloatArray, distance: FloatArray, plane: FloatArray, faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Return the triangles (m,) of which no edge is cut."""
     whole = np.ones(len(faces), dtype=bool)
     pairs = [faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]
     sides = [np.abs(plane[pair[:, 0]] - plane[pair[:, 1]]) for pair in pairs]
@@ -123,12 +155,12 @@ def _whole(local: FloatArray, distance: FloatArray, plane: FloatArray, faces: ND
 
 
 def _typical(lengths: FloatArray) -> float:
-    """Median of the lengths that are no rounding."""
+    """Return the median length, ignoring lengths that are only rounding errors."""
     return float(np.median(lengths[lengths > 0.05 * lengths.mean()]))
 
 
 def _towards(faces: NDArray[np.int32], local: FloatArray) -> NDArray[np.int32]:
-    """The faces, wound counter-clockwise seen from the origin of the local frame."""
+    """Wind the faces counter-clockwise as seen from the origin of the local frame."""
     away = signed_volumes(local[faces]) > 0
     faces = faces.copy()
     faces[away] = faces[away][:, ::-1]
@@ -136,7 +168,10 @@ def _towards(faces: NDArray[np.int32], local: FloatArray) -> NDArray[np.int32]:
 
 
 def _roughness(local: FloatArray, faces: NDArray[np.int32], edges: NDArray[np.int32]) -> float:
-    """Robust spread along the rays of a vertex about the mean of its neighbours; noise s and k of them give s sqrt(1 + 1 / k)."""
+    """Return the robust standard deviation along the rays of a vertex from the mean of its neighbours.
+
+    It is divided by sqrt(1 + 1 / k), the factor by which the mean of k neighbours increases a vertex's own noise.
+    """
     ends = np.concatenate([edges, edges[:, ::-1]])
     count = np.bincount(ends[:, 0], minlength=len(local))
     inner = count >= 8  # four neighbours, each edge seen from two triangles

@@ -1,6 +1,7 @@
-"""The light on the rock: the sun's direction, by date, time and place or given, shadows cast by the wall, and an even sky.
+"""Light the rock: direct sun with shadows cast by the wall, and a uniform sky.
 
-The world frame is x east, y north, z up; azimuths count clockwise from north.
+The sun's direction is given, or computed from date, time and place. The world frame is x east, y north, z up; azimuths count
+clockwise from north.
 """
 
 from __future__ import annotations
@@ -20,14 +21,16 @@ from scene.geometry.mesh import FloatArray
 from scene.ray_casting.raycast import RayCaster
 
 J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
+"""Epoch from which the formulas count days."""
 _SHADOW_OFFSET_M = 1e-3
-"""How far off the surface a shadow ray starts: a hundred times the error of a single precision ray at 100 m."""
+"""Distance from the surface at which a shadow ray starts: a hundred times the error of a single precision ray at 100 m."""
 _FAR_M = 1e4
+"""Length of a shadow ray, m."""
 
 
 @dataclass(frozen=True)
 class SunPosition:
-    """Where the sun stands: azimuth clockwise from north, elevation above the horizon as it appears (refracted), rad."""
+    """Direction of the sun: azimuth clockwise from north, and apparent (refracted) elevation above the horizon, rad."""
 
     azimuth_rad: float
     elevation_rad: float
@@ -39,10 +42,11 @@ class SunPosition:
         return np.array([level * np.sin(self.azimuth_rad), level * np.cos(self.azimuth_rad), np.sin(self.elevation_rad)])
 
 
-def equatorial(days: float) -> tuple[float, float]:
-    """Right ascension and declination of the sun, rad, `days` after J2000 (2000-01-01 12:00 UT).
+def sun_coordinates(days: float) -> tuple[float, float]:
+    """Compute the sun's right ascension and declination, rad, `days` after J2000 (2000-01-01 12:00 UT).
 
-    The Astronomical Almanac's low-precision formulas: within 0.01 deg from 1950 to 2050 (Michalsky 1988, eq. 2-7).
+    These are the Astronomical Almanac's low-precision formulas, accurate to 0.01 deg from 1950 to 2050 (Michalsky 1988, eq.
+    2-7).
     """
     longitude, anomaly = np.radians(280.460 + 0.9856474 * days), np.radians(357.528 + 0.9856003 * days)
     ecliptic = longitude + np.radians(1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly))
@@ -52,14 +56,23 @@ def equatorial(days: float) -> tuple[float, float]:
 
 
 def sun_position(time: datetime, latitude_rad: float, longitude_rad: float) -> SunPosition:
-    """The sun at `time` (without a time zone: UTC) and a place (north and east positive), within 0.02 deg from 1950 to 2050.
+    """Compute where the sun stands, accurate to 0.02 deg from 1950 to 2050.
 
-    Refraction is that of a standard atmosphere; below 15 deg of elevation it may differ by more (Michalsky 1988, Solar Energy
-    40(3), with his errata of 1988).
+    Parameters
+    ----------
+    time : datetime
+        UTC if it has no time zone.
+    latitude_rad, longitude_rad : float
+        The place, north and east positive.
+
+    Notes
+    -----
+    Refraction is that of a standard atmosphere; below 15 deg of elevation it may differ by more than the stated accuracy
+        (Michalsky 1988, Solar Energy 40(3), with his errata of 1988).
     """
     moment = time if time.tzinfo else time.replace(tzinfo=UTC)
     days = (moment - J2000).total_seconds() / 86400
-    ascension, declination = equatorial(days)
+    ascension, declination = sun_coordinates(days)
     hour = 24 * ((days + 0.5) % 1)  # UT
     sidereal = np.radians(15 * ((6.697375 + 0.0657098242 * days + hour) % 24))
     angle = sidereal + longitude_rad - ascension
@@ -71,7 +84,9 @@ def sun_position(time: datetime, latitude_rad: float, longitude_rad: float) -> S
 
 
 def _refraction(elevation_rad: float) -> float:
-    """Atmospheric refraction, rad, of a true elevation (Michalsky 1988, 288 K, 1013.25 hPa); zero for a sun that is down."""
+    """Return the atmospheric refraction, rad, at a true elevation (Michalsky 1988, 288 K, 1013.25 hPa); zero if the sun is
+    down.
+    """
     degrees = np.degrees(elevation_rad)
     if degrees < -0.56:
         return 0.0
@@ -80,19 +95,19 @@ def _refraction(elevation_rad: float) -> float:
 
 
 class IlluminationConfig(Config):
-    """Sun and sky while the pair of photographs is taken; a time and a place go before a given direction."""
+    """Sun and sky while the two photographs are taken; a time and a place take precedence over a given direction."""
 
     sun_azimuth_deg: float = Field(225.0, ge=0, lt=360, description="direction of the sun, clockwise from north (world y) [deg]")
     sun_elevation_deg: float = Field(45.0, gt=0, le=90, description="height of the sun above the horizon [deg]")
-    time_utc: datetime | None = Field(None, description="date and time, 2026-06-21T03:00:00; none: the sun is where it is given")
+    time_utc: datetime | None = Field(None, description="date and time, 2026-06-21T03:00:00; none: use the given direction")
     latitude_deg: float | None = Field(
-        None, ge=-90, le=90, description="of the place, north positive; needed with time_utc [deg]"
+        None, ge=-90, le=90, description="latitude of the place, north positive; needed with time_utc [deg]"
     )
     longitude_deg: float | None = Field(
-        None, ge=-180, le=180, description="of the place, east positive; needed with time_utc [deg]"
+        None, ge=-180, le=180, description="longitude of the place, east positive; needed with time_utc [deg]"
     )
     sky_share: float = Field(
-        0.25, ge=0, le=1, description="share of the sky in the light on a face turned to the sun; 1: overcast"
+        0.25, ge=0, le=1, description="share of skylight in the total light on a face that points at the sun; 1: overcast"
     )
 
     @model_validator(mode="after")
@@ -103,7 +118,7 @@ class IlluminationConfig(Config):
         return self
 
     def sun(self) -> SunPosition:
-        """Where the sun stands. Raises InputError where it is down at the given time and place."""
+        """Return the direction of the sun. Raises InputError if it is below the horizon at the given time and place."""
         if self.time_utc is None or self.latitude_deg is None or self.longitude_deg is None:
             return SunPosition(np.radians(self.sun_azimuth_deg), np.radians(self.sun_elevation_deg))
         sun = sun_position(self.time_utc, np.radians(self.latitude_deg), np.radians(self.longitude_deg))
@@ -116,24 +131,42 @@ class IlluminationConfig(Config):
         return sun
 
     def in_wall_frame(self, frame: WallFrame) -> Illumination:
-        """The light in the frame of the scene."""
+        """Return sun and sky with directions in the wall frame."""
         up = frame.direction_to_wall(np.array([0.0, 0.0, 1.0]))
         return Illumination(frame.direction_to_wall(self.sun().direction), up, self.sky_share)
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """Sun and sky in the scene's frame. sun, up: (3,) unit vectors; sky_share: in the light on a face turned to the sun."""
+    """Sun and sky in the frame of the scene.
+
+    Attributes
+    ----------
+    sun, up : (3,) array
+        Unit vectors towards the sun and the zenith.
+    sky_share : float
+        Share of skylight in the total light on a face that points at the sun.
+    """
 
     sun: FloatArray
     up: FloatArray
     sky_share: float
 
     def irradiance(self, scene: RayCaster, point: mi.Array3f64, normal: mi.Vector3f) -> mi.Float32:
-        """(n,) irradiance of surface elements, relative to an open one that faces the sun.
+        """Compute the irradiance (n,) of surface elements, relative to an unshadowed one that points at the sun.
 
-        E = (1 - s) V max(0, n . sun) + s (1 + n . up) / 2, V: whether the sun is seen (one shadow ray), s: the sky's share. The
-        sky is of even brightness and what the wall hides of it is left out, as is light from rock to rock.
+        E = (1 - s) V max(0, n . sun) + s (1 + n . up) / 2, where V is 1 if a shadow ray reaches the sun and s is the sky's
+        share. The sky has uniform brightness. The part of it that the wall hides is not subtracted, and light reflected
+        between rocks is ignored.
+
+        Parameters
+        ----------
+        scene : RayCaster
+            The surface that casts shadows.
+        point : 3 x (n,)
+            Positions, m.
+        normal : 3 x (n,)
+            Unit normals of the surface.
         """
         sun, up = (mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in axis)) for axis in (self.sun, self.up))
         towards = mi.Array3f64(sun)

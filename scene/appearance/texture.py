@@ -1,4 +1,4 @@
-"""The rock's texture at image resolution: solid noise, evaluated where a ray hits, so that every camera sees the same rock."""
+"""Add texture to the rock at image resolution: solid noise evaluated where a ray hits, so that all cameras see the same rock."""
 
 from __future__ import annotations
 
@@ -12,34 +12,49 @@ from scene.common.config import Config
 from scene.common.keyed_random import KeyedRandom
 
 _DEVIATION = (1 / 3 * (26 / 35) ** 3) ** 0.5
-"""Standard deviation of the interpolated lattice: 1/3 at the nodes, times the mean of w^2 + (1-w)^2 = 26/35 along each axis."""
+"""Standard deviation of the interpolated lattice: variance 1/3 at the nodes, times the mean of w^2 + (1-w)^2 = 26/35 along each
+axis.
+"""
 _PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)
+"""Multipliers of the lattice hash, one per axis."""
 
 
 class TextureConfig(Config):
-    """Texture of the rock beyond the mesh's albedo, seen by the real matcher alone."""
+    """Texture of the rock beyond the mesh's albedo; only the image matcher sees it."""
 
     contrast: float = Field(0.12, ge=0, le=1, description="standard deviation of each octave, as a share of the albedo")
     coarsest_m: float = Field(1.0, gt=0, le=100, description="grain of the coarsest octave; finer ones follow by halves [m]")
 
     def texture(self, random: KeyedRandom) -> RockTexture:
-        """The texture that `random` draws: the same for every epoch of a run."""
+        """Return the texture that `random` draws. It is the same in every epoch of a run."""
         return RockTexture(self.contrast, self.coarsest_m, random.key & 0xFFFFFFFF)
 
 
 @dataclass(frozen=True)
 class RockTexture:
-    """Fractal value noise in space: octaves of equal contrast, as in natural images, whose power falls with 1/f^2."""
+    """Fractal value noise in space.
+
+    Octaves have equal contrast, so that the power spectrum falls with 1/f^2, as in natural images.
+
+    Attributes
+    ----------
+    contrast : float
+        Standard deviation of each octave, as a share of the albedo.
+    coarsest_m : float
+        Grain size of the coarsest octave, m.
+    key : int
+        Seed of the noise, 32 bits.
+    """
 
     contrast: float
     coarsest_m: float
     key: int
 
     def factor(self, point: mi.Array3f64, footprint_m: float) -> mi.Float32:
-        """(n,) factor on the albedo at 3 x (n,) points, m; its logarithm is Gaussian-like with mean 0.
+        """Return the factor (n,) on the albedo at points 3 x (n,), m. Its logarithm has mean 0 and is nearly Gaussian.
 
-        Octaves end at the footprint (the size of a pixel on the rock): finer grain averages out inside a pixel. An octave between
-        half the footprint and the footprint fades in, so that the rock looks alike from nearly equal distances.
+        Octaves end at `footprint_m`, the size of a pixel on the rock, because finer grain averages out within a pixel. An
+        octave between half the footprint and the footprint fades in, so that the rock looks alike from similar distances.
         """
         octaves = max(1, int(np.ceil(np.log2(self.coarsest_m / footprint_m))) + 1)
         total = mi.Float32(0)
@@ -51,9 +66,19 @@ class RockTexture:
 
 
 def solid_noise(point: mi.Array3f64, grain_m: float, key: int) -> mi.Float32:
-    """(n,) smooth noise of mean 0 and unit standard deviation at 3 x (n,) points, m: a lattice of hashed numbers `grain_m` apart.
+    """Evaluate smooth noise (n,) with mean 0 and standard deviation 1 at points 3 x (n,), m.
 
-    The weights are smoothsteps 3 f^2 - 2 f^3 (Perlin 1985); nodes are hashed as in Teschner et al. (2003).
+    Hashed random numbers on a lattice with spacing `grain_m` are interpolated with smoothstep weights 3 f^2 - 2 f^3 (Perlin
+    1985); the hash of the nodes follows Teschner et al. (2003).
+
+    Parameters
+    ----------
+    point : 3 x (n,)
+        Positions, m.
+    grain_m : float
+        Spacing of the lattice, m.
+    key : int
+        Seed, 32 bits.
     """
     position = point * dr.opaque(mi.Float64, 1 / grain_m)
     cell = dr.floor(position)
@@ -72,7 +97,7 @@ def solid_noise(point: mi.Array3f64, grain_m: float, key: int) -> mi.Float32:
 
 
 def _uniform(value: mi.UInt32) -> mi.Float32:
-    """A number in [-1, 1) out of the bits of `value` (the integer hash `lowbias32` of Wellons 2018)."""
+    """Hash the bits of `value` to a number in [-1, 1) (integer hash `lowbias32`, Wellons 2018)."""
     value ^= value >> 16
     value *= 0x7FEB352D
     value ^= value >> 15

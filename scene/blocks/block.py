@@ -1,4 +1,4 @@
-"""Blocks that fall from a wall: primitives made irregular by three transformers in cascade, then placed on the relief."""
+"""Draw the blocks that fall from a wall (primitives, scaled, rotated and roughened) and place them on its relief."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from scene.walls.contour import highest_under, highest_vertex_under, median_unde
 from scene.walls.safe_zone import SafeZone, safe_zone
 
 _BATCH = 16
-"""Positions tried at a time."""
+"""Number of positions tried at a time."""
 
 _LEAST_DEPTH = 0.1
-"""How far a block must reach into the rock, as a fraction of its height along z; one that does not is placed anew."""
+"""Depth that a block must reach into the rock, as a share of its height along z. A block that does not is placed again."""
 
 _RADIAL_LIMITS = (0.3, 3.0)
-"""Bounds of a vertex's radial factor: positive, so that the block stays star-shaped and never cuts itself."""
+"""Bounds of a vertex's radial factor. It stays positive, so that the block is star-shaped and never intersects itself."""
 
 
 def _per_axis(value: Any) -> str:
+    """Tell one distribution for all axes from a list of three."""
     return "per axis" if isinstance(value, list | tuple) else "all axes"
 
 
@@ -42,11 +43,11 @@ AxisDistributions = Annotated[
 
 
 MOST_BLOCKS = 20_000
-"""Of an epoch; placing them takes some twenty seconds, carving minutes."""
+"""Most blocks per epoch. Placing that many takes about twenty seconds, carving them minutes."""
 
 
 class RockfallConfig(Config):
-    """How many blocks fall, how they look and where they may lie."""
+    """How many blocks fall, what they look like and where they may lie."""
 
     count: int = Field(40, ge=1, le=MOST_BLOCKS, description="number of blocks")
     shape: Literal["cube", "sphere", "mixed"] = Field("mixed", description="primitive; mixed draws one for each block")
@@ -64,24 +65,36 @@ class RockfallConfig(Config):
     )
     placement: Literal["relief", "highest_vertex", "mean_surface"] = Field(
         "relief",
-        description="a block's centre lies at the highest relief within its contour, at the highest of the wall's vertices "
-        "there, which lies lower on a coarser mesh, or on the median surface, which makes niches about twice as deep",
+        description="height of a block's centre: the highest relief within its contour; the highest of the wall's vertices "
+        "there, which is lower on a coarser mesh; or the median surface, which makes niches about twice as deep",
     )
-    safe_zone_offset_m: float = Field(0.5, ge=0, description="distance that blocks keep from the wall's border and its holes")
+    safe_zone_offset_m: float = Field(0.5, ge=0, description="distance of blocks from the wall's border and its holes")
     minimum_distance_m: float = Field(0.1, ge=0, description="distance between the bounding boxes of two blocks, in x or in y")
     maximum_attempts: int = Field(2000, ge=1, description="positions tried for a block before giving up")
 
 
 _HEIGHTS = {"relief": highest_under, "highest_vertex": highest_vertex_under, "mean_surface": median_under}
+"""Function that returns the wall's height within contours, for each kind of placement."""
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """k closed blocks in the wall frame, packed one after the other; the block of index i has the label i + 1.
+    """k closed blocks in the wall frame, stored one after the other. The block with index i has the label i + 1.
 
-    vertices: (n, 3), m; faces: (m, 3) int32 into them, outside counter-clockwise; vertex_start, face_start: (k + 1,) int32,
-    where each block's vertices and faces begin; shape: k names; size_m: (k, 3) lengths of the axes before rotation;
-    position_m: (k, 3) the centres.
+    Attributes
+    ----------
+    vertices : (n, 3) array
+        Vertices of all blocks, m.
+    faces : (m, 3) int32 array
+        Vertex indices, counter-clockwise seen from outside.
+    vertex_start, face_start : (k + 1,) int32 arrays
+        Where each block's vertices and faces begin.
+    shape : tuple of k str
+        Name of each block's primitive.
+    size_m : (k, 3) array
+        Lengths of the axes before rotation, m.
+    position_m : (k, 3) array
+        Centres, m.
     """
 
     vertices: FloatArray
@@ -103,17 +116,17 @@ class Blocks:
 
     @cached_property
     def face_label(self) -> IntArray:
-        """(m,) the label, 1 .. k, of each face's block."""
+        """(m,) label, 1 to k, of each face's block."""
         return np.repeat(np.arange(1, len(self) + 1, dtype=np.int32), np.diff(self.face_start))
 
     def mesh(self, index: int) -> TriangleMesh:
-        """The block of this index (0 .. k - 1) alone."""
+        """Return the mesh of the block with this index (0 to k - 1)."""
         vertices = slice(self.vertex_start[index], self.vertex_start[index + 1])
         faces = self.faces[self.face_start[index] : self.face_start[index + 1]] - self.vertex_start[index]
         return TriangleMesh(self.vertices[vertices], faces)
 
     def only(self, index: int) -> Blocks:
-        """The block of this index as the only one."""
+        """Return a collection that holds only the block with this index."""
         mesh, one = self.mesh(index), slice(index, index + 1)
         vertex_start, face_start = (np.array([0, len(array)], dtype=np.int32) for array in (mesh.vertices, mesh.faces))
         placed = self.shape[one], self.size_m[one], self.position_m[one]
@@ -122,7 +135,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class _Solid:
-    """A block around the origin, before placement: its middle height is 0."""
+    """A block around the origin, before placement. The middle of its z range is 0."""
 
     shape: str
     size_m: FloatArray
@@ -131,26 +144,41 @@ class _Solid:
 
     @cached_property
     def bbox(self) -> FloatArray:
+        """(2, 3) smallest and largest coordinates, m."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
 def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom, caster: RayCaster | None = None) -> Blocks:
     """Draw `config.count` blocks and place them on the wall.
 
-    mesh: the wall, wall frame; random: each block draws from its own child, so that the outcome depends on nothing else;
-    caster: of this mesh, where one exists already. A block keeps its shape and is tried at positions drawn uniformly from the
-    safe zone until its bounding box lies in the zone and far enough from the others'; large blocks come first, so that
-    small ones do not take their room. Its height follows the thesis, 3.3, with the sign mended: the middle of its z range
-    lies at the largest z of the wall within its contour (`placement: relief`), of the wall's vertices alone (`highest_vertex`),
-    or at the median z there (`mean_surface`). Where it would then not reach into the rock it is placed anew.
-    Raises InputError where blocks are larger than the wall or find no room.
+    A block keeps its shape and is tried at positions drawn uniformly from the safe zone, until its bounding box lies inside
+    the zone and far enough from those of the other blocks. Large blocks are placed first, so that small ones do not take their
+    room. The middle of a block's z range then lies at the largest z of the wall within its contour (`placement: relief`), at
+    that of the wall's vertices (`highest_vertex`), or at the median z (`mean_surface`). The thesis, section 3.3, has the sign
+    of this height wrong. A block that does not reach into the rock there is placed again.
+
+    Parameters
+    ----------
+    config : RockfallConfig
+        Number, shape and placement of the blocks.
+    mesh : TriangleMesh
+        The wall, wall frame.
+    random : KeyedRandom
+        Source of random numbers. Each block draws from its own child, so that it does not depend on the others' draws.
+    caster : RayCaster, optional
+        A ray caster of `mesh`, if one exists already.
+
+    Raises
+    ------
+    InputError
+        If blocks are larger than the wall or find no room.
     """
     caster = caster or RayCaster(mesh)
-    with np.errstate(over="ignore", invalid="ignore"):  # of sizes that are no block's, which is said next
-        solids = [_shaped(config, random.child("block", index)) for index in range(config.count)]
+    with np.errstate(over="ignore", invalid="ignore"):  # implausible sizes are reported by _require_fit
+        solids = [_draw_block(config, random.child("block", index)) for index in range(config.count)]
     _require_fit(solids, mesh)
     zone = safe_zone(caster, config.safe_zone_offset_m)
-    search = _Placing(config, zone, solids, random)
+    search = _PositionSearch(config, zone, solids, random)
     surface_under = _HEIGHTS[config.placement]
     position = np.zeros((len(solids), 3))
     area = np.array([np.ptp(solid.bbox[:, :2], axis=0).prod() for solid in solids])
@@ -162,12 +190,26 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
         outlines = [solids[index].vertices[:, :2] + position[index, :2] for index in pending]
         position[pending, 2] = surface_under(caster, outlines)
         pending = pending[~_reach_rock([solids[index] for index in pending], position[pending], caster)]
-        search.take_back(pending)
+        search.release(pending)
     return _packed(solids, position)
 
 
-def given_blocks(position_m: FloatArray, size_m: FloatArray, rotation_rad: FloatArray, shape: str, subdivisions: int) -> Blocks:
-    """Regular blocks at given places, wall frame. position_m, size_m, rotation_rad (about x, then y, then z): (k, 3)."""
+def make_regular_blocks(
+    position_m: FloatArray, size_m: FloatArray, rotation_rad: FloatArray, shape: str, subdivisions: int
+) -> Blocks:
+    """Make regular cubes or spheres at given positions, wall frame.
+
+    Parameters
+    ----------
+    position_m, size_m : (k, 3) arrays
+        Centres and lengths of the axes before rotation, m.
+    rotation_rad : (k, 3) array
+        Rotations about x, then y, then z, rad.
+    shape : str
+        "cube" or "sphere".
+    subdivisions : int
+        Fineness, as in RockfallConfig.
+    """
     from scipy.spatial.transform import Rotation
 
     unit, faces = _primitive(shape, subdivisions)
@@ -178,8 +220,10 @@ def given_blocks(position_m: FloatArray, size_m: FloatArray, rotation_rad: Float
     return _packed(found, position_m)
 
 
-class _Placing:
-    """Rejection sampling of positions. boxes: (k, 2, 2) what is placed so far in x and y, NaN where not."""
+class _PositionSearch:
+    """Finds positions of blocks by rejection sampling. boxes: (k, 2, 2) x and y range of the blocks placed so far, NaN for the
+    others.
+    """
 
     def __init__(self, config: RockfallConfig, zone: SafeZone, solids: Sequence[_Solid], random: KeyedRandom) -> None:
         self._config, self._zone, self._solids = config, zone, solids
@@ -189,7 +233,7 @@ class _Placing:
         self.boxes = np.full((len(solids), 2, 2), np.nan)
 
     def place(self, index: int) -> FloatArray:
-        """(2,) the next admissible position of a block, m."""
+        """Return the next admissible position (2,) of a block, m."""
         shape = self._solids[index].bbox[:, :2]
         while self._attempts[index] < self._config.maximum_attempts:
             self._attempts[index] += _BATCH
@@ -202,16 +246,18 @@ class _Placing:
         raise self._no_room(index)
 
     def _is_apart(self, box: FloatArray) -> bool:
+        """Return whether a box is far enough from all placed ones."""
         gap = np.maximum(box[0] - self.boxes[:, 1], self.boxes[:, 0] - box[1])  # in x and in y
         apart = np.maximum(gap[:, 0], gap[:, 1])
         return not np.any((apart < self._config.minimum_distance_m) | (apart <= 0))
 
-    def take_back(self, indices: NDArray[np.intp]) -> None:
-        """Free the room of blocks that do not reach into the rock where they were placed."""
+    def release(self, indices: NDArray[np.intp]) -> None:
+        """Remove blocks that do not reach into the rock where they were placed, so that their room is free again."""
         self.boxes[indices] = np.nan
         self._hung[indices] += 1
 
     def _no_room(self, index: int) -> InputError:
+        """Make the error for a block that finds no position."""
         placed, (width, height) = int(np.isfinite(self.boxes[:, 0, 0]).sum()), np.ptp(self._solids[index].bbox[:, :2], axis=0)
         steep = f" ({self._hung[index]} times it would have hung in front of a steep wall)" if self._hung[index] else ""
         return InputError(
@@ -223,7 +269,7 @@ class _Placing:
 
 
 def _require_room(area: FloatArray, zone: SafeZone) -> None:
-    """Bounding boxes do not overlap and lie in the safe zone, so that their sum cannot exceed its area."""
+    """Raise InputError if the bounding boxes, which may not overlap, have a larger total area than the safe zone."""
     room = zone.free.sum() * zone.grid.gsd**2
     if area.sum() > room:
         raise InputError(
@@ -233,31 +279,34 @@ def _require_room(area: FloatArray, zone: SafeZone) -> None:
         )
 
 
-def _shaped(config: RockfallConfig, random: KeyedRandom) -> _Solid:
-    """The cascade: a primitive of unit size, scaled along its axes, rotated, then moved radially vertex by vertex."""
+def _draw_block(config: RockfallConfig, random: KeyedRandom) -> _Solid:
+    """Draw a block: a primitive of unit size, scaled along its axes, rotated, then roughened by radial offsets of its
+    vertices.
+    """
     from scipy.spatial.transform import Rotation
 
     generator = random.child("shape").generator()
     shape = ("cube", "sphere")[generator.integers(2)] if config.shape == "mixed" else config.shape
-    size = _drawn(config.size_m, generator)
+    size = _draw_per_axis(config.size_m, generator)
     if not size.min() > 0:
         raise InputError(f"drew a length of {size.min():.3g} m", where="size_m", allowed="above 0", remedy="give it a minimum")
     unit, faces = _primitive(shape, config.subdivisions)
-    vertices = Rotation.from_euler("xyz", _drawn(config.rotation_rad, generator)).apply(unit * size)
+    vertices = Rotation.from_euler("xyz", _draw_per_axis(config.rotation_rad, generator)).apply(unit * size)
     factor = np.clip(1 + config.irregularity.sample(generator, len(vertices)), *_RADIAL_LIMITS)
     vertices = vertices * factor[:, None]
     vertices[:, 2] -= (vertices[:, 2].max() + vertices[:, 2].min()) / 2
     return _Solid(shape, size, vertices, faces)
 
 
-def _drawn(distributions: AxisDistributions, generator: np.random.Generator) -> FloatArray:
+def _draw_per_axis(distributions: AxisDistributions, generator: np.random.Generator) -> FloatArray:
+    """Draw one value per axis (3,)."""
     axes = distributions if isinstance(distributions, tuple) else (distributions,) * 3
     return np.concatenate([axis.sample(generator, 1) for axis in axes])
 
 
 @lru_cache
 def _primitive(shape: str, subdivisions: int) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of a sphere or cube of diameter or side 1 around the origin."""
+    """Return vertices and faces of a sphere or cube with diameter or side 1 around the origin."""
     import trimesh
 
     if shape == "sphere":
@@ -267,7 +316,7 @@ def _primitive(shape: str, subdivisions: int) -> tuple[FloatArray, IntArray]:
 
 
 def _cube(segments: int) -> tuple[FloatArray, IntArray]:
-    """A cube of side 1 around the origin, each side cut into segments x segments squares of two triangles."""
+    """Make a cube with side 1 around the origin; each side has segments x segments squares of two triangles."""
     steps = np.arange(segments + 1)
     quads = []
     for axis in range(3):
@@ -284,7 +333,7 @@ def _cube(segments: int) -> tuple[FloatArray, IntArray]:
 
 
 def _require_fit(solids: Sequence[_Solid], mesh: TriangleMesh) -> None:
-    """Raise where a block's bounding box is larger than the wall's."""
+    """Raise InputError if a block's bounding box is larger than the wall's."""
     wall = np.ptp(mesh.bounds[:, :2], axis=0)
     extents = np.array([np.ptp(solid.bbox[:, :2], axis=0) for solid in solids])
     too_large = np.any(extents >= wall, axis=1)
@@ -299,19 +348,20 @@ def _require_fit(solids: Sequence[_Solid], mesh: TriangleMesh) -> None:
 
 
 def _reach_rock(solids: Sequence[_Solid], position: FloatArray, caster: RayCaster) -> NDArray[np.bool_]:
-    """(k,) whether some vertex of each block at its position lies under the surface by the least depth or more."""
+    """Return whether each block (k,), at its position, has a vertex at least the required depth below the surface."""
     counts = np.array([len(solid.vertices) for solid in solids])
     points = np.concatenate([solid.vertices for solid in solids]) + np.repeat(position, counts, axis=0)
     start = points.copy()
     start[:, 2] = caster.mesh.bounds[1, 2] + 1.0
     distance, _ = caster.cast(start, np.tile([0.0, 0.0, -1.0], (len(points), 1)))
-    depth = start[:, 2] - distance - points[:, 2]  # NaN where there is no surface
+    depth = start[:, 2] - distance - points[:, 2]  # below the surface; NaN where there is none
     deepest = np.fmax.reduceat(depth, np.concatenate([[0], np.cumsum(counts)[:-1]]))
     height = np.array([np.ptp(solid.bbox[:, 2]) for solid in solids])
     return deepest >= _LEAST_DEPTH * height
 
 
 def _packed(solids: Sequence[_Solid], position: FloatArray) -> Blocks:
+    """Store solids, moved to their positions, one after the other."""
     vertex_start = _starts([len(solid.vertices) for solid in solids])
     face_start = _starts([len(solid.faces) for solid in solids])
     vertices = np.concatenate([solid.vertices + place for solid, place in zip(solids, position, strict=True)])
@@ -321,4 +371,5 @@ def _packed(solids: Sequence[_Solid], position: FloatArray) -> Blocks:
 
 
 def _starts(counts: Sequence[int]) -> IntArray:
+    """Return where each of several consecutive ranges begins, and where the last one ends."""
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)

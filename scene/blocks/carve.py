@@ -1,4 +1,4 @@
-"""Carving blocks out of a wall with Manifold, on the patches under the blocks; the rest of the wall is passed through."""
+"""Carve blocks out of a wall with Manifold. Only the patches under the blocks are processed; the rest of the wall is copied."""
 
 from __future__ import annotations
 
@@ -9,30 +9,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.blocks.block import Blocks
-from scene.blocks.slivers import mend
-from scene.blocks.solid import Piece, boundary, close, piece, prism_volumes, solid, split
+from scene.blocks.slivers import remove_slivers
+from scene.blocks.solid import Piece, boundary, close_patch, prism_volumes, read_piece, solid_of, split_wall
 from scene.common.errors import InputError
 from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh, area_normals
-from scene.geometry.under_boxes import faces_under
+from scene.geometry.under_boxes import faces_under_boxes
 
 FRESH_ALBEDO = 0.6
-"""Albedo of rock that no weather has darkened yet."""
+"""Albedo of freshly exposed rock, not yet darkened by weathering."""
 
 _HALO_M = 1e-3
-"""Added around the blocks' boxes, so that the mending of the rims always has whole neighbourhoods to work on."""
+"""Margin around the blocks' boxes, so that slivers at the rims always have complete neighbourhoods."""
 
 _CHUNK = 1 << 20
+"""Number of faces processed at a time."""
 
 
 @dataclass(frozen=True)
 class Carved:
     """A wall without its blocks.
 
-    mesh: the surface; face_block is the label (1 .. k) of the block whose niche a face belongs to, WALL elsewhere; vertex_block
-    likewise for the vertices inside niches, while those on a rim, which lie on the old surface too, are WALL;
-    removed_volume_m3: (k,) rock that each block took along (the boolean's, corrected for the mending of its rim);
-    wall_volume_m3: volume of the wall before, of an open one above its lowest point;
-    balance_m3: wall before - wall after - sum of the removed volumes, 0 but for rounding.
+    Attributes
+    ----------
+    mesh : TriangleMesh
+        The surface. `face_block` is the label (1 to k) of the block whose niche a face belongs to, WALL elsewhere.
+        `vertex_block` is the same for vertices inside niches; vertices on a rim, which also lie on the old surface, are WALL.
+    removed_volume_m3 : (k,) array
+        Volume of rock that each block removed. It is the boolean's, corrected for the removal of slivers at the rim.
+    wall_volume_m3 : float
+        Volume of the wall before carving; for an open surface the volume above its lowest point.
+    balance_m3 : float
+        Volume before minus volume after minus the sum of the removed volumes: 0 except for rounding.
     """
 
     mesh: TriangleMesh
@@ -43,11 +50,19 @@ class Carved:
 
 @dataclass(frozen=True)
 class BlockMeshes:
-    """The four meshes of one block (thesis, 3.3), wall frame.
+    """The four meshes of one block (thesis, section 3.3), wall frame.
 
-    wall_difference: the wall around the block, with the hole; intersection: the closed solid that is removed (face_block tells
-    the wall's skin, WALL, from the block's side); niche: the surface left in the wall; removed_block: the closed part of the
-    block that protrudes from the wall and plays no further role.
+    Attributes
+    ----------
+    wall_difference : TriangleMesh
+        The wall around the block, with the hole.
+    intersection : TriangleMesh
+        The closed solid that is removed. `face_block` distinguishes the wall's surface (WALL) from the block's side (its
+        label).
+    niche : TriangleMesh
+        The surface left in the wall.
+    removed_block : TriangleMesh
+        The closed part of the block that protrudes from the wall. Nothing else uses it.
     """
 
     wall_difference: TriangleMesh
@@ -58,7 +73,9 @@ class BlockMeshes:
 
 @dataclass(frozen=True)
 class _Surface:
-    """The carved patches, before they are put back. origin: (n,) the wall's vertex that each vertex is, -1 for new ones."""
+    """The carved patches before they are inserted into the wall. origin: (n,) the wall's vertex that each vertex is, -1 for new
+    ones.
+    """
 
     vertices: FloatArray
     faces: IntArray
@@ -68,15 +85,26 @@ class _Surface:
 
 
 def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO) -> Carved:
-    """Carve all blocks out of a wall, open or closed; an open one keeps its boundary loops.
+    """Carve all blocks out of a wall, open or closed. An open wall keeps its boundary loops.
 
-    mesh: wall frame; labels it has from an earlier carving count as wall; blocks: disjoint; fresh_albedo: of the niches, where
-    the wall has an albedo. Raises InputError where the wall is not manifold near a block or a block removes nothing.
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The wall, wall frame. Block labels from an earlier carving count as wall.
+    blocks : Blocks
+        Disjoint blocks.
+    fresh_albedo : float
+        Albedo of the niches, if the wall has an albedo.
+
+    Raises
+    ------
+    InputError
+        If the wall is not manifold near a block, or if a block removes nothing.
     """
-    rows = faces_under(mesh, blocks.bbox, _HALO_M)
-    wall, corners = close(mesh, rows, float(blocks.bbox[:, 0, 2].min()))
-    removed, left = split(wall, solid(blocks.vertices, blocks.faces, "blocks"))
-    surface, gain = _mended(_surface(mesh, rows, corners, left, blocks, fresh_albedo))
+    rows = faces_under_boxes(mesh, blocks.bbox, _HALO_M)
+    wall, corners = close_patch(mesh, rows, float(blocks.bbox[:, 0, 2].min()))
+    removed, left = split_wall(wall, solid_of(blocks.vertices, blocks.faces, "blocks"))
+    surface, gain = _without_slivers(_surface(mesh, rows, corners, left, blocks, fresh_albedo))
     volumes = _removed_volumes(removed, blocks) - gain[1:]
     carved = _put_back(mesh, rows, surface)
     low = float(mesh.vertices[:, 2].min())
@@ -84,8 +112,10 @@ def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO
     return Carved(carved, volumes, before, before - _volume(carved.vertices, carved.faces, low) - float(volumes.sum()))
 
 
-def carved_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[str, Any]]:
-    """One record per block for blocks.json: label, shape, size, removed volume, bounding box and position, wall frame, SI."""
+def block_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[str, Any]]:
+    """Make one record per block for blocks.json: label, shape, size, removed volume, bounding box and position, wall frame,
+    SI.
+    """
     return [
         {
             "label": index + 1,
@@ -100,13 +130,13 @@ def carved_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[s
 
 
 def block_meshes(mesh: TriangleMesh, blocks: Blocks, index: int) -> BlockMeshes:
-    """The four meshes of the block of this index (label index + 1), cut from the patch of the wall around it."""
+    """Compute the four meshes of the block with this index (label index + 1) from the patch of the wall around it."""
     block = blocks.only(index)
-    rows = faces_under(mesh, block.bbox, _HALO_M)
-    wall, _ = close(mesh, rows, float(block.bbox[0, 0, 2]))
-    cutter = solid(block.vertices, block.faces, "blocks")
-    removed, left = split(wall, cutter)
-    outside = piece(cutter.manifold - wall.manifold, cutter)
+    rows = faces_under_boxes(mesh, block.bbox, _HALO_M)
+    wall, _ = close_patch(mesh, rows, float(block.bbox[0, 0, 2]))
+    cutter = solid_of(block.vertices, block.faces, "blocks")
+    removed, left = split_wall(wall, cutter)
+    outside = read_piece(cutter.manifold - wall.manifold, cutter)
     label = index + 1
     return BlockMeshes(
         wall_difference=_part(left, left.first & (left.source < len(rows)), WALL),
@@ -117,12 +147,13 @@ def block_meshes(mesh: TriangleMesh, blocks: Blocks, index: int) -> BlockMeshes:
 
 
 def _part(whole: Piece, chosen: NDArray[np.bool_], label: int | IntArray) -> TriangleMesh:
+    """Return some faces of a boolean's result as a mesh with block labels."""
     labels = np.broadcast_to(np.asarray(label, dtype=np.int32), len(chosen))
     return TriangleMesh(whole.vertices, whole.faces, face_block=labels).submesh(chosen)
 
 
 def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
-    """(k,) volume of the intersection, block by block; raises InputError where there is none."""
+    """Return the volume (k,) of the intersection with each block. Raises InputError for a block that removes nothing."""
     from scipy import sparse
 
     links = removed.faces[:, [0, 1]].T, removed.faces[:, [1, 2]].T
@@ -132,7 +163,7 @@ def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
     component = component[removed.faces[:, 0]]
     label = np.zeros(count, dtype=np.int64)
     label[component[~removed.first]] = blocks.face_label[removed.source[~removed.first]]
-    whole = np.flatnonzero(label == 0)  # pieces of wall that float inside a block: no face of the block is in them
+    whole = np.flatnonzero(label == 0)  # pieces of wall entirely inside a block, which contain no face of it
     label[whole] = _containing(blocks, removed, component, whole)
     parts = prism_volumes(removed.vertices, removed.faces)
     volumes = np.bincount(label[component], parts, minlength=len(blocks) + 1)[1:].astype(np.float64)
@@ -148,7 +179,7 @@ def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
 
 
 def _containing(blocks: Blocks, removed: Piece, component: IntArray, wanted: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The label of the block in whose bounding box each wanted component lies."""
+    """Return the label of the block whose bounding box contains each wanted component."""
     example = np.array([removed.faces[np.argmax(component == number), 0] for number in wanted], dtype=np.intp)
     points = removed.vertices[example][:, None]
     inside = np.all((points >= blocks.bbox[None, :, 0]) & (points <= blocks.bbox[None, :, 1]), axis=2)
@@ -158,7 +189,9 @@ def _containing(blocks: Blocks, removed: Piece, component: IntArray, wanted: NDA
 def _surface(
     mesh: TriangleMesh, rows: IntArray, corners: FloatArray, left: Piece, blocks: Blocks, fresh_albedo: float
 ) -> _Surface:
-    """What is left of the patches and the niches, without the closure: the wall's vertices found again by their source face."""
+    """Collect the remaining patches and the niches, without the closure at the back; find the wall's vertices by their source
+    faces.
+    """
     is_wall = left.first & (left.source < len(rows))
     chosen = is_wall | ~left.first
     faces, source, is_wall = left.faces[chosen], left.source[chosen], is_wall[chosen]
@@ -180,7 +213,7 @@ def _surface(
 
 
 def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """(n, 3) weights of the corners (n, 3, 3) at points (n, 3) in their triangles, within [0, 1]."""
+    """Return the weights (n, 3) of the corners (n, 3, 3) at points (n, 3) in their triangles, within [0, 1]."""
     to_corner = corners - points[:, None]
     normal = area_normals(corners)
     parts = np.cross(np.roll(to_corner, -1, axis=1), np.roll(to_corner, -2, axis=1))
@@ -188,24 +221,27 @@ def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
     return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
 
 
-def _mended(surface: _Surface) -> tuple[_Surface, FloatArray]:
-    """The surface without slivers along the rims, and the volume this adds by label; vertices on the patches' boundary stay."""
+def _without_slivers(surface: _Surface) -> tuple[_Surface, FloatArray]:
+    """Remove slivers along the rims; return the surface and the volume that this adds, by label. Vertices on the patches'
+    boundary stay.
+    """
     of_wall, of_niche = (_used(surface, is_wall) for is_wall in (True, False))
     rank = np.ones(len(surface.vertices), dtype=np.int8)
     rank[of_wall & (of_niche | (surface.origin < 0))] = 2
     rank[boundary(surface.faces)[0]] = 0
-    mended = mend(surface.vertices, surface.faces, surface.label, rank)
+    mended = remove_slivers(surface.vertices, surface.faces, surface.label, rank)
     return replace(surface, faces=mended.faces, label=mended.label), mended.gain_m3
 
 
 def _used(surface: _Surface, is_wall: bool) -> NDArray[np.bool_]:
+    """Return which vertices (n,) belong to wall faces, or to niche faces."""
     used = np.zeros(len(surface.vertices), dtype=bool)
     used[surface.faces[(surface.label == WALL) == is_wall].ravel()] = True
     return used
 
 
 def _put_back(mesh: TriangleMesh, rows: IntArray, surface: _Surface) -> TriangleMesh:
-    """The untouched faces, in their order, followed by those of the carved patches, on the vertices that are still in use."""
+    """Join the untouched faces, in their order, and the faces of the carved patches, with only the vertices still in use."""
     untouched = np.ones(len(mesh.faces), dtype=bool)
     untouched[rows] = False
     on_wall, on_niche = _used(surface, True), _used(surface, False)
@@ -226,6 +262,6 @@ def _put_back(mesh: TriangleMesh, rows: IntArray, surface: _Surface) -> Triangle
 
 
 def _volume(vertices: FloatArray, faces: IntArray, base_m: float) -> float:
-    """Volume between a surface and z = base_m; of a closed surface its volume, whatever the base."""
+    """Return the volume between a surface and z = base_m; for a closed surface its volume, whatever the base."""
     starts = range(0, len(faces), _CHUNK)
     return float(sum(prism_volumes(vertices, faces[start : start + _CHUNK], base_m).sum() for start in starts))

@@ -1,4 +1,4 @@
-"""Distributions that a config can name: each draws from an explicit generator and keeps no state.
+"""Define the probability distributions that a config can name. Each draws from the generator it is given and keeps no state.
 
 In YAML a distribution is a mapping with its `kind`, or a plain number for a constant:
 
@@ -26,12 +26,12 @@ class Constant(Config):
     value: float = Field(description="the value")
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """(size,) values."""
+        """Draw values (size,)."""
         return np.full(size, self.value)
 
 
 class Gaussian(Config):
-    """Normal distribution, truncated from below where a minimum is given (the mass below it is spread over the rest)."""
+    """Normal distribution, truncated from below if a minimum is given."""
 
     kind: Literal["gaussian"] = "gaussian"
     mean: float = Field(description="mean, before truncation")
@@ -45,7 +45,7 @@ class Gaussian(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """(size,) values, by inversion of the (truncated) distribution function's upper tail."""
+        """Draw values (size,), by inversion of the upper tail of the (truncated) distribution function."""
         from scipy import special
 
         if self.minimum is None or self.sigma == 0:
@@ -56,7 +56,7 @@ class Gaussian(Config):
 
 
 class Uniform(Config):
-    """Uniform on [low, high)."""
+    """Uniform distribution on [low, high)."""
 
     kind: Literal["uniform"] = "uniform"
     low: float = Field(description="smallest value")
@@ -69,24 +69,24 @@ class Uniform(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """(size,) values."""
+        """Draw values (size,)."""
         return generator.uniform(self.low, self.high, size)
 
 
 class Lognormal(Config):
-    """The logarithm is normal with mean ln(median) and standard deviation sigma_log."""
+    """Lognormal distribution: the natural logarithm is normal with mean ln(median) and standard deviation sigma_log."""
 
     kind: Literal["lognormal"] = "lognormal"
     median: float = Field(gt=0, description="median")
     sigma_log: float = Field(ge=0, description="standard deviation of the natural logarithm")
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """(size,) values."""
+        """Draw values (size,)."""
         return self.median * np.exp(self.sigma_log * generator.standard_normal(size))
 
 
 class Histogram(Config):
-    """An empirical distribution: uniform within each bin, bins drawn in proportion to their counts."""
+    """Empirical distribution: bins are drawn in proportion to their counts, values uniformly within a bin."""
 
     kind: Literal["histogram"] = "histogram"
     edges: tuple[float, ...] = Field(min_length=2, description="bin edges, increasing, one more than counts")
@@ -103,7 +103,7 @@ class Histogram(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """(size,) values, by inversion of the piecewise linear distribution function."""
+        """Draw values (size,), by inversion of the piecewise linear distribution function."""
         edges, counts = np.asarray(self.edges), np.asarray(self.counts)
         filled = counts > 0
         ends = np.cumsum(counts[filled])
@@ -114,7 +114,7 @@ class Histogram(Config):
 
 
 class Mixture(Config):
-    """One of several distributions, chosen for each value with probabilities in proportion to the weights."""
+    """Mixture of distributions: one is chosen for each value, with probability proportional to its weight."""
 
     kind: Literal["mixture"] = "mixture"
     components: tuple[Distribution, ...] = Field(min_length=1, description="the distributions")
@@ -129,7 +129,7 @@ class Mixture(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """(size,) values."""
+        """Draw values (size,)."""
         ends = np.cumsum(self.weights)
         number = np.searchsorted(ends / ends[-1], generator.random(size), side="right")
         drawn = np.stack([component.sample(generator, size) for component in self.components])
@@ -137,6 +137,7 @@ class Mixture(Config):
 
 
 def _constant_from_number(value: Any) -> Any:
+    """Convert a plain number to a constant distribution."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return Constant(value=value) if is_number else value
 
@@ -145,6 +146,6 @@ Distribution = Annotated[
     Annotated[Constant | Gaussian | Uniform | Lognormal | Histogram | Mixture, Field(discriminator="kind")],
     BeforeValidator(_constant_from_number),
 ]
-"""The type of a config key that takes any of the distributions or a plain number."""
+"""Type of a config key that accepts any of the distributions or a plain number."""
 
 Mixture.model_rebuild()

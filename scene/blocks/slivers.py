@@ -1,8 +1,8 @@
-"""Mending of the needles that a boolean leaves along its cuts, by edge collapses and flips that move no vertex.
+"""Remove the slivers (needle-shaped triangles) that a boolean leaves along its cuts, by edge collapses and edge flips.
 
-Each round picks operations whose neighbourhoods do not touch one another, so all of them are applied at once. A collapse is
-made only where the surface stays manifold (the link condition: the ends of the edge share no neighbours but the apexes of
-its two faces) and where no sound face turns over; a flip only where it raises the smaller of the two heights.
+No vertex moves. Each round picks operations whose neighbourhoods do not touch, so that all of them can be applied at once. An
+edge is collapsed only if the surface stays manifold (link condition: the ends of the edge share no neighbours except the
+apexes of its two faces) and no sound face turns over. It is flipped only if this increases the smaller of the two heights.
 """
 
 from __future__ import annotations
@@ -13,45 +13,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.blocks.solid import boundary, prism_volumes
-from scene.geometry.mesh import FloatArray, IntArray, renumbered
+from scene.geometry.mesh import FloatArray, IntArray, compact_vertices
 
 SLIVER_M = 2e-5
 """A face whose smallest height is below this is a sliver: single precision (8 um at 70 m) would lose its normal."""
 
 _COLLAPSIBLE_M = 3 * SLIVER_M
-"""Length up to which an edge of a sliver is collapsed at first; slivers without such an edge are flipped away."""
+"""Length up to which an edge of a sliver is collapsed in the first attempt. Slivers without such an edge are flipped away."""
 
 _ATTEMPTS, _ROUNDS = 10, 40
 
 _RINGS = 3
-"""Rings of faces around slivers that are worked on: a collapse needs two, a third lets the next one find its room."""
+"""Rings of faces around slivers that are processed: a collapse needs two; a third leaves room for the next collapse."""
 
 BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]
 
 
 def smallest_height(corners: FloatArray) -> FloatArray:
-    """(m,) the height of each triangle (m, 3, 3) over its longest side, m."""
+    """Return the height (m,) of each triangle (m, 3, 3) over its longest side, m."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     longest = np.sqrt(np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c)))
     return np.sqrt(_square(_normal(corners))) / np.maximum(longest, 1e-300)
 
 
 def _square(vectors: FloatArray) -> FloatArray:
+    """Return the squared lengths (n,) of vectors (n, 3)."""
     return np.einsum("ni,ni->n", vectors, vectors)
 
 
 def _normal(corners: FloatArray) -> FloatArray:
-    """(m, 3) normals of triangles (m, 3, 3), twice as long as their area."""
+    """Return the normals (m, 3) of triangles (m, 3, 3), twice as long as their area."""
     (ux, uy, uz), (vx, vy, vz) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
 
 
 @dataclass(frozen=True)
 class _RankedEdges:
-    """Edges (start, end) to work on, in order of preference, and the faces that meet them.
+    """Edges (start, end) to process, in order of preference, and the faces that touch them.
 
-    operation, face: (p,) pairs of an edge's number and a face with its start or end in it.
+    operation, face: (p,) pairs of an edge's number and a face that contains its start or end.
     """
 
     start: IndexArray
@@ -60,17 +61,24 @@ class _RankedEdges:
     face: IndexArray
 
     def only(self, chosen: BoolArray) -> _RankedEdges:
+        """Return the chosen edges, in the same order."""
         number = np.cumsum(chosen) - 1
         kept = chosen[self.operation]
         return _RankedEdges(self.start[chosen], self.end[chosen], number[self.operation[kept]], self.face[kept])
 
 
 @dataclass(frozen=True)
-class Mended:
+class MendedSurface:
     """A surface without slivers at the cut.
 
-    faces: (m, 3); label: (m,); gain_m3: (largest label + 1,) volume below the surface (towards -z) that mending has added,
-    by the label near which it did.
+    Attributes
+    ----------
+    faces : (m, 3) int32 array
+        Vertex indices.
+    label : (m,) int32 array
+        Block label of each face.
+    gain_m3 : (largest label + 1,) array
+        Volume below the surface (towards -z) that the removal of slivers has added, by the label near which it happened, m3.
     """
 
     faces: IntArray
@@ -78,35 +86,43 @@ class Mended:
     gain_m3: FloatArray
 
 
-def mend(vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[np.int8]) -> Mended:
-    """Mend the faces at the cut; those elsewhere are not looked at.
+def remove_slivers(vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[np.int8]) -> MendedSurface:
+    """Remove the slivers at the cut; other faces stay.
 
-    vertices: (n, 3), m, left as they are (some fall out of use); faces: (m, 3); label: (m,) of the faces;
-    rank: (n,) 0 for vertices that have to stay, 1 for original ones, 2 for those on the cut; of two vertices the one of
-    higher rank gives way where it can.
+    Parameters
+    ----------
+    vertices : (n, 3) array
+        Positions, m. None is moved, but some are no longer used afterwards.
+    faces : (m, 3) int32 array
+        Vertex indices.
+    label : (m,) int32 array
+        Block label of each face.
+    rank : (n,) int8 array
+        0 for vertices that must stay, 1 for original ones, 2 for those on the cut. Of an edge's two vertices, the one with the
+        higher rank is preferably removed.
     """
     cut, gain = rank == 2, np.zeros(int(label.max(initial=0)) + 1)
-    suspects = np.flatnonzero(_at(cut, faces))
+    suspects = np.flatnonzero(_touch(cut, faces))
     for attempt in range(_ATTEMPTS):
         bad = suspects[smallest_height(vertices[faces[suspects]]) < SLIVER_M]
         if not len(bad):
             break
-        near = _around(faces, bad, len(vertices))
-        limit_m = _COLLAPSIBLE_M * 2.0**attempt  # what resists is given more freedom
-        mended, labels = _mend_part(vertices, faces[near], label[near], rank, cut, limit_m)
-        gain += _gain(vertices, faces[near], label[near], mended, len(gain))
+        near = _grow_rings(faces, bad, len(vertices))
+        limit_m = _COLLAPSIBLE_M * 2.0**attempt  # allow longer collapses for the slivers that remain
+        mended, labels = _mend_patch(vertices, faces[near], label[near], rank, cut, limit_m)
+        gain += _added_volume(vertices, faces[near], label[near], mended, len(gain))
         away = np.ones(len(faces), dtype=bool)
         away[near] = False
         faces, label = np.concatenate([faces[away], mended]), np.concatenate([label[away], labels])
-        suspects = len(faces) - len(mended) + np.flatnonzero(_at(cut, mended))
-    return Mended(faces, label, gain)
+        suspects = len(faces) - len(mended) + np.flatnonzero(_touch(cut, mended))
+    return MendedSurface(faces, label, gain)
 
 
-def _gain(vertices: FloatArray, before: IntArray, label: IntArray, after: IntArray, count: int) -> FloatArray:
-    """(count,) the volume that each connected part of a surface has gained, under the largest label in it."""
+def _added_volume(vertices: FloatArray, before: IntArray, label: IntArray, after: IntArray, count: int) -> FloatArray:
+    """Return the volume (count,) that each connected part of a surface has gained, under the largest label in that part."""
     from scipy import sparse
 
-    used, number = renumbered(before)
+    used, number = compact_vertices(before)
     links = np.concatenate([number[:, :2], number[:, 1:]]).T
     graph = sparse.coo_array((np.ones(links.shape[1], dtype=bool), (links[0], links[1])), shape=(len(used), len(used)))
     parts, part = sparse.csgraph.connected_components(graph, directed=False)
@@ -117,26 +133,26 @@ def _gain(vertices: FloatArray, before: IntArray, label: IntArray, after: IntArr
     return np.bincount(largest, now - then, minlength=count).astype(np.float64)
 
 
-def _at(flagged: BoolArray, faces: IntArray) -> BoolArray:
-    """(m,) whether a face has a flagged vertex."""
+def _touch(flagged: BoolArray, faces: IntArray) -> BoolArray:
+    """Return whether each face (m,) has a flagged vertex."""
     a, b, c = faces.T
     return flagged[a] | flagged[b] | flagged[c]
 
 
-def _around(faces: IntArray, rows: IndexArray, count: int) -> IndexArray:
-    """The faces within some rings of the given ones."""
+def _grow_rings(faces: IntArray, rows: IndexArray, count: int) -> IndexArray:
+    """Return the faces within some rings around the given ones."""
     for _ in range(_RINGS):
         near = np.zeros(count, dtype=bool)
         near[faces[rows].ravel()] = True
-        rows = np.flatnonzero(_at(near, faces))
+        rows = np.flatnonzero(_touch(near, faces))
     return rows
 
 
-def _mend_part(
+def _mend_patch(
     vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[np.int8], cut: BoolArray, limit_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Mend a part of a surface as far as this can be done without its boundary; `cut` grows with the vertices collapsed onto."""
-    used, faces = renumbered(faces)
+    """Remove slivers from a patch without changing its boundary. Vertices that edges collapse onto are added to `cut`."""
+    used, faces = compact_vertices(faces)
     vertices, rank, part_cut = vertices[used], rank[used], cut[used]
     rank[boundary(faces)[0]] = 0
     for _ in range(_ROUNDS):
@@ -150,13 +166,14 @@ def _mend_part(
 
 
 def _slivers(vertices: FloatArray, faces: IntArray, cut: BoolArray) -> IndexArray:
-    return np.flatnonzero(_at(cut, faces) & (smallest_height(vertices[faces]) < SLIVER_M))
+    """Return the slivers that have a vertex on the cut."""
+    return np.flatnonzero(_touch(cut, faces) & (smallest_height(vertices[faces]) < SLIVER_M))
 
 
 def _collapse(
     vertices: FloatArray, faces: IntArray, rank: NDArray[np.int8], cut: BoolArray, bad: IndexArray, limit: float
 ) -> BoolArray:
-    """Collapse short edges of the bad faces, in place; returns which faces have vanished."""
+    """Collapse short edges of the bad faces in place, and return which faces (m,) have vanished."""
     start, end = _collapsible_edges(vertices, faces[bad], rank, limit)
     edges = _with_faces(faces, start, end, len(vertices))
     edges = edges.only(_keeps_manifold(faces, edges))
@@ -176,9 +193,9 @@ def _collapse(
 def _collapsible_edges(
     vertices: FloatArray, faces: IntArray, rank: NDArray[np.int8], limit: float
 ) -> tuple[IndexArray, IndexArray]:
-    """Start (gives way) and end of the sides of the faces up to the limit, both ways round; the best first, no edge twice.
+    """Return start (removed) and end (kept) of the sides of the faces up to the limit, both ways round, best first.
 
-    Better is an edge whose start has no lower rank than its end, then a shorter one.
+    Edges whose start has at least the rank of its end come first, shorter ones before longer ones.
     """
     first, second = faces.ravel().astype(np.intp), np.roll(faces, -1, axis=1).ravel().astype(np.intp)
     edges = np.unique(np.concatenate([first << 32 | second, second << 32 | first]))
@@ -190,9 +207,10 @@ def _collapsible_edges(
 
 
 def _with_faces(faces: IntArray, start: IndexArray, end: IndexArray, count: int) -> _RankedEdges:
+    """Find the faces that touch each edge."""
     near = np.zeros(count, dtype=bool)
     near[start] = near[end] = True
-    rows = np.flatnonzero(_at(near, faces))
+    rows = np.flatnonzero(_touch(near, faces))
     corner = faces[rows].ravel()
     order = np.argsort(corner, kind="stable")
     wanted = np.concatenate([start, end])
@@ -206,7 +224,7 @@ def _with_faces(faces: IntArray, start: IndexArray, end: IndexArray, count: int)
 
 
 def _keeps_manifold(faces: IntArray, edges: _RankedEdges) -> BoolArray:
-    """The link condition: the two ends share as many neighbours as the edge has faces, which are two."""
+    """Check the link condition: the two ends share as many neighbours as the edge has faces, which are two."""
     corners = faces[edges.face]
     at_start = (corners == edges.start[edges.operation, None]).any(axis=1)
     at_end = (corners == edges.end[edges.operation, None]).any(axis=1)
@@ -218,7 +236,7 @@ def _keeps_manifold(faces: IntArray, edges: _RankedEdges) -> BoolArray:
 
 
 def _turns_no_face(vertices: FloatArray, faces: IntArray, edges: _RankedEdges) -> BoolArray:
-    """Whether no face that is sound and stays turns by more than a right angle when start moves to end."""
+    """Return whether collapsing each edge turns no sound face that remains by more than a right angle."""
     corners = faces[edges.face]
     start, end = edges.start[edges.operation, None], edges.end[edges.operation, None]
     stays = (corners == start).any(axis=1) & ~(corners == end).any(axis=1)
@@ -229,7 +247,7 @@ def _turns_no_face(vertices: FloatArray, faces: IntArray, edges: _RankedEdges) -
 
 
 def _independent(faces: IntArray, edges: _RankedEdges, count: int) -> BoolArray:
-    """The edges that come first at every vertex of their faces, so that no two of them share a neighbourhood."""
+    """Return the edges that come first at every vertex of their faces, so that no two of them share a neighbourhood."""
     best = np.full(count, len(edges.start))
     around, operation = faces[edges.face].ravel(), np.repeat(edges.operation, 3)
     np.minimum.at(best, around, operation)
@@ -237,11 +255,10 @@ def _independent(faces: IntArray, edges: _RankedEdges, count: int) -> BoolArray:
 
 
 def _flip(vertices: FloatArray, faces: IntArray, label: IntArray, bad: IndexArray) -> bool:
-    """Flip the longest edge of the bad faces, in place, where that helps; both new faces take the other face's label.
-    Returns whether any was flipped.
+    """Flip the longest edge of the bad faces in place where this helps, and return whether any edge was flipped.
 
-    For a sliver whose apex lies almost on its longest edge this amounts to taking the sliver away and putting its apex
-    into the edge of the face beyond.
+    Both new faces take the label of the other face. For a sliver whose apex lies almost on its longest edge, this removes the
+    sliver and inserts its apex into the edge of the face beyond.
     """
     ends = np.roll(faces[bad], -1, axis=1)
     side = np.linalg.norm(vertices[ends] - vertices[faces[bad]], axis=2).argmax(axis=1)
@@ -271,7 +288,7 @@ def _flip(vertices: FloatArray, faces: IntArray, label: IntArray, bad: IndexArra
 
 
 def _joined(faces: IntArray, first: IndexArray, second: IndexArray, count: int) -> BoolArray:
-    """Whether an edge joins first to second already."""
+    """Return whether each pair of vertices is already connected by an edge."""
     edges = _with_faces(faces, first, second, count)
     corners = faces[edges.face]
     both = (corners == first[edges.operation, None]).any(axis=1) & (corners == second[edges.operation, None]).any(axis=1)
@@ -279,6 +296,6 @@ def _joined(faces: IntArray, first: IndexArray, second: IndexArray, count: int) 
 
 
 def _agree(vertices: FloatArray, old: IntArray, new: IntArray) -> BoolArray:
-    """Whether the normals of the new faces lie within a right angle of the old ones', where the old ones have any."""
+    """Return whether each new face's normal is within a right angle of the old one's; True where the old face is a sliver."""
     corners = vertices[old]
     return (np.einsum("mi,mi->m", _normal(corners), _normal(vertices[new])) > 0) | (smallest_height(corners) < SLIVER_M)

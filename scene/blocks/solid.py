@@ -1,8 +1,8 @@
-"""Solids for Manifold: patches of a wall closed at the back, and what a boolean leaves of them, triangle by triangle.
+"""Make solids for Manifold from patches of a wall, and read the result of a boolean triangle by triangle.
 
-A patch is closed by vertical sides below its boundary and a fan far below, so a point under the patch is inside wherever the
-surface above it faces up once more than down. Where patches overlap themselves in XY (overhangs, the back of a closed wall)
-this count stays right, which is all that Manifold's boolean needs.
+A patch is closed by vertical sides below its boundary and a fan of triangles far below. A point under the patch is then inside
+wherever the surface above it faces up once more than down. This count remains correct where a patch overlaps itself in XY
+(overhangs, the back of a closed wall), which is all that Manifold's boolean needs.
 """
 
 from __future__ import annotations
@@ -14,19 +14,20 @@ from manifold3d import Error, Manifold, Mesh64
 from numpy.typing import NDArray
 
 from scene.common.errors import InputError
-from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, renumbered
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, compact_vertices
 
 _MARGIN_M = 1.0
-"""Distance from the lowest point of patch and blocks to the closure's bottom."""
+"""Distance from the lowest point of patch and blocks to the bottom of the closure."""
 
 _SPREAD_M, _IRRATIONAL = 2e-6, (0.6180339887498949, 0.7548776662466927)
-"""How far the foot of each side stands from below its top: where a straight boundary folds back on itself, sides in one plane
-would overlap, which Manifold takes for one flat face and retriangulates, the neighbours included."""
+"""Offset of the foot of each side in x and y, m, and the irrational numbers that vary it. Where a straight boundary folds back on
+itself, exactly vertical sides would overlap in one plane; Manifold would merge them into one flat face and retriangulate it,
+neighbours included."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A Manifold solid whose triangles keep their row number through booleans."""
+    """A Manifold solid whose triangles keep their row numbers through booleans; `identity` is Manifold's id of it."""
 
     manifold: Manifold
     identity: int
@@ -34,10 +35,18 @@ class Solid:
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of the result of a boolean.
+    """Part of the result of a boolean.
 
-    vertices: (n, 3), m; faces: (m, 3) int32; source: (m,) row of the triangle that each face is a part of, in the solid that
-    it came from; first: (m,) whether that is the first solid.
+    Attributes
+    ----------
+    vertices : (n, 3) array
+        Positions, m.
+    faces : (m, 3) int32 array
+        Vertex indices.
+    source : (m,) int array
+        Row of the triangle that each face is a part of, in the solid that it came from.
+    first : (m,) bool array
+        Whether that is the first of the boolean's two solids.
     """
 
     vertices: FloatArray
@@ -46,8 +55,8 @@ class Piece:
     first: NDArray[np.bool_]
 
 
-def solid(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
-    """A solid of closed triangles; raises InputError, naming it by `name`, where they do not close."""
+def solid_of(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
+    """Make a solid of closed triangles. Raises InputError, which calls it `name`, if they do not close."""
     identity = Manifold.reserve_ids(1)
     manifold = Manifold(
         Mesh64(
@@ -69,14 +78,14 @@ def solid(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
     return Solid(manifold, identity)
 
 
-def split(wall: Solid, blocks: Solid) -> tuple[Piece, Piece]:
-    """Cut the blocks out of the wall: what is removed, and what is left with the blocks' imprint."""
+def split_wall(wall: Solid, blocks: Solid) -> tuple[Piece, Piece]:
+    """Cut the blocks out of the wall. Returns what is removed, and what is left with the blocks' imprint."""
     removed, left = wall.manifold.split(blocks.manifold)
-    return piece(removed, wall), piece(left, wall)
+    return read_piece(removed, wall), read_piece(left, wall)
 
 
-def piece(result: Manifold, first: Solid) -> Piece:
-    """Read the result of a boolean of `first` with another solid."""
+def read_piece(result: Manifold, first: Solid) -> Piece:
+    """Read the result of a boolean of the solid `first` with another solid."""
     mesh = result.to_mesh64()
     run_end = np.asarray(mesh.run_index).astype(np.int64) // 3
     runs = run_end[1:] - run_end[:-1]
@@ -85,12 +94,13 @@ def piece(result: Manifold, first: Solid) -> Piece:
     return Piece(vertices, faces, np.asarray(mesh.face_id).astype(np.int64), is_first)
 
 
-def close(mesh: TriangleMesh, rows: IntArray, bottom_m: float) -> tuple[Solid, FloatArray]:
-    """Close the patch of `mesh` made of the faces `rows`; triangle i < len(rows) of the solid is the face rows[i].
+def close_patch(mesh: TriangleMesh, rows: IntArray, bottom_m: float) -> tuple[Solid, FloatArray]:
+    """Close the patch of `mesh` that consists of the faces `rows`. Triangle i < len(rows) of the solid is the face rows[i].
 
-    bottom_m: a z that the closure's bottom has to lie below. Returns the solid and the corners (r, 3, 3) of the patch's faces.
+    `bottom_m` is a height z below which the closure's bottom must lie. Returns the solid and the corners (r, 3, 3) of the
+    patch's faces.
     """
-    used, faces = renumbered(mesh.faces[rows])
+    used, faces = compact_vertices(mesh.faces[rows])
     vertices = mesh.vertices[used]
     start, end = boundary(faces)
     pinched = np.bincount(start, minlength=len(vertices)) > 1
@@ -99,11 +109,11 @@ def close(mesh: TriangleMesh, rows: IntArray, bottom_m: float) -> tuple[Solid, F
         start, end = boundary(faces)
     corners = vertices[faces]
     bottom = min(bottom_m, float(vertices[:, 2].min(initial=bottom_m))) - _MARGIN_M
-    return solid(*_closed(vertices, faces, start, end, bottom), name="wall mesh"), corners
+    return solid_of(*_closed(vertices, faces, start, end, bottom), name="wall mesh"), corners
 
 
 def boundary(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Start and end vertex of the directed edges that have no face on their other side."""
+    """Return start and end vertex of the directed edges that have no face on their other side."""
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     key = np.minimum(start, end).astype(np.int64) << 32 | np.maximum(start, end)
     order = np.argsort(key, kind="stable")
@@ -113,7 +123,9 @@ def boundary(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _closed(vertices: FloatArray, faces: IntArray, start: IntArray, end: IntArray, bottom: float) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces with the sides below the boundary edges start -> end, and a fan below the sides."""
+    """Return vertices and faces of the patch with vertical sides below the boundary edges start -> end, and fans below the
+    sides.
+    """
     rim, place = np.unique(np.concatenate([start, end]), return_inverse=True)
     start_low, end_low = (place + len(vertices)).astype(np.int32).reshape(2, -1)
     spread = (np.arange(len(rim))[:, None] * _IRRATIONAL % 1.0 - 0.5) * _SPREAD_M
@@ -126,7 +138,7 @@ def _closed(vertices: FloatArray, faces: IntArray, start: IntArray, end: IntArra
 
 
 def _apexes(low: FloatArray, start: IntArray, end: IntArray) -> tuple[IntArray, FloatArray]:
-    """The loop that each edge start -> end belongs to, and for each loop a point below its middle."""
+    """Return the loop that each edge start -> end belongs to, and for each loop a point below its middle."""
     from scipy import sparse
 
     graph = sparse.coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(low), len(low)))
@@ -137,7 +149,7 @@ def _apexes(low: FloatArray, start: IntArray, end: IntArray) -> tuple[IntArray, 
 
 
 def _split_pinched(vertices: FloatArray, faces: IntArray, pinched: NDArray[np.bool_]) -> tuple[FloatArray, IntArray]:
-    """Give each fan of faces around a vertex where several boundary loops meet a vertex of its own."""
+    """Give each fan of faces its own vertex where several boundary loops meet in one."""
     from scipy import sparse
 
     face, corner = np.nonzero(pinched[faces])

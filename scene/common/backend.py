@@ -1,6 +1,6 @@
-"""The ray-tracing backend: Mitsuba's CUDA variant where there is a GPU, else LLVM; chosen once per process.
+"""Select the ray-tracing backend once per process: Mitsuba's CUDA variant if there is a GPU, else its LLVM variant.
 
-Everything that uses Mitsuba imports `mi` and `dr` from here, so that a variant is set before any Mitsuba type is touched.
+Import `mi` and `dr` from here and nowhere else, so that the variant is set before any Mitsuba type is used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from scene.common.errors import InputError
 
 if "tensorflow" in sys.modules and "drjit" not in sys.modules:
     raise InputError(
-        "TensorFlow is loaded already, and the names of LLVM in it would crash the ray tracer",
+        "TensorFlow was imported first; its LLVM symbols would crash the ray tracer",
         where="scarpsim",
         remedy="import scarpsim's scene, sensors or pipeline before tensorflow, or use two processes",
     )
@@ -22,9 +22,11 @@ import mitsuba as mi
 
 CUDA, LLVM = "cuda_ad_mono", "llvm_ad_mono"
 _VARIANT_VARIABLE = "SCARPSIM_VARIANT"
+"""Environment variable that selects the variant."""
 
 
 def _choose() -> str:
+    """Return the variant that the environment variable names, or the best one that this machine supports."""
     wanted = os.environ.get(_VARIANT_VARIABLE)
     if wanted:
         if wanted not in (CUDA, LLVM):
@@ -34,6 +36,7 @@ def _choose() -> str:
 
 
 def _activate() -> str:
+    """Set Mitsuba's variant and return its name. Raises InputError if the device or the library that it needs is missing."""
     variant = _choose()
     backend = dr.JitBackend.CUDA if variant == CUDA else dr.JitBackend.LLVM
     if not dr.has_backend(backend):

@@ -1,4 +1,4 @@
-"""The base of every config model: frozen, unknown keys refused with the nearest right one."""
+"""Define the base class of all config sections and turn YAML or JSON into them, with errors that name the mistaken key."""
 
 from __future__ import annotations
 
@@ -21,20 +21,41 @@ from scene.common.yaml_text import parse_yaml
 
 
 class Config(BaseModel):
-    """A frozen config section. Field names carry their unit (`_m`, `_rad`, `_px`, `_ppm`)."""
+    """Base class of every config section: immutable, and unknown keys are errors.
+
+    Field names carry their unit (`_m`, `_rad`, `_px`, `_ppm`). Infinite and NaN values are refused.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     short_forms: ClassVar[tuple[str, ...]] = ()
-    """Keys that a file may have in this section and that are resolved to others before it is parsed; messages name them too."""
+    """Keys that a file may use in this section although the model has no such field, because they are replaced by other keys
+    before parsing. Error messages list them as allowed.
+    """
 
 
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
 
 
 def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
-    """Validate `values` (a mapping) as `model`; every mistake is named in one InputError.
+    """Validate `values` as the config section `model`.
 
-    `where` is the file or option the values came from; it stands at the front of the message.
+    Parameters
+    ----------
+    model : type of pydantic model
+        The config section.
+    values : mapping
+        Keys and values, as read from a file or given in Python.
+    where : str
+        The file or option that the values came from; every message starts with it.
+
+    Returns
+    -------
+    An instance of `model`.
+
+    Raises
+    ------
+    InputError
+        If a key or value is wrong. One message lists all mistakes, with the nearest valid key for a misspelt one.
     """
     if not isinstance(values, Mapping):
         raise InputError(
@@ -47,11 +68,14 @@ def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
 
 
 _MOST_YAML_BYTES = 4_000_000
-"""YAML takes some twenty seconds for as much."""
+"""Largest YAML file that is read: parsing this much takes about twenty seconds."""
 
 
 def load_yaml(path: Path) -> Any:
-    """Read a YAML file (`parse_yaml` says which YAML), or a JSON file; unreadable or malformed files are InputErrors."""
+    """Read a YAML file (see `parse_yaml` for the dialect) or, by its suffix, a JSON file.
+
+    Raises InputError if the file cannot be read or is malformed.
+    """
     if path.suffix == ".json":
         return read_json(path)
     try:
@@ -63,16 +87,18 @@ def load_yaml(path: Path) -> Any:
 
 
 _MOST_MISTAKES = 4
-"""More are counted only: a file of another kind is wrong in every key."""
+"""Number of mistakes that a message spells out; the rest are only counted, because in a file of another kind every key is wrong.
+"""
 
 
 def _listed(mistakes: list[str]) -> str:
+    """Join the descriptions of mistakes into one message."""
     more = len(mistakes) - _MOST_MISTAKES
     return "; ".join(mistakes[:_MOST_MISTAKES] + ([f"and {more} more"] if more > 0 else []))
 
 
 def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
-    """One mistake as `section.key: message, got value`, with the nearest key for an unknown one."""
+    """Describe one validation error as `section.key: message, got value`, with a suggestion for an unknown key."""
     keys, sections = _place(model, item["loc"])
     key = ".".join(keys)
     if item["type"] == "extra_forbidden":
@@ -80,14 +106,14 @@ def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
     if item["type"] == "missing":
         return f"'{key}' is missing"
     message = item["msg"].removeprefix("Value error, ")
-    if not key:  # of the whole, which is not worth repeating
+    if not key:  # the error concerns the whole section, whose value would be too long to print
         return message
     hint = _hint(keys, item)
     return f"'{key}': {message[0].lower()}{message[1:]}, got {_shown(item['input'])}" + (f"; {hint}" if hint else "")
 
 
 def _unknown(keys: list[str], sections: list[_Section]) -> str:
-    """What a key that is not allowed is: one of another kind of this section, or of none."""
+    """Describe a key that is not allowed: it belongs to another variant of this section, or to none."""
     key, name = ".".join(keys), keys[-1]
     owners = list(dict.fromkeys(section.kind for section in sections if name in section.names()))
     picked = [section for section in sections if section.picked]
@@ -96,14 +122,14 @@ def _unknown(keys: list[str], sections: list[_Section]) -> str:
     if owners and name not in known:
         more = f" and {len(owners) - _MOST_MISTAKES} more" if len(owners) > _MOST_MISTAKES else ""
         return f"'{key}' belongs to {', '.join(owners[:_MOST_MISTAKES])}{more}, not to {picked[0].kind}; {allowed}"
-    if owners:  # of kinds that no word tells apart
-        return f"'{key}' does not go with the other keys of '{'.'.join(keys[:-1])}'; leave it or them out"
+    if owners:  # the variants of this section have no key that names them
+        return f"'{key}' cannot be combined with the other keys of '{'.'.join(keys[:-1])}'; leave it or them out"
     hint = nearest(name, known) or allowed
     return f"unknown key '{key}'; {hint}" if hint else f"unknown key '{key}'"
 
 
 def _hint(keys: list[str], item: ErrorDetails) -> str:
-    """What was probably meant: a word in another spelling, or an angle in degrees."""
+    """Return what was probably meant (a word in another spelling, an angle in degrees), or ""."""
     value, told = item["input"], item.get("ctx", {})
     if item["type"] == "literal_error" and isinstance(value, str):
         return nearest(value.lower(), re.findall(r"'([^']*)'", told["expected"]))
@@ -116,7 +142,7 @@ def _hint(keys: list[str], item: ErrorDetails) -> str:
 
 
 def _shown(value: Any) -> str:
-    """The value as it is written, cut where it is long: a file's aliases can make one of any size."""
+    """Return the value as it would be written in code, shortened: YAML aliases can make a small file describe a huge value."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = 80
     short.maxdict = short.maxlist = 6
@@ -126,19 +152,29 @@ def _shown(value: Any) -> str:
 
 @dataclass(frozen=True)
 class _Section:
-    """A model that may stand at a place of a config. kind: the word that picks it, or that picks what it stands in, such as an
-    effect's name; "" where none does; picked: whether the config picks it."""
+    """A model that may stand at one place of a config.
+
+    Attributes
+    ----------
+    model : type of pydantic model
+        The section's class.
+    kind : str
+        The word that selects this model among the variants of a union, such as an effect's name, or that of the section around
+        it; "" if there is none.
+    picked : bool
+        Whether the config selects this variant.
+    """
 
     model: type[BaseModel]
     kind: str = ""
     picked: bool = True
 
     def names(self) -> set[str]:
-        """What may stand in it."""
+        """Return the keys that are allowed in this section."""
         return {*self.model.model_fields, *getattr(self.model, "short_forms", ())}
 
     def inside(self, field: str) -> list[_Section]:
-        """The models that the annotation of a field holds."""
+        """Return the models that the type annotation of a field contains."""
         pending: list[Any] = [self.model.model_fields[field].annotation]
         found = []
         while pending:
@@ -150,13 +186,16 @@ class _Section:
 
 
 def _word_of(model: type[BaseModel]) -> str:
-    """The only value of the field that tells a model from others of its union; "" where it has no such field."""
+    """Return the value of the literal field that distinguishes a model within its union, or "" if it has no such field."""
     words = (get_args(field.annotation) for field in model.model_fields.values() if get_origin(field.annotation) is Literal)
     return next((str(word[0]) for word in words if len(word) == 1), "")
 
 
 def _place(model: type[BaseModel], location: tuple[str | int, ...]) -> tuple[list[str], list[_Section]]:
-    """The keys that lead to a mistake, without the tags of unions, and the sections that may stand around the last of them."""
+    """Locate a validation error.
+
+    Returns the keys that lead to it, without the tags of unions, and the sections that may contain the last key.
+    """
     keys: list[str] = []
     sections = around = [_Section(model)]
     for depth, part in enumerate(location):

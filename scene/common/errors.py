@@ -1,4 +1,4 @@
-"""The error that a person can mend, wrong input or a wrong config; and the one that lies outside of the program."""
+"""Define the two errors that users see: wrong input, which they can correct, and failures outside the program."""
 
 from __future__ import annotations
 
@@ -7,9 +7,20 @@ from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """Wrong input: what is wrong and where, what is allowed, how to mend it.
+    """Wrong input: says what is wrong and where, what is allowed, and how to correct it.
 
-    Commands print it as one message and exit with 2; a library user catches it as a ValueError.
+    Commands print it as one message and exit with status 2. In Python it is a ValueError.
+
+    Parameters
+    ----------
+    what : str
+        The problem, with the value that was given.
+    where : str
+        The file, option or config key.
+    allowed : str
+        The values that are valid.
+    remedy : str
+        What the user can do about it.
     """
 
     def __init__(self, what: str, *, where: str = "", allowed: str = "", remedy: str = "") -> None:
@@ -24,23 +35,25 @@ class InputError(ValueError):
 
 
 class OutsideError(RuntimeError):
-    """Something outside of the program failed that was not the input's fault, such as its worker processes.
+    """A failure that the input did not cause, such as worker processes that die.
 
-    Commands print it as one message and exit with 1.
+    Commands print it as one message and exit with status 1.
     """
 
 
 _LONGEST = 600
-"""Characters of a part of a message: a name or a value from a file can have any length."""
+"""Maximum length of one part of a message, in characters: names and values from a file can have any length."""
 
 
 def one_line(part: str) -> str:
-    """On one line, without control characters (a terminal would obey them), its middle left out where it is long."""
+    """Return `part` on one line without control characters, which a terminal would obey. The middle of a long text is left
+    out.
+    """
     line = "".join(each if each.isprintable() else "\ufffd" for each in " ".join(part.splitlines()))
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 3 :]}"
 
 
 def nearest(word: str, words: Iterable[str]) -> str:
-    """The word of `words` most like `word` as a question to the user, or "" if none is near."""
+    """Return "did you mean '...'?" with the word of `words` most like `word`, or "" if none is similar."""
     near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
     return f"did you mean '{near[0]}'?" if near else ""

@@ -1,4 +1,4 @@
-"""How an optional part of the program, an extra of the package, is installed."""
+"""Tell how to install an optional part of the program (an extra of the Python package)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 def how_to_install(extra: str) -> str:
-    """The command that installs an extra: where the program runs from a checkout that of its set-up, else pip's."""
+    """Return the command that installs an extra: `make setup` in a source checkout, pip elsewhere."""
     if (_ROOT / "tools" / "setup.sh").is_file():
         return f"make setup EXTRAS={extra}, in {_ROOT}"
     return f"pip install 'scarpsim[{extra}]'"

@@ -1,7 +1,7 @@
-"""Random numbers keyed by (seed, purpose, element): the same whatever the threads, chunks or workers.
+"""Random numbers that depend only on (seed, purpose, element), and so not on threads, chunks or workers.
 
-A generator is never advanced: every number is a pure function of its key. On the device the counter-based Philox 4x32 of
-Salmon et al. (2011) is evaluated at the element's index; on the host NumPy's Philox is seeded with the hashed key.
+No generator is advanced: every number is a pure function of its key. On the device, the counter-based Philox 4x32 of Salmon et
+al. (2011) is evaluated at the element's index; on the host, NumPy's Philox is seeded with the hashed key.
 """
 
 from __future__ import annotations
@@ -16,34 +16,43 @@ from scene.common.backend import dr, mi
 
 @dataclass(frozen=True)
 class KeyedRandom:
-    """A source of random numbers for one seed and a path of purposes, such as ("epoch", 3, "tls", "range_noise")."""
+    """A source of random numbers for one seed and one path of purposes, such as ("epoch", 3, "tls", "range_noise")."""
 
     seed: int
     path: tuple[str | int, ...] = ()
 
     def child(self, *purpose: str | int) -> KeyedRandom:
-        """The source for a narrower purpose; children of different purposes are independent."""
+        """Return the source for a narrower purpose. Children for different purposes are independent of each other."""
         return KeyedRandom(self.seed, self.path + purpose)
 
     @property
     def key(self) -> int:
-        """The 64-bit key that this seed and path hash to (BLAKE2b)."""
+        """64-bit BLAKE2b hash of the seed and the path."""
         text = repr((self.seed, self.path)).encode()
         return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little")
 
     def generator(self) -> np.random.Generator:
-        """A fresh NumPy generator, at the start of this key's stream each time it is asked for."""
+        """Return a new NumPy generator, which starts at the beginning of this key's stream on every call."""
         return np.random.Generator(np.random.Philox(key=self.key))
 
     def normals(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
-        """Four independent standard normal numbers per element, on the device.
+        """Draw four independent standard normal numbers per element, on the device.
 
-        index: (n,) element numbers; field: a second number of the key, one or (n,). Returns a Dr.Jit Array4f of (n,) each.
+        Parameters
+        ----------
+        index : mi.UInt32, (n,)
+            Element numbers.
+        field : int or mi.UInt32, () or (n,)
+            A second number of the key, such as the pass over the elements.
+
+        Returns
+        -------
+        mi.Array4f of (n,) each.
         """
         return self._philox(index, field).next_float32x4_normal()
 
     def uniforms(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
-        """Four independent numbers in [0, 1) per element, on the device; arguments as in `normals`."""
+        """Draw four independent numbers in [0, 1) per element, on the device. Arguments as in `normals`."""
         return self._philox(index, field).next_float32x4()
 
     def _philox(self, index: mi.UInt32, field: int | mi.UInt32) -> mi.Philox4x32:

@@ -1,4 +1,4 @@
-"""Names that a package offers at its top level and loads when they are asked for, so that importing it costs nothing."""
+"""Let a package offer names at its top level that are imported only when they are used, so that importing it is fast."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import Any
 
 
-def lazily(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a package. homes: the module in which each of its names is defined."""
+def lazy_attributes(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Make the `__getattr__` and `__dir__` of a package. homes: for each public name, the module that defines it."""
 
     def load(name: str) -> Any:
         if name not in homes:

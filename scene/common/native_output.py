@@ -1,4 +1,4 @@
-"""Keep what libraries in C write to stderr from the user's terminal."""
+"""Keep messages that C libraries write to stderr away from the user's terminal."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def stderr_dropped() -> Iterator[None]:
-    """Drop what the process writes to stderr, libraries in C as well, unless an exception leaves the body."""
+def suppress_stderr() -> Iterator[None]:
+    """Discard what the process writes to stderr inside the `with` block, C libraries included, unless an exception leaves it."""
     sys.stderr.flush()
     stderr = os.dup(2)
     with tempfile.TemporaryFile() as written:

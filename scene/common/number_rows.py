@@ -1,7 +1,7 @@
-"""Rows of numbers in text, read line by line, so that an error says which line is wrong, and why.
+"""Parse rows of numbers from text line by line, with errors that say which line is wrong and why.
 
-NumPy's own reader is faster and is tried first where a file is plain; this one is for what it refuses: decimal commas, comments
-between the rows, missing values, and the message.
+NumPy's own reader is faster and is tried first on plain files. This parser handles what NumPy refuses: decimal commas,
+comments between rows and missing values. It also produces the error messages.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scene.common.errors import InputError
 
 COMMENTS = ("#", "//", "%", "!")
-"""What a line of text begins with that is no row."""
+"""Prefixes of comment lines."""
 _TRAILING = re.compile(r"\s(?:#|//)")
-"""Where a comment begins behind a row."""
+"""Start of a comment behind the values of a row."""
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 _COMMA = re.compile(r"[+-]?(\d+,\d*|\d*,\d+)([eEdD][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}([.,'\u2019\u00a0\u202f_ ]\d{3})+([.,]\d*)?")
@@ -31,11 +31,22 @@ _UNGROUPED = "export the numbers without thousands separators, as 6389450.123"
 
 @dataclass(frozen=True)
 class RowForm:
-    """How the rows of a text are written.
+    """How the rows of a text file are written.
 
-    separator: between values, None for white space; decimal_comma: whether numbers have a comma for the decimal mark; columns:
-    values of a row; first_line: number, from 1, of the first line in the file; counts: whether a line of one whole number
-    between the rows states how many follow; words: columns, from 0, that hold words in place of numbers, read as NaN.
+    Attributes
+    ----------
+    separator : str or None
+        Character between values; None for white space.
+    decimal_comma : bool
+        Whether numbers use a comma as the decimal mark.
+    columns : int
+        Number of values in a row.
+    first_line : int
+        Number of the first line within the file, from 1, for error messages.
+    counts : bool
+        Whether a line with a single whole number states how many rows follow.
+    words : tuple of int
+        Columns, from 0, that hold words instead of numbers. They are read as NaN.
     """
 
     separator: str | None = None
@@ -48,15 +59,24 @@ class RowForm:
 
 @dataclass
 class RowsFound:
-    """What was found beside the values. missing: values that are none; blocks: stated and found rows of each block, and the
-    line that states them."""
+    """What the parser found besides the values.
+
+    Attributes
+    ----------
+    missing : int
+        Number of missing values.
+    blocks : list of (int, int, int)
+        For each block of rows: the stated number of rows, the actual number, and the line that states it.
+    """
 
     missing: int = 0
     blocks: list[tuple[int, int, int]] = field(default_factory=list)
 
 
 def split_row(line: str, separator: str | None) -> list[str]:
-    """The values of a line, without quotation marks and a comment behind them; the last is empty where a separator ends them."""
+    """Split a line into values, without quotation marks and a trailing comment. The last value is empty if the line ends with a
+    separator.
+    """
     if "#" in line or "//" in line:
         line = _TRAILING.split(line, maxsplit=1)[0]
     if separator is not None and '"' in line:
@@ -66,36 +86,40 @@ def split_row(line: str, separator: str | None) -> list[str]:
 
 
 def is_number(word: str) -> bool:
-    """Whether a word stands for a number, a missing or an infinite one too, with a decimal point, a comma or grouped digits."""
+    """Return whether a word is a number. Missing and infinite values, decimal commas and grouped digits count as numbers."""
     plain = word.lower()
     number = _POINT.fullmatch(word) or _COMMA.fullmatch(word) or _GROUPED.fullmatch(word)
     return bool(number) or plain.removeprefix("-") in _MISSING | _INFINITE or plain in _INFINITE
 
 
 def is_grouped(word: str, *, decimal_comma: bool) -> bool:
-    """Whether a word is a number with thousands separators: 6,389,450.1, 6.389.450,1, 6'389'450 or 6 389 450."""
+    """Return whether a word is a number with thousands separators: 6,389,450.1, 6.389.450,1, 6'389'450 or 6 389 450."""
     if not _GROUPED.fullmatch(word):
         return False
     return not (_POINT.fullmatch(word) or (decimal_comma and _COMMA.fullmatch(word)))
 
 
 def read_rows(lines: Iterable[str], form: RowForm, where: str) -> tuple[NDArray[np.float64], RowsFound]:
-    """The numbers of lines of text.
+    """Parse lines of text into numbers.
 
     Parameters
     ----------
-    lines : from `form.first_line` on; empty ones and comments are passed over
-    form : how the rows are written
-    where : what errors call the file
+    lines : iterable of str
+        The lines from number `form.first_line` on. Empty lines and comments are skipped.
+    form : RowForm
+        How the rows are written.
+    where : str
+        Name of the file in error messages.
 
     Returns
     -------
-    (n, columns) values, NaN for missing ones, and what else was found.
+    array (n, columns) and RowsFound
+        The values, NaN for missing ones, and what else was found.
 
     Raises
     ------
     InputError
-        With the number of the line that is no row.
+        If a line is not a valid row. The message gives its number.
     """
     found = RowsFound()
     values = np.fromiter(_values(lines, form, found, where), dtype=np.float64)
@@ -103,6 +127,7 @@ def read_rows(lines: Iterable[str], form: RowForm, where: str) -> tuple[NDArray[
 
 
 def _values(lines: Iterable[str], form: RowForm, found: RowsFound, where: str) -> Iterator[float]:
+    """Yield the values of all rows, one after the other; record missing values and blocks in `found`."""
     for number, line in enumerate(lines, start=form.first_line):
         text = line.strip()
         if not text or text.startswith(COMMENTS):
@@ -124,6 +149,7 @@ def _values(lines: Iterable[str], form: RowForm, found: RowsFound, where: str) -
 
 
 def _value(word: str, form: RowForm, found: RowsFound, where: str) -> float:
+    """Parse one word. Raises InputError if it is not a number or uses another decimal mark than the rest of the file."""
     plain = word.lower().removeprefix("-") if "#" in word else word.lower()
     if form.decimal_comma and _COMMA.fullmatch(word):
         return float(plain.replace(",", ".").replace("d", "e"))
@@ -141,16 +167,18 @@ def _value(word: str, form: RowForm, found: RowsFound, where: str) -> float:
 
 
 def _no_number(word: str, form: RowForm, where: str) -> InputError:
+    """Make the error for a word that is not a number."""
     if is_grouped(word, decimal_comma=form.decimal_comma):
         return InputError(f"'{word:.40}': {GROUPED}", where=where, allowed="plain numbers", remedy=_UNGROUPED)
     if _COMMA.fullmatch(word):
         problem = f"'{word:.40}' has a decimal comma, where other numbers of the file have decimal points"
         return InputError(problem, where=where, remedy="export all numbers with decimal points")
     remedy = "correct or remove the line, or export the file again"
-    return InputError(f"'{word:.40}' is no number", where=where, allowed="numbers, one point a line", remedy=remedy)
+    return InputError(f"'{word:.40}' is not a number", where=where, allowed="numbers, one point a line", remedy=remedy)
 
 
 def _wrong_width(text: str, width: int, number: int, form: RowForm, where: str) -> InputError:
+    """Make the error for a row with too many or too few values."""
     values = "value" if width == 1 else "values"
     return InputError(
         f"has {width} {values} ('{text:.60}')", where=f"{where}, line {number:,}", allowed=f"{form.columns}, as the rows before",

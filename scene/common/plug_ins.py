@@ -1,4 +1,4 @@
-"""What other packages add, found by entry points: wall styles, readers, scanners, other configs (effects: sensors/effects)."""
+"""Load what other packages add through entry points: wall styles, readers, scanners, configs (effects: see sensors/effects)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,29 @@ from typing import Any
 from scene.common.errors import InputError
 
 
-def plugged(group: str, needs: str, is_one: Callable[[Any], bool], taken: Collection[str]) -> dict[str, Any]:
-    """What the entry points of a group name ("name = package.module:object"), in the order of their names.
+def load_plug_ins(group: str, needs: str, is_one: Callable[[Any], bool], taken: Collection[str]) -> dict[str, Any]:
+    """Load the objects that the entry points of a group name ("name = package.module:object").
 
-    needs: what an object has to be, in words, is_one whether it is; taken: names that there are already. Raises InputError for
-    one that does not load, is something else, or has a name that is taken.
+    Parameters
+    ----------
+    group : str
+        Name of the entry point group.
+    needs : str
+        What an object has to be, in words, for error messages.
+    is_one : callable
+        Tells whether a loaded object is of that kind.
+    taken : collection of str
+        Names that are already in use.
+
+    Returns
+    -------
+    dict
+        The objects by name, in alphabetical order.
+
+    Raises
+    ------
+    InputError
+        If an object cannot be loaded or is of another kind, or if its name is already in use.
     """
     found: dict[str, Any] = {}
     for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):

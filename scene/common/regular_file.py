@@ -1,4 +1,4 @@
-"""The door for every file that a person names: it is looked at first, as a pipe or a device would be read without end."""
+"""Check and read files that a user names. Every read starts here, because reading a pipe or a device might never end."""
 
 from __future__ import annotations
 
@@ -13,18 +13,35 @@ from typing import IO, Any, AnyStr
 from scene.common.errors import InputError
 
 MOST_TEXT_BYTES = 512_000_000
-"""Of a text file that is read into memory as a whole."""
+"""Largest text file that is read into memory as a whole."""
 MOST_JSON_GB = 1.7
-"""What a JSON file may take in memory."""
+"""Most memory, in GB, that the contents of a JSON file may take."""
 READ_LIMIT = "SCARPSIM_READ_GB"
-"""The variable of the environment that allows any file that is read to take more, in GB."""
+"""Environment variable that raises both limits, in GB."""
 
 
 def check_file(
     path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str = "give a smaller one"
 ) -> Path:
-    """`path` itself, if it is a file with data in it or none; InputError for what is not there, a folder, a pipe, a device, a
-    loop of links, a name that cannot be, and a file of more than `most_bytes`, whose remedy is `smaller`."""
+    """Check that `path` is a regular file that can be read, and return it.
+
+    Parameters
+    ----------
+    path : Path
+        The file. It may be empty.
+    most_bytes : int, optional
+        Size limit; none by default.
+    remedy : str
+        What the message advises if the file cannot be used.
+    smaller : str
+        What the message advises if the file is too large.
+
+    Raises
+    ------
+    InputError
+        If the path does not exist, is a folder, a pipe, a device, a loop of links or an impossible name, or if the file is too
+        large.
+    """
     where = str(path)
     try:
         state = path.stat()
@@ -44,9 +61,23 @@ def check_file(
 
 
 def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str | None = None) -> str:
-    """The text of a file in UTF-8; raises InputError as `check_file` does, and for other encodings. most_bytes: none: as many
-    as MOST_TEXT_BYTES or the variable READ_LIMIT allow."""
-    most = max(MOST_TEXT_BYTES, int(raised_gb() * 1e9)) if most_bytes is None else most_bytes
+    """Read a UTF-8 text file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    most_bytes : int, optional
+        Size limit. By default the larger of MOST_TEXT_BYTES and the environment variable READ_LIMIT.
+    remedy, smaller : str
+        What the message advises, as in `check_file`.
+
+    Raises
+    ------
+    InputError
+        As `check_file` does, and if the file is not UTF-8.
+    """
+    most = max(MOST_TEXT_BYTES, int(read_limit_gb() * 1e9)) if most_bytes is None else most_bytes
     check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller one, or set the variable {READ_LIMIT}")
     try:
         return path.read_text(encoding="utf-8")
@@ -58,12 +89,12 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check
 
 
 def read_json(path: Path, *, remedy: str = "make it again") -> Any:
-    """The value that a JSON file holds.
+    """Read a JSON file.
 
-    Raises InputError as `read_text` does, where the file is not JSON, and before it is read where it may take more than
-    MOST_JSON_GB of memory, or than the variable READ_LIMIT says.
+    Raises InputError as `read_text` does, if the file is not JSON, and, before reading it, if its contents might take more
+    memory than MOST_JSON_GB or the environment variable READ_LIMIT allows.
     """
-    most = max(MOST_JSON_GB, raised_gb())
+    most = max(MOST_JSON_GB, read_limit_gb())
     size = check_file(path, remedy=remedy).stat().st_size
     try:
         needed = _json_gb(path, size, most)
@@ -81,8 +112,8 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
         raise InputError(f"is not JSON ({problem})", where=str(path), remedy=remedy) from None
 
 
-def raised_gb() -> float:
-    """What the variable READ_LIMIT says, 0 without it."""
+def read_limit_gb() -> float:
+    """Return the limit that the environment variable READ_LIMIT sets, in GB; 0 if it is not set."""
     given = os.environ.get(READ_LIMIT)
     if not given:
         return 0.0
@@ -96,11 +127,11 @@ def raised_gb() -> float:
 
 
 def _json_gb(path: Path, size: int, enough: float) -> float:
-    """What a JSON file of `size` bytes takes in memory at most, as bytes, text and values; from its first part where that alone
-    takes more than `enough`.
+    """Return an upper bound on the memory that a JSON file of `size` bytes takes as bytes, text and Python values, in GB.
 
-    In CPython 3.11 a value and its place take up to 72 bytes, a list 96 more, a mapping 190 more, a key that no other mapping has
-    100 more; a text with one letter beyond the first 256 takes up to four bytes a letter.
+    Counting stops, and the bound is extrapolated, as soon as the part read so far takes more than `enough`. In CPython 3.11 a
+    value and its reference take up to 72 bytes, a list 96 more, a mapping 190 more, and a key that no other mapping has 100
+    more. A text with a letter beyond the first 256 code points takes up to four bytes a letter.
     """
     values, letter, read = 0, 1, 0
     with path.open("rb") as file:
@@ -114,7 +145,9 @@ def _json_gb(path: Path, size: int, enough: float) -> float:
 
 
 def bounded_lines(file: IO[AnyStr], count: int, longest: int = 65_536) -> Iterator[AnyStr]:
-    """At most `count` lines of an open file; raises ValueError for a longer one, which would be taken into memory as a whole."""
+    """Yield at most `count` lines of an open file. Raises ValueError for a line longer than `longest`, which would fill the
+    memory.
+    """
     for _ in range(count):
         line = file.readline(longest)
         if len(line) == longest:

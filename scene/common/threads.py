@@ -1,4 +1,4 @@
-"""Work on several things at once, with the same results as on one after the other."""
+"""Run the same work on several items in threads, with the same results as one after the other."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ Result = TypeVar("Result")
 
 
 def executor(threads: int | None = None) -> ThreadPoolExecutor:
-    """As many threads as this process may use cores, or `threads`."""
+    """Make a thread pool with `threads` threads, or as many as the process may use cores."""
     return ThreadPoolExecutor(threads or len(os.sched_getaffinity(0)))
 
 
-def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """`work` of every item, in their order; for work that NumPy does without Python's lock, and that no other item touches."""
+def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """Return `work(item)` for every item, in order, computed in threads.
+
+    Useful for NumPy work that releases Python's global lock. The items must not share data that `work` changes.
+    """
     every = list(items)
-    if len(every) < 2:  # a pool would only cost the hand-over
+    if len(every) < 2:  # a pool would only add overhead
         return [work(item) for item in every]
     with executor() as pool:
         return [found.result() for found in [pool.submit(copy_context().run, work, item) for item in every]]

@@ -1,7 +1,7 @@
-"""YAML as config files and `--set` use it: the core schema of YAML 1.2, safe, duplicate keys refused.
+"""Parse and write YAML as config files and `--set` use it: the core schema of YAML 1.2, plain data only, no duplicate keys.
 
-PyYAML follows YAML 1.1, which reads 1e-3 as text, 1:30 as 90, 010 as 8 and a date as an object; in a config each of these is a
-silent mistake.
+PyYAML follows YAML 1.1, which reads 1e-3 as text, 1:30 as 90, 010 as 8 and a date as an object. In a config each of these
+would be a silent mistake.
 """
 
 from __future__ import annotations
@@ -27,36 +27,41 @@ _SCALARS = {
 
 
 _MOST_MERGED = 10_000
+"""Most keys in one mapping: with merge keys (`<<`) a few lines can ask for any number of them."""
 _LONGEST_NUMBER = 400
+"""Most digits of a whole number: converting a very long one takes long."""
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with the core schema's scalars."""
+    """PyYAML's SafeLoader with the scalars of YAML 1.2's core schema."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012  (PyYAML's own name)
 
     def integer(self, node: yaml.ScalarNode) -> int:
+        """Convert a whole number: decimal, octal (0o17) or hexadecimal (0x1f)."""
         text = self.construct_scalar(node)
         if len(text) > _LONGEST_NUMBER:
             raise _wrong(node, f"a number of {len(text):,} digits")
         return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
 
     def mapping(self, node: yaml.MappingNode) -> dict[Hashable, Any]:
+        """Convert a mapping. Raises YAMLError if a key stands in it twice."""
         seen: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise _wrong(key, f"the key '{key.value:.80}' stands there twice")
+                raise _wrong(key, f"the key '{key.value:.80}' is given twice")
             seen.add(str(key.value))
         return self.construct_mapping(node, deep=True)
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """As PyYAML does, which puts what `<<` names into the mapping: a few lines can ask for any number of keys."""
+        """Insert what `<<` refers to, as PyYAML does, up to a limit on the number of keys."""
         super().flatten_mapping(node)
         if len(node.value) > _MOST_MERGED:
             raise _wrong(node, f"more than {_MOST_MERGED:,} keys in one mapping")
 
 
 def _wrong(node: yaml.Node, problem: str) -> yaml.YAMLError:
+    """Make an error that names the place in the text."""
     return yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
 
 
@@ -67,16 +72,17 @@ _Loader.add_constructor(_MAP, _Loader.mapping)
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that quotes the texts which `_Loader` would read as something else."""
+    """PyYAML's SafeDumper, which quotes any text that `_Loader` would read as something other than text."""
 
     yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
 
     def ignore_aliases(self, data: object) -> bool:
+        """Write repeated values in full instead of as aliases."""
         return True
 
 
 def parse_yaml(text: str) -> Any:
-    """The value that `text` holds; raises yaml.YAMLError where it is malformed or asks for more than plain data."""
+    """Parse YAML text into plain data. Raises yaml.YAMLError if it is malformed or asks for other than plain data."""
     try:
         return yaml.load(text, Loader=_Loader)
     except RecursionError:
@@ -84,6 +90,6 @@ def parse_yaml(text: str) -> Any:
 
 
 def yaml_line(value: Any) -> str:
-    """Plain data as one line of YAML that `parse_yaml` reads back."""
+    """Write plain data as one line of YAML, which `parse_yaml` reads back."""
     text = yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=10**9, allow_unicode=True, sort_keys=False)
     return text.removesuffix("\n").removesuffix("\n...")

@@ -1,6 +1,7 @@
-"""Define the wall frame: XY is the wall's mean plane or another plane, z points towards the sensors, y up the wall.
+"""Define the wall frame, in which all difference maps are made.
 
-The origin lies at the lower corner.
+XY is the wall's mean plane or another plane, z points towards the sensors, y points up the wall, and the origin lies at the
+wall's lower corner.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _VERTICAL_LIMIT = 1e-3
-"""Below this sine between the wall's normal and the vertical there is no direction up the wall (a floor or a roof)."""
+"""Sine of the angle between the wall's normal and the vertical below which the surface counts as a floor or a roof, with no
+direction up the wall.
+"""
 
 
 class FrameConfig(Config):
-    """Which way the wall frame's z axis points: difference maps show the change along it."""
+    """The direction of the wall frame's z axis, along which difference maps measure change."""
 
     normal: Literal["mean_plane", "sensor"] | tuple[float, float, float] = Field(
         "mean_plane",
@@ -29,9 +32,19 @@ class FrameConfig(Config):
     )
 
     def fit(self, vertices: FloatArray, towards: FloatArray) -> WallFrame:
-        """Fit the frame to the vertices (n, 3) of a wall; towards: (3,) where the sensors stand; both world, m.
+        """Fit the wall frame to a wall.
 
-        Raises InputError where the vertices span no plane, and for a direction without length or away from the sensors.
+        Parameters
+        ----------
+        vertices : (n, 3) array
+            Vertices of the wall, world frame, m.
+        towards : (3,) array
+            Position of the sensors, world frame, m.
+
+        Raises
+        ------
+        InputError
+            If the vertices do not span a plane, or if the configured direction has no length or points away from the sensors.
         """
         if self.normal == "mean_plane":
             return WallFrame.fit(vertices, towards)
@@ -47,10 +60,17 @@ class FrameConfig(Config):
 
 @dataclass(frozen=True)
 class WallFrame:
-    """A rigid transform between the world (the survey's frame, m) and the wall frame: x_wall = R (x_world - origin).
+    """The rigid transform between the world frame (the survey's coordinates, m) and the wall frame: x_wall = R (x_world -
+    origin).
 
-    rotation: (3, 3), rows are the wall's axes in world coordinates; origin: (3,) of the wall frame, in world coordinates.
-    Subtracting the origin first keeps micrometres with UTM-sized coordinates.
+    The origin is subtracted first, so that micrometres survive with UTM-sized coordinates.
+
+    Attributes
+    ----------
+    rotation : (3, 3) array
+        Rows are the wall frame's axes in world coordinates.
+    origin : (3,) array
+        Origin of the wall frame in world coordinates, m.
     """
 
     rotation: FloatArray
@@ -58,10 +78,21 @@ class WallFrame:
 
     @classmethod
     def fit(cls, vertices: FloatArray, towards: FloatArray) -> WallFrame:
-        """Fit the mean plane by SVD to all vertices.
+        """Fit a frame whose z axis is the normal of the vertices' mean plane (least squares, by SVD).
 
-        vertices: (n, 3), world, m; towards: (3,) a point on the sensors' side of the wall, world, m.
-        The origin lies in the mean plane at the smallest x and y. Raises InputError where the vertices span no plane.
+        The origin lies in the mean plane at the smallest x and y of the vertices.
+
+        Parameters
+        ----------
+        vertices : (n, 3) array
+            World frame, m.
+        towards : (3,) array
+            A point on the sensors' side of the wall, world frame, m. It fixes the sign of the normal.
+
+        Raises
+        ------
+        InputError
+            If the vertices do not span a plane.
         """
         centre = vertices.mean(axis=0)
         local = vertices - centre
@@ -74,10 +105,18 @@ class WallFrame:
 
     @classmethod
     def along(cls, normal: FloatArray, vertices: FloatArray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> WallFrame:
-        """Make the frame whose z axis is `normal` and whose y axis points up the wall.
+        """Make the frame with a given z axis, whose y axis points up the wall.
 
-        normal: (3,) unit vector, world; vertices: (n, 3), world, m; up: the vertical. The origin lies in the plane through the
-        mean of the vertices, at their smallest x and y.
+        The origin lies in the plane through the mean of the vertices, at their smallest x and y.
+
+        Parameters
+        ----------
+        normal : (3,) array
+            Unit vector along z, world frame.
+        vertices : (n, 3) array
+            World frame, m.
+        up : tuple of 3 floats
+            The vertical, world frame.
         """
         centre = vertices.mean(axis=0)
         local = vertices - centre
@@ -91,24 +130,25 @@ class WallFrame:
 
     @classmethod
     def identity(cls) -> WallFrame:
+        """Return the frame that equals the world frame."""
         return cls(np.eye(3), np.zeros(3))
 
     @property
     def matrix(self) -> FloatArray:
-        """(4, 4) homogeneous transform, world to wall."""
+        """(4, 4) homogeneous matrix that transforms world coordinates to the wall frame."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.origin
         return matrix
 
     def to_wall(self, points: FloatArray) -> FloatArray:
-        """(..., 3) world to wall, m."""
+        """Transform points (..., 3) from the world to the wall frame, m."""
         return np.einsum("ij,...j->...i", self.rotation, points - self.origin)
 
     def to_world(self, points: FloatArray) -> FloatArray:
-        """(..., 3) wall to world, m."""
+        """Transform points (..., 3) from the wall to the world frame, m."""
         return np.einsum("ji,...j->...i", self.rotation, points) + self.origin
 
     def direction_to_wall(self, directions: FloatArray) -> FloatArray:
-        """(..., 3) directions, world to wall: rotated, not moved."""
+        """Rotate direction vectors (..., 3) from the world to the wall frame; the origin plays no role."""
         return np.einsum("ij,...j->...i", self.rotation, directions)

@@ -1,4 +1,4 @@
-"""A raster over the wall frame's XY plane."""
+"""Define the raster over the wall frame's XY plane."""
 
 from __future__ import annotations
 
@@ -11,10 +11,18 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class Grid:
-    """Square pixels, row 0 at the top (largest y), column 0 at the left (smallest x).
+    """A raster of square pixels, with row 0 at the top (largest y) and column 0 at the left (smallest x).
 
-    x_min, y_max: the outer corner of the top-left pixel, wall frame, m; gsd: the side of a pixel, m; width, height: pixels.
     The centre of pixel (row, column) is (x_min + (column + 0.5) gsd, y_max - (row + 0.5) gsd).
+
+    Attributes
+    ----------
+    x_min, y_max : float
+        Outer corner of the top-left pixel, wall frame, m.
+    gsd : float
+        Side of a pixel (ground sampling distance), m.
+    width, height : int
+        Size in pixels.
     """
 
     x_min: float
@@ -25,7 +33,7 @@ class Grid:
 
     @classmethod
     def over(cls, bounds: FloatArray, gsd: float) -> Grid:
-        """The grid of whole pixels inside `bounds` ((2, 2 or 3) smallest and largest coordinates, m)."""
+        """Make the grid of all whole pixels inside `bounds`, (2, 2 or 3) smallest and largest coordinates, m."""
         extent = bounds[1] - bounds[0]
         width, height = (max(int(np.floor(extent[axis] / gsd + 1e-9)), 1) for axis in (0, 1))
         return cls(float(bounds[0, 0]), float(bounds[1, 1]), gsd, width, height)
@@ -36,9 +44,9 @@ class Grid:
         return self.height, self.width
 
     def columns(self, x: FloatArray) -> FloatArray:
-        """Column of each x, m, in pixels from the left edge (a pixel's centre is at k + 0.5)."""
+        """Convert x, m, to columns in pixels from the left edge. The centre of pixel k is at k + 0.5."""
         return (x - self.x_min) / self.gsd
 
     def rows(self, y: FloatArray) -> FloatArray:
-        """Row of each y, m, in pixels from the top edge (a pixel's centre is at k + 0.5)."""
+        """Convert y, m, to rows in pixels from the top edge. The centre of pixel k is at k + 0.5."""
         return (self.y_max - y) / self.gsd

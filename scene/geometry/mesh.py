@@ -1,4 +1,4 @@
-"""The triangle mesh that walls, blocks and reconstructed surfaces share."""
+"""Define the triangle mesh that walls, blocks and reconstructed surfaces share, and functions of triangles."""
 
 from __future__ import annotations
 
@@ -12,28 +12,30 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 WALL = 0
-"""The block label of a face or a point that belongs to no block; blocks count from 1."""
+"""Block label of a face or point that belongs to no block. Labels of blocks count from 1."""
 
 DEFAULT_ALBEDO = 0.5
-"""Of rock whose albedo nobody gives."""
+"""Albedo of rock for which none is given."""
 
 _CHUNK = 1 << 18
-"""Faces worked on at a time, which bounds the memory of intermediates."""
+"""Number of faces processed at a time, to limit the memory of intermediate arrays."""
 
 
 def area_normals(corners: FloatArray) -> FloatArray:
-    """(n, 3) normals of triangles by their corners (n, 3, 3), twice as long as their areas."""
+    """Return the (n, 3) normals of triangles with corners (n, 3, 3). The length of a normal is twice the triangle's area."""
     return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def signed_volumes(corners: FloatArray) -> FloatArray:
-    """(n,) six times the volumes of the tetrahedra from the origin to triangles of corners (n, 3, 3); positive where its normal
-    points away from there."""
+    """Return six times the signed volumes (n,) of the tetrahedra from the origin to triangles with corners (n, 3, 3).
+
+    A volume is positive if the triangle's normal points away from the origin.
+    """
     return np.asarray(np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
 
 
 def barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:
-    """(n, 3) weights of the corners at points (n, 3) in triangles (n, 3 corners, 3)."""
+    """Return the barycentric weights (n, 3) of points (n, 3) in triangles with corners (n, 3, 3)."""
     one, other, within = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], point - corners[:, 0]
     a, b, c = (np.einsum("ni,ni->n", *pair) for pair in ((one, one), (one, other), (other, other)))
     d, e = (np.einsum("ni,ni->n", within, side) for side in (one, other))
@@ -42,8 +44,11 @@ def barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:
     return np.stack([1 - second - third, second, third], axis=1)
 
 
-def renumbered(faces: NDArray[np.integer]) -> tuple[NDArray[np.int64], IntArray]:
-    """(k,) the vertices that faces (m, 3) use, in rising order, and the faces by their places among these."""
+def compact_vertices(faces: NDArray[np.integer]) -> tuple[NDArray[np.int64], IntArray]:
+    """Find the vertices that faces use and renumber the faces accordingly.
+
+    Returns the used vertices (k,) in ascending order, and the faces (m, 3) as positions in that list.
+    """
     if not len(faces):
         return np.empty(0, dtype=np.int64), np.empty((0, 3), dtype=np.int32)
     low, high = int(faces.min()), int(faces.max())
@@ -56,10 +61,18 @@ def renumbered(faces: NDArray[np.integer]) -> tuple[NDArray[np.int64], IntArray]
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles with shared vertices, counter-clockwise seen from outside (from the sensors' side of a wall).
+    """Triangles with shared vertices, counter-clockwise seen from outside (for a wall: from the sensors' side).
 
-    vertices: (n, 3) float64, m; faces: (m, 3) int32, vertex indices; vertex_albedo: (n,) float32 in [0, 1];
-    vertex_block, face_block: (n,), (m,) int32, the block whose removal made this vertex or face, WALL (0) elsewhere.
+    Attributes
+    ----------
+    vertices : (n, 3) float64 array
+        Coordinates, m.
+    faces : (m, 3) int32 array
+        Vertex indices.
+    vertex_albedo : (n,) float32 array, optional
+        Albedo in [0, 1].
+    vertex_block, face_block : (n,) and (m,) int32 arrays, optional
+        The block whose removal created this vertex or face; WALL (0) elsewhere.
     """
 
     vertices: FloatArray
@@ -75,22 +88,24 @@ class TriangleMesh:
 
     @cached_property
     def edges(self) -> NDArray[np.int64]:
-        """(3 m,) a number per edge, the same for both directions: edges 01 of all triangles, then 12, then 20."""
+        """(3 m,) number of each triangle side, equal for both directions. Sides 0-1 of all triangles come first, then 1-2, then
+        2-0.
+        """
         start, stop = self.faces.T.ravel(), self.faces[:, [1, 2, 0]].T.ravel()
         return np.minimum(start, stop).astype(np.int64) * len(self.vertices) + np.maximum(start, stop)
 
     @cached_property
     def edge_order(self) -> NDArray[np.int64]:
-        """(3 m,) what sorts `edges`, those alike in their order."""
+        """(3 m,) indices that sort `edges`; equal ones keep their order."""
         return np.argsort(self.edges, kind="stable")
 
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
-        """The same triangles over moved vertices."""
+        """Return the same triangles with moved vertices."""
         return replace(self, vertices=vertices)
 
     def submesh(self, faces: NDArray[np.integer] | NDArray[np.bool_] | slice = slice(None)) -> TriangleMesh:
-        """Some of the faces, or all, on the vertices that they use."""
-        used, numbered = renumbered(self.faces[faces])
+        """Return a mesh of some of the faces, or all of them, with only the vertices that they use."""
+        used, numbered = compact_vertices(self.faces[faces])
         return TriangleMesh(
             self.vertices[used],
             numbered,
@@ -100,27 +115,29 @@ class TriangleMesh:
         )
 
     def corners(self, faces: NDArray[np.integer] | slice = slice(None)) -> FloatArray:
-        """(k, 3, 3) corners of some faces, or of all."""
+        """Return the corners (k, 3, 3) of some of the faces, or of all."""
         return self.vertices[self.faces[faces]]
 
     def face_normals(self, faces: NDArray[np.integer] | slice = slice(None)) -> FloatArray:
-        """(k, 3) unit normals of some faces, or of all; 0 for a face without an area."""
+        """Return the unit normals (k, 3) of some of the faces, or of all; zero for a face without area."""
         normal = area_normals(self.corners(faces))
         return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
     @cached_property
     def normals(self) -> FloatArray:
-        """(m, 3) `face_normals` of all faces, kept: for meshes of which many rays meet every face, again and again."""
+        """(m, 3) unit normals of all faces. They are cached for meshes that are hit by many rays repeatedly."""
         return self.face_normals()
 
     def vertex_normals(self) -> FloatArray:
-        """(n, 3) unit normals, outside: the sum of the adjacent faces' normals weighted by area; NaN for an unused vertex."""
+        """Compute outward unit normals (n, 3) as the area-weighted mean of the adjacent faces' normals; NaN for an unused
+        vertex.
+        """
         total = np.zeros((3, len(self.vertices)))
         for start in range(0, len(self.faces), _CHUNK):
             faces = self.faces[start : start + _CHUNK]
             first, second, third = (self.vertices[faces[:, corner]] for corner in range(3))
             area = np.repeat(np.cross(second - first, third - first).T, 3, axis=1)
-            low = int(faces.min())  # faces near one another in memory share vertices that are
+            low = int(faces.min())  # consecutive faces mostly use vertices with neighbouring numbers
             part = slice(low, int(faces.max()) + 1)
             for axis in range(3):
                 total[axis, part] += np.bincount(faces.ravel() - low, area[axis], part.stop - low)

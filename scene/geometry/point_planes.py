@@ -1,4 +1,8 @@
-"""Planes through neighbouring points: where triangles lean by the noise and the relief between their corners."""
+"""Fit planes through neighbouring points of a cloud.
+
+They give normals where triangles between the points would be tilted by noise and relief, and an estimate of the points' own
+noise.
+"""
 
 from __future__ import annotations
 
@@ -11,48 +15,63 @@ from scene.geometry.mesh import FloatArray
 
 _NEIGHBOURS = 24
 _AT_ONCE = 100_000
+"""Number of points processed at a time."""
 _LEAST_COSINE = 0.05
+"""Lower limit on the cosine of the incidence angle, which keeps distances along grazing rays finite."""
 _NEAR = 8
+"""Number of nearest neighbours in the inner plane of `estimate_point_noise`; the outer one has the other 16."""
 _SAMPLE = 10_000
+"""Number of points from which the noise is estimated."""
 _AS_WHITE = 1.2
-"""Times by which points may scatter more about what lies farther from them, for noise of their own to be most of it."""
+"""Largest ratio of outer to inner residuals for which independent noise counts as dominant."""
 
 
 @dataclass(frozen=True)
 class PointPlanes:
-    """Planes of least squares through each point's 24 nearest, itself among them.
+    """Least-squares planes through the 24 nearest neighbours of each point, the point itself included.
 
-    normal: (n, 3) unit, either way round; scatter_m: (n,) root mean square distance of the 24 from their plane; typical_m: median
-    of the scatter along the lines from the viewpoint; of_noise: whether it is noise of each point's own for the most part.
+    Attributes
+    ----------
+    normal : (n, 3) array
+        Unit normals, of either sign.
+    scatter_m : (n,) array
+        Root mean square distance of the 24 points from their plane, m.
+    median_scatter_m : float
+        Median of the scatter along the rays from the viewpoint, m.
+    noise_dominates : bool
+        Whether the scatter is mostly independent noise of each point rather than relief.
     """
 
     normal: FloatArray
     scatter_m: FloatArray
-    typical_m: float
-    of_noise: bool
+    median_scatter_m: float
+    noise_dominates: bool
 
     @classmethod
     def of(cls, points: FloatArray, viewpoint: FloatArray) -> PointPlanes:
-        """Of points (n, 3) seen from a place (3,), m: the least eigenvector of their scatter (Hoppe et al. 1992, Surface
-        reconstruction from unorganized points) and the root of its eigenvalue."""
+        """Fit the planes to points (n, 3), m, seen from `viewpoint` (3,), m.
+
+        The normal is the eigenvector of the neighbours' covariance with the smallest eigenvalue (Hoppe et al. 1992, Surface
+        reconstruction from unorganized points); the scatter is the square root of that eigenvalue.
+        """
         normal, scatter = _planes(points)
         ray = points - viewpoint
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        of_noise = own_noise(points, viewpoint) is not None
-        return cls(normal, scatter, float(np.median(_along(ray, normal, scatter))), of_noise)
+        noise_dominates = estimate_point_noise(points, viewpoint) is not None
+        return cls(normal, scatter, float(np.median(_along(ray, normal, scatter))), noise_dominates)
 
     def along(self, rays: FloatArray, point: NDArray[np.int32]) -> FloatArray:
-        """(n, k) scatter about the planes of some points (n, k) along unit rays (n, 3), m."""
+        """Return the scatter (n, k), m, about the planes of points `point` (n, k), measured along unit rays (n, 3)."""
         return _along(rays[:, None], self.normal[point], self.scatter_m[point])
 
 
-def normals_of(points: FloatArray) -> FloatArray:
-    """Estimate unit normals (n, 3), of either sign, of points (n, 3): of the plane through the 24 nearest of each."""
+def estimate_normals(points: FloatArray) -> FloatArray:
+    """Estimate unit normals (n, 3), of either sign, of points (n, 3) from the plane through the 24 nearest neighbours of each."""
     return _planes(points)[0]
 
 
 def _planes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit normals (n, 3) of the planes through each point's 24 nearest, and the (n,) scatter of the 24 about them, m."""
+    """Return the unit normals (n, 3) of the planes through each point's 24 nearest neighbours, and their scatter (n,), m."""
     from scipy.spatial import cKDTree
 
     tree, count = cKDTree(points), min(_NEIGHBOURS, len(points))
@@ -67,16 +86,16 @@ def _planes(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _along(rays: FloatArray, normal: FloatArray, scatter: FloatArray) -> FloatArray:
-    """(...) scatter (...) about planes with normals (..., 3) along unit rays (..., 3)."""
+    """Convert scatter (...) normal to planes with normals (..., 3) into scatter along unit rays (..., 3)."""
     return np.asarray(scatter / np.maximum(np.abs(np.einsum("...i,...i->...", normal, rays)), _LEAST_COSINE))
 
 
-def own_noise(points: FloatArray, viewpoint: FloatArray) -> float | None:
-    """Standard deviation, along the lines from a place (3,), of an error that each of the points (n, 3) has of its own, m; None
-    where relief is more than that.
+def estimate_point_noise(points: FloatArray, viewpoint: FloatArray) -> float | None:
+    """Estimate the standard deviation, m, of the independent noise of points (n, 3) along the rays from `viewpoint` (3,).
 
-    Of each of a sample: how far it lies from the plane through its 8 nearest, and from that through the 16 after those. Noise of
-    their own is the same in both but for that of the planes, relief grows with the distance.
+    A sample of points is compared with two planes: through the 8 nearest neighbours, and through the 16 after those.
+    Independent noise gives nearly the same residuals from both, while relief gives larger ones from the second. Returns None
+    if the second are too large for noise to dominate, or if there are too few points.
     """
     from scipy.spatial import cKDTree
 
@@ -93,7 +112,9 @@ def own_noise(points: FloatArray, viewpoint: FloatArray) -> float | None:
 
 
 def _off_plane(points: FloatArray, near: FloatArray, rays: FloatArray) -> float:
-    """Robust standard deviation of points (n, 3) along rays (n, 3) about the planes through others (n, k, 3)."""
+    """Return the robust standard deviation, m, of points (n, 3) along rays (n, 3) from planes fitted to their neighbours (n, k,
+    3).
+    """
     middle = near.mean(axis=1)
     within = near - middle[:, None]
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", within, within))[1][:, :, 0]

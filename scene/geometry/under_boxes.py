@@ -1,4 +1,6 @@
-"""Which faces of a wall lie under boxes: a raster of the boxes and its integral image answer for millions of faces."""
+"""Find the faces of a wall that lie under boxes. A raster of the boxes and its integral image make this fast for millions of
+faces.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +10,42 @@ from numpy.typing import NDArray
 from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh
 
 _MOST_CELLS = 4e6
+"""Largest number of raster cells."""
 _CELLS_PER_BOX = 8
-"""Cells along the shortest side of the smallest box, where the number of cells allows it."""
+"""Number of cells along the shortest side of the smallest box, if the largest number of cells allows it."""
 
 _CHUNK = 1 << 19
-"""Faces looked up at a time, which bounds the memory of the intermediates."""
+"""Number of faces looked up at a time, to limit the memory of intermediate arrays."""
 
 
-def faces_under(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0) -> IntArray:
-    """Indices, increasing, of all faces that lie under one of the boxes, and of a few beside them (to a raster cell).
+def faces_under_boxes(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0) -> IntArray:
+    """Find all faces that lie under one of the boxes, and a few beside them (within one raster cell).
 
-    boxes: (k, 2, 2 or 3) smallest and largest coordinates, m; halo_m: added around each box. A face lies under a box where
-    their projections on XY overlap, at whatever height.
+    A face lies under a box if their projections on XY overlap, at any height.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The wall, wall frame.
+    boxes : (k, 2, 2 or 3) array
+        Smallest and largest coordinates of each box, m.
+    halo_m : float
+        Margin added around each box, m.
+
+    Returns
+    -------
+    (f,) int32 array
+        Face indices, ascending.
     """
     low, high = boxes[:, 0, :2] - halo_m, boxes[:, 1, :2] + halo_m
     corner, extent = low.min(axis=0), high.max(axis=0) - low.min(axis=0)
     cell = max(float((high - low).min()) / _CELLS_PER_BOX, float(np.sqrt(extent.prod() / _MOST_CELLS)))
-    shape = (extent / cell).astype(np.int64) + 3  # a rim of free cells takes all that lies outside
+    shape = (extent / cell).astype(np.int64) + 3  # a rim of free cells stands for everything outside
     free = np.zeros(tuple(shape), dtype=np.int32)
     first, last = _cells(low, corner, cell, shape), _cells(high, corner, cell, shape)
     for (x0, y0), (x1, y1) in zip(first.tolist(), last.tolist(), strict=True):
         free[x0 : x1 + 1, y0 : y1 + 1] = 1
-    count = integral(free).ravel()
+    count = integral_image(free).ravel()
     width = int(shape[1]) + 1
     x_cell, y_cell = (_cells(mesh.vertices[:, axis], corner[axis], cell, shape[axis]) for axis in (0, 1))
     found = []
@@ -44,8 +60,8 @@ def faces_under(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0) -> I
     return np.concatenate(found) if found else np.empty(0, dtype=np.int32)
 
 
-def integral(raster: NDArray[np.generic]) -> IntArray:
-    """(h + 1, w + 1) integral image: entry (i, j) is the sum over the raster's rows below i and columns below j."""
+def integral_image(raster: NDArray[np.generic]) -> IntArray:
+    """Return the integral image (h + 1, w + 1) of a raster: entry (i, j) is the sum over rows below i and columns below j."""
     sums = np.zeros((raster.shape[0] + 1, raster.shape[1] + 1), dtype=np.int32)
     np.cumsum(raster, axis=0, dtype=np.int32, out=sums[1:, 1:])
     np.cumsum(sums[1:, 1:], axis=1, out=sums[1:, 1:])
@@ -53,9 +69,12 @@ def integral(raster: NDArray[np.generic]) -> IntArray:
 
 
 def _cells(positions: FloatArray, corner: FloatArray, cell: float, shape: NDArray[np.int64]) -> IntArray:
-    """Cell numbers along one or both axes; 0 and shape - 1 hold all that lies outside the boxes' common rectangle."""
+    """Return cell numbers along one or both axes. Numbers 0 and shape - 1 stand for everything outside the boxes' common
+    rectangle.
+    """
     return np.clip(np.floor((positions - corner) / cell) + 1, 0, shape - 1).astype(np.int32)
 
 
 def _span(a: IntArray, b: IntArray, c: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the smallest and the largest of three arrays, element by element."""
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)

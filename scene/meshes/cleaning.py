@@ -1,7 +1,7 @@
-"""Mend a triangle mesh: weld vertices, remove degenerate and doubled triangles, wind it one way, keep touching parts apart.
+"""Repair a triangle mesh so that it is manifold and consistently wound.
 
-The result is manifold. Every step returns the mended mesh and says in words what it did ("" for nothing).
-All steps are vectorised sorts and gathers.
+The steps are: weld vertices, remove degenerate and duplicate triangles, unify the winding, separate parts that only touch.
+Every step returns the repaired mesh and a description of what it did ("" for nothing). All steps are vectorised.
 """
 
 from __future__ import annotations
@@ -15,45 +15,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.common.errors import InputError
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray, TriangleMesh
 
-Mended = tuple[TriangleMesh, str]
+Repaired = tuple[TriangleMesh, str]
+"""A mesh after one repair, and the repair in words ("" if there was nothing to do)."""
 Index = NDArray[np.int64]
 
 WELD_M = 1e-6
-"""Vertices nearer to one another than this are one, m."""
+"""Vertices closer than this are welded, m."""
 _FLAT_M = 1e-9
-"""A triangle of a smaller height than this has no area, m."""
+"""A triangle with a smaller height than this counts as having no area, m."""
 _SMALLEST_AREA_M2 = 1e-6
-"""Area below which a report need not say where triangles were removed, m2."""
+"""Removed area below which the report does not say where it was, m2."""
 _FACES_AT_ONCE = 1 << 14
+"""Number of triangles processed at a time; their corners then stay in the processor's cache."""
 _DIRECTION = np.array([0.5377, 0.6349, 0.5548])
+"""An oblique direction along which vertices are sorted to find close ones."""
 
 
 def clean(mesh: TriangleMesh, where: str, origin: FloatArray | None = None) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Mend a mesh and say what was mended.
+    """Repair a mesh and report what was repaired.
 
     Parameters
     ----------
     mesh : TriangleMesh
-        In local coordinates, m, so that float64 has micrometres to spare.
+        In local coordinates near the origin, m, so that float64 resolves far less than a micrometre.
     where : str
-        What an error names, such as the file.
+        Name of the mesh in error messages, such as its file.
     origin : (3,) array, optional
-        Of the local coordinates in those that the user knows, m; only the report needs it.
+        Origin of the local coordinates in the user's coordinate system, m. Only the report uses it.
 
     Returns
     -------
     TriangleMesh, tuple of str
-        The mended mesh, and each repair in words with its count.
+        The repaired mesh, and each repair in words with its count.
 
     Raises
     ------
     InputError
-        Where no triangle with an area is left, or the surface has only one side.
+        If no triangle with an area is left, or the surface has only one side.
     """
-    steps: tuple[Callable[[TriangleMesh], Mended], ...] = (weld, drop_flat, partial(drop_doubled, origin=origin))
+    steps: tuple[Callable[[TriangleMesh], Repaired], ...] = (weld, drop_degenerate, partial(drop_duplicates, origin=origin))
     repairs = []
     for step in steps:
         mesh, words = step(mesh)
@@ -62,20 +65,22 @@ def clean(mesh: TriangleMesh, where: str, origin: FloatArray | None = None) -> t
             raise InputError(
                 "no triangle has an area: all vertices lie on lines or points", where=where, remedy="export the surface anew"
             )
-    mesh, words = rewind(mesh, where)
+    mesh, words = unify_winding(mesh, where)
     repairs.append(words)
-    for step in (part_fans, drop_unused):
+    for step in (separate_touching_parts, drop_unused):
         mesh, words = step(mesh)
         repairs.append(words)
-    return mesh, tuple(text for text in (*repairs, pieces(mesh)) if text)
+    return mesh, tuple(text for text in (*repairs, describe_pieces(mesh)) if text)
 
 
-def weld(mesh: TriangleMesh) -> Mended:
-    """Join vertices that are the same or within WELD_M of one another (chains of such vertices too); the first one stays."""
+def weld(mesh: TriangleMesh) -> Repaired:
+    """Merge vertices that lie within WELD_M of each other, directly or through a chain of such vertices. The first one is
+    kept.
+    """
     first, inverse = unique_rows(mesh.vertices + 0.0)  # + 0.0: minus zero is zero
     near = _near_pairs(mesh.vertices[first])
     if len(near):
-        group = groups(near, len(first))
+        group = connected_groups(near, len(first))
         first, inverse = first[np.unique(group, return_index=True)[1]], group[inverse]
     removed = len(mesh.vertices) - len(first)
     if not removed:
@@ -85,31 +90,32 @@ def weld(mesh: TriangleMesh) -> Mended:
     return welded, f"{removed} duplicate vertices welded"
 
 
-def drop_flat(mesh: TriangleMesh) -> Mended:
-    """Remove triangles without an area: two corners the same, or all three on one line."""
-    keep = _by_parts(mesh, _has_area, bool)
-    return _keep(mesh, keep, "degenerate triangles removed")
+def drop_degenerate(mesh: TriangleMesh) -> Repaired:
+    """Remove triangles without an area: two equal corners, or three corners on one line."""
+    keep = _in_chunks(mesh, _has_area, bool)
+    return _drop_faces(mesh, keep, "degenerate triangles removed")
 
 
-def drop_doubled(mesh: TriangleMesh, origin: FloatArray | None = None) -> Mended:
-    """Remove all but the first of the triangles over the same three vertices, whatever their winding."""
+def drop_duplicates(mesh: TriangleMesh, origin: FloatArray | None = None) -> Repaired:
+    """Remove all but the first of the triangles with the same three vertices, whatever their winding."""
     first, _ = unique_rows(np.sort(mesh.faces, axis=1))
     keep = np.zeros(len(mesh.faces), bool)
     keep[first] = True
-    return _keep(mesh, keep, "duplicate triangles removed", origin)
+    return _drop_faces(mesh, keep, "duplicate triangles removed", origin)
 
 
-def rewind(mesh: TriangleMesh, where: str) -> Mended:
-    """Flip the triangles wound against the larger part of their piece of surface."""
-    odd = wound_otherwise(mesh, where)
-    return (flipped(mesh, odd), f"{int(odd.sum())} triangles wound the other way round") if odd.any() else (mesh, "")
+def unify_winding(mesh: TriangleMesh, where: str) -> Repaired:
+    """Flip the triangles that are wound opposite to the majority of their connected piece."""
+    odd = inconsistent_faces(mesh, where)
+    return (flip_faces(mesh, odd), f"{int(odd.sum())} triangles wound the other way round") if odd.any() else (mesh, "")
 
 
-def wound_otherwise(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
-    """(m,) the triangles wound against the larger part of their piece of surface; vertices must be welded.
+def inconsistent_faces(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
+    """Find the triangles (m,) that are wound opposite to the majority of their connected piece. Vertices must be welded.
 
-    Each triangle stands twice in a graph, as it is and flipped; neighbours are joined so that the windings agree. A piece
-    whose two copies are connected has only one side. Triangles are no neighbours over an edge that more than two share.
+    Each triangle is represented twice in a graph, as it is and flipped; neighbours are joined so that their windings agree. A
+    piece whose two copies are connected has only one side, which raises InputError. Triangles are not neighbours across an
+    edge that more than two of them share.
     """
     count = len(mesh.faces)
     pair, same = _neighbours(mesh)
@@ -117,7 +123,7 @@ def wound_otherwise(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
         return np.zeros(count, bool)
     flip, none = same * count, np.zeros(len(same), np.int64)
     links = np.concatenate([pair + np.stack([none, flip], axis=1), pair + np.stack([none + count, count - flip], axis=1)])
-    label = groups(links, 2 * count)
+    label = connected_groups(links, 2 * count)
     if np.any(label[:count] == label[count:]):
         raise InputError("the surface has only one side (a Moebius strip), so it has no outside", where=where)
     size = np.bincount(label[:count], minlength=label.max() + 1)
@@ -126,11 +132,11 @@ def wound_otherwise(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
     return minor | tie
 
 
-def part_fans(mesh: TriangleMesh) -> Mended:
-    """Give each part of the surface a vertex of its own where parts touch in a vertex or along an edge.
+def separate_touching_parts(mesh: TriangleMesh) -> Repaired:
+    """Give parts of the surface that touch in a vertex or along an edge vertices of their own.
 
-    No triangle is removed: parts that touch, such as a rock on the ground, stay where they are and are no longer connected.
-    Triangles are connected over an edge that exactly two of them share. The mesh must be consistently wound.
+    No triangle is removed. Parts that touch, such as a rock on the ground, keep their positions but are no longer connected.
+    Triangles are connected across an edge that exactly two of them share. The mesh must be consistently wound.
     """
     pinched = _pinched(mesh)
     if not pinched.any():
@@ -138,9 +144,9 @@ def part_fans(mesh: TriangleMesh) -> Mended:
     near = np.flatnonzero(pinched[mesh.faces].any(axis=1))
     patch = replace(mesh, faces=mesh.faces[near])
     corners, count = patch.faces.T.ravel(), len(near)
-    one, other = _twins(patch)  # wound alike, so that one leaves where the other arrives
+    one, other = _shared_edges(patch)  # consistent winding: the two run in opposite directions
     links = np.concatenate([np.stack([one, (other + count) % (3 * count)], 1), np.stack([(one + count) % (3 * count), other], 1)])
-    fan = groups(links, 3 * count)
+    fan = connected_groups(links, 3 * count)
     first, size = np.unique(fan, return_index=True, return_counts=True)[1:]
     centre = corners[first]
     ranked = np.lexsort((-size, centre))
@@ -157,64 +163,66 @@ def part_fans(mesh: TriangleMesh) -> Mended:
     return parted, f"parts of the surface that touch kept apart at {int(pinched.sum())} vertices"
 
 
-def drop_unused(mesh: TriangleMesh) -> Mended:
+def drop_unused(mesh: TriangleMesh) -> Repaired:
     """Remove the vertices that no triangle uses."""
     kept = mesh.submesh()
     unused = len(mesh.vertices) - len(kept.vertices)
     return (kept, f"{unused} unused vertices removed") if unused else (mesh, "")
 
 
-def pieces(mesh: TriangleMesh) -> str:
-    """What a report should say about pieces that are not connected to the main one; "" if there is one."""
-    label = groups(mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
+def describe_pieces(mesh: TriangleMesh) -> str:
+    """Describe the pieces that are not connected to the main surface; "" if there are none."""
+    label = connected_groups(mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
     sizes = np.sort(np.bincount(label[mesh.faces[:, 0]]))
     if len(sizes) == 1:
         return ""
     return f"kept {len(sizes) - 1} pieces apart from the main surface, of {sizes[0]} to {sizes[-2]} triangles"
 
 
-def flipped(mesh: TriangleMesh, which: NDArray[np.bool_]) -> TriangleMesh:
-    """The mesh with the triangles `which` wound the other way round."""
+def flip_faces(mesh: TriangleMesh, which: NDArray[np.bool_]) -> TriangleMesh:
+    """Return the mesh with the winding of the triangles `which` reversed."""
     return replace(mesh, faces=np.where(which[:, None], mesh.faces[:, ::-1], mesh.faces))
 
 
-def areas(mesh: TriangleMesh) -> FloatArray:
-    """(m,) areas of the triangles, m2."""
-    return _by_parts(mesh, _areas, float)
+def triangle_areas(mesh: TriangleMesh) -> FloatArray:
+    """Return the areas (m,) of the triangles, m2."""
+    return _in_chunks(mesh, _areas, float)
 
 
-def _by_parts(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]], kind: type) -> NDArray[Any]:
-    """(m,) `evaluate` of the (k, 3, 3) corners of the triangles, some at a time, which stay in the cache."""
+def _in_chunks(mesh: TriangleMesh, evaluate: Callable[[FloatArray], NDArray[Any]], kind: type) -> NDArray[Any]:
+    """Apply `evaluate` to the corners (k, 3, 3) of some triangles at a time, and return the results (m,) of type `kind`."""
     result: NDArray[Any] = np.empty(len(mesh.faces), kind)
 
     def fill(start: int) -> None:
         part = slice(start, start + _FACES_AT_ONCE)
         result[part] = evaluate(mesh.vertices[mesh.faces[part]])
 
-    side_by_side(fill, range(0, len(result), _FACES_AT_ONCE))
+    map_in_threads(fill, range(0, len(result), _FACES_AT_ONCE))
     return result
 
 
 def _areas(corners: FloatArray) -> FloatArray:
-    """(k,) areas of the triangles, m2."""
+    """Return the areas (k,) of triangles by their corners, m2."""
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.sqrt(_squared(np.cross(first, second))) / 2
 
 
 def _has_area(corners: FloatArray) -> NDArray[np.bool_]:
+    """Return whether each triangle's smallest height exceeds _FLAT_M."""
     sides = (_squared(corners[:, start] - corners[:, end]) for start, end in ((0, 1), (1, 2), (2, 0)))
     return 2 * _areas(corners) > _FLAT_M * np.sqrt(reduce(np.maximum, sides))
 
 
 def _squared(vectors: FloatArray) -> FloatArray:
-    """(k,) squared lengths of (k, 3) vectors."""
+    """Return the squared lengths (k,) of vectors (k, 3)."""
     return np.einsum("ki,ki->k", vectors, vectors)
 
 
 def unique_rows(rows: NDArray[np.generic]) -> tuple[Index, Index]:
-    """Index of the first of each group of equal rows, in order of appearance, and the group of every row.
+    """Find groups of equal rows (n, 3).
 
-    rows: (n, 3). They are sorted by a 64-bit hash; should two different ones share a hash, they are sorted in full.
+    Returns the index of the first row of each group, in order of appearance, and the group of every row. Rows are sorted by a
+    64-bit hash; should two different rows share a hash, they are sorted in full.
     """
     key = np.zeros(len(rows), np.uint64)
     for column in rows.T.astype(f"{rows.dtype.kind}8"):
@@ -232,7 +240,7 @@ def unique_rows(rows: NDArray[np.generic]) -> tuple[Index, Index]:
 
 
 def _near_pairs(vertices: FloatArray) -> Index:
-    """(k, 2) pairs of vertices within WELD_M, found as neighbours along one skew direction."""
+    """Return the pairs (k, 2) of vertices within WELD_M of each other. Candidates are neighbours along one oblique direction."""
     along = np.einsum("ni,i->n", vertices, _DIRECTION)
     order = np.argsort(along, kind="stable")
     along = along[order]
@@ -249,11 +257,12 @@ def _near_pairs(vertices: FloatArray) -> Index:
     return np.concatenate(found)
 
 
-def groups(pairs: NDArray[np.integer], count: int) -> Index:
-    """(count,) number of the connected group of each element, in order of first appearance.
+def connected_groups(pairs: NDArray[np.integer], count: int) -> Index:
+    """Return the connected group (count,) of each element, given linked pairs (k, 2); groups are numbered by first appearance.
 
-    Every element points to the smallest of its group known so far. A round hooks the groups that a pair joins to the smaller
-    one, then follows the pointers to their ends (Shiloach and Vishkin 1982). SciPy takes as long, and its import longer still.
+    Every element points to the smallest member of its group known so far. A round links the groups that a pair joins to the
+    smaller one, then follows the pointers to their ends (Shiloach and Vishkin 1982). SciPy's version takes as long, and its
+    import takes longer.
     """
     smallest = np.arange(count)
     start, end = pairs.T
@@ -267,8 +276,8 @@ def groups(pairs: NDArray[np.integer], count: int) -> Index:
     return (np.cumsum(smallest == np.arange(count)) - 1)[smallest]
 
 
-def _twins(mesh: TriangleMesh) -> tuple[Index, Index]:
-    """The two places of each edge that stands twice, and no oftener, in `mesh.edges`."""
+def _shared_edges(mesh: TriangleMesh) -> tuple[Index, Index]:
+    """Return the two positions in `mesh.edges` of each edge that exactly two triangles share."""
     order, ordered = mesh.edge_order, mesh.edges[mesh.edge_order]
     again = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])
     twin = np.flatnonzero(again[1:-1] & ~again[:-2] & ~again[2:])
@@ -276,22 +285,26 @@ def _twins(mesh: TriangleMesh) -> tuple[Index, Index]:
 
 
 def _neighbours(mesh: TriangleMesh) -> tuple[Index, NDArray[np.bool_]]:
-    """(k, 2) triangles that share an edge, and whether both run along it in the same direction (a winding that disagrees)."""
+    """Return pairs (k, 2) of triangles that share an edge, and whether both run along it in the same direction (inconsistent
+    winding).
+    """
     start = mesh.faces.T.ravel()
-    one, other = _twins(mesh)
+    one, other = _shared_edges(mesh)
     return np.stack([one, other], axis=1) % len(mesh.faces), start[one] == start[other]
 
 
 def _pinched(mesh: TriangleMesh) -> NDArray[np.bool_]:
-    """(n,) vertices whose triangles are not one fan: a walk about the vertex, edge by edge, does not meet them all."""
+    """Find the vertices (n,) whose triangles do not form one fan: walking around the vertex, edge by edge, misses some of
+    them.
+    """
     count, corners = len(mesh.faces), mesh.faces.T.ravel()  # half-edge k m + f leaves corner k of triangle f
-    one, other = _twins(mesh)
+    one, other = _shared_edges(mesh)
     twin = np.full(3 * count, -1)
     twin[one], twin[other] = other, one
     rim = np.flatnonzero(twin < 0)
     start = np.full(len(mesh.vertices), -1)
     start[corners] = np.arange(3 * count)
-    start[corners[rim]] = rim  # an open fan is walked from its rim
+    start[corners[rim]] = rim  # the walk around an open fan starts at its rim
     unmet = np.bincount(corners, minlength=len(mesh.vertices))
     vertex = np.flatnonzero(start >= 0)
     edge = start[vertex]
@@ -303,16 +316,17 @@ def _pinched(mesh: TriangleMesh) -> NDArray[np.bool_]:
     return unmet > 0
 
 
-def _keep(mesh: TriangleMesh, keep: NDArray[np.bool_], words: str, origin: FloatArray | None = None) -> Mended:
+def _drop_faces(mesh: TriangleMesh, keep: NDArray[np.bool_], words: str, origin: FloatArray | None = None) -> Repaired:
+    """Keep some of the faces, and describe the removed ones."""
     if keep.all():
         return mesh, ""
-    return replace(mesh, faces=mesh.faces[keep]), f"{int(np.sum(~keep))} {words}{_place(mesh, ~keep, origin)}"
+    return replace(mesh, faces=mesh.faces[keep]), f"{int(np.sum(~keep))} {words}{_describe_removed(mesh, ~keep, origin)}"
 
 
-def _place(mesh: TriangleMesh, removed: NDArray[np.bool_], origin: FloatArray | None) -> str:
-    """How large the removed triangles are and where the first of them lies, for a report; "" where they have no area."""
+def _describe_removed(mesh: TriangleMesh, removed: NDArray[np.bool_], origin: FloatArray | None) -> str:
+    """Describe how large the removed triangles are and where the first of them lies; "" if they have no area."""
     lost = replace(mesh, faces=mesh.faces[removed])
-    if (area := float(areas(lost).sum())) < _SMALLEST_AREA_M2:
+    if (area := float(triangle_areas(lost).sum())) < _SMALLEST_AREA_M2:
         return ""
     x, y, z = lost.corners()[0].mean(axis=0) + (0.0 if origin is None else origin)
     return f" ({area:.3g} m2, the first at {x:.2f}, {y:.2f}, {z:.2f})"

@@ -1,4 +1,4 @@
-"""Read what trimesh's OBJ reader leaves out: indices that count backwards, concave polygons, and a unit named in a comment."""
+"""Preprocess OBJ files for what trimesh's reader does not handle: negative indices, concave polygons, and a unit in a comment."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from scene.geometry.mesh import FloatArray
-from scene.meshes.polygons import fan_fills, triangulated
+from scene.meshes.polygons import fan_is_valid, triangulate_polygons
 
 _OTHER_FACE = re.compile(rb"^[ \t]*f[ \t](?:[^\r\n]*-\d|[ \t]*(?:[^ \t\r\n]+[ \t]+){3}[^ \t\r\n])", re.MULTILINE)
-"""A face that counts backwards or has more than three corners."""
+"""A face with a negative index or with more than three corners."""
 _UNIT_IN_COMMENT = re.compile(
     rb"^[ \t]*#[^\r\n]*?\bunits?\b[ \t:=]*(?:(?P<count>\d+(?:\.\d*)?)[ \t]*)?(?P<unit>[a-z-]+)\b", re.MULTILINE | re.IGNORECASE
 )
@@ -22,19 +22,20 @@ _UNITS = {
     "ft": "ft", "foot": "ft", "feet": "ft",
 }  # fmt: skip
 _HEAD_BYTES = 4096
-"""Comments on the unit stand at the beginning of a file."""
+"""Length of the beginning of a file in which a comment on the unit is expected."""
 
 
-def is_plain(text: bytes) -> bool:
-    """Say whether all faces are triangles whose indices count forwards, which trimesh reads as they are meant."""
+def has_plain_faces(text: bytes) -> bool:
+    """Return whether all faces are triangles with positive indices, which trimesh reads correctly."""
     return _OTHER_FACE.search(text) is None
 
 
-def made_plain(text: bytes) -> bytes:
-    """Replace negative indices by positive ones, and polygons that a fan of triangles would not fill by triangles.
+def with_plain_faces(text: bytes) -> bytes:
+    """Replace negative indices by positive ones, and concave polygons by triangles.
 
-    An index of -1 names the vertex that stands last before the face, not the last one of the file (Wavefront, "Object Files",
-    section on referencing vertices). Texture coordinates and normals are counted in the same way, each by themselves.
+    An index of -1 refers to the last vertex before the face, not to the last one of the file (Wavefront, "Object Files",
+    section on referencing vertices). Texture coordinates and normals are counted separately in the same way. Only polygons
+    that a fan of triangles would not fill are divided.
     """
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
     vertices: list[list[bytes]] = []
@@ -59,28 +60,33 @@ def made_plain(text: bytes) -> bytes:
 
 
 def _divided(vertices: FloatArray, faces: Mapping[int, Sequence[bytes]]) -> dict[int, list[list[bytes]]]:
-    """Return the triangles of those polygons that a fan would not fill, by line; corners as in the file, v/vt/vn."""
+    """Divide the polygons that a fan would not fill. Returns their triangles by line number, with corners as in the file
+    (v/vt/vn).
+    """
     divided = {}
     for count in {len(corners) for corners in faces.values()}:
         places = [place for place, corners in faces.items() if len(corners) == count]
         polygons = np.array([[int(corner.split(b"/")[0]) - 1 for corner in faces[place]] for place in places])
-        for row in np.flatnonzero(~fan_fills(vertices, polygons)):
+        for row in np.flatnonzero(~fan_is_valid(vertices, polygons)):
             number = dict(zip(polygons[row], faces[places[row]], strict=True))
-            triangles = triangulated(vertices, polygons[row : row + 1])
+            triangles = triangulate_polygons(vertices, polygons[row : row + 1])
             divided[places[row]] = [[number[vertex] for vertex in triangle] for triangle in triangles]
     return divided
 
 
 def _absolute(corner: bytes, counts: tuple[int, ...]) -> bytes:
-    """Return one corner of a face, as v/vt/vn, with positive indices; `counts`: how many of each stand before it."""
+    """Convert one corner of a face (v/vt/vn) to positive indices. counts: how many vertices, texture coordinates and normals
+    precede it.
+    """
     indices = zip(corner.split(b"/"), counts, strict=False)
     return b"/".join(b"%d" % (count + 1 + int(index)) if index.startswith(b"-") else index for index, count in indices)
 
 
-def stated_unit(text: bytes) -> tuple[str, str] | None:
-    """Return the unit that a comment at the beginning names, a key of `METRES`, and the comment; None where none does.
+def unit_in_comments(text: bytes) -> tuple[str, str] | None:
+    """Find the unit of length that a comment at the beginning of the file states.
 
-    Comments of the kinds "# units: mm" and "# ..., where 1 unit = 1.000000 mm" are understood; a count other than 1 is not.
+    Comments such as "# units: mm" and "# ..., where 1 unit = 1.000000 mm" are understood; a count other than 1 is not. Returns
+    the unit (a key of `METRES`) and the comment, or None.
     """
     for found in _UNIT_IN_COMMENT.finditer(text[:_HEAD_BYTES]):
         unit = _UNITS.get(found["unit"].decode().lower())

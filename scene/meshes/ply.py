@@ -1,4 +1,4 @@
-"""The elements and properties of PLY files, binary and ASCII, as arrays."""
+"""Read the elements and properties of PLY files, binary and ASCII, as arrays."""
 
 from __future__ import annotations
 
@@ -28,7 +28,17 @@ Columns = Mapping[str, NDArray[Any]]
 
 @dataclass
 class _Element:
-    """One element of a header. properties: name to (type of the value, type of the list's count or "")."""
+    """One element of a PLY header.
+
+    Attributes
+    ----------
+    name : str
+        Such as "vertex" or "face".
+    count : int
+        Number of records.
+    properties : dict
+        Name to (type of the value, type of the list's length or "").
+    """
 
     name: str
     count: int
@@ -36,9 +46,24 @@ class _Element:
 
 
 def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
-    """The elements of a file, up to the one called `only`: their properties by name, (n,) or, for lists of one length k, (n, k).
+    """Read the elements of a PLY file.
 
-    Raises InputError for a missing or damaged file and for lists of different lengths.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    only : str
+        Stop after the element of this name; "" reads all.
+
+    Returns
+    -------
+    dict
+        For each element, its properties by name: arrays (n,), or (n, k) for lists of length k.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or contains lists of different lengths.
     """
     check_file(path)
     try:
@@ -51,24 +76,25 @@ def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
             return found
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
-    except InputError as error:  # of a row of numbers
+    except InputError as error:  # raised by read_rows, which does not know the path
         raise InputError(error.what, where=f"{path}, {error.where}", allowed=error.allowed, remedy=error.remedy) from None
     except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise InputError(f"is not a whole PLY file ({error})", where=str(path), remedy="export it again") from None
 
 
 def header_remarks(path: Path) -> list[str]:
-    """The comments in a file's header, of a file that `read_elements` has read."""
+    """Return the comments in the header of a file that `read_elements` has read."""
     with path.open("rb") as file:
         return [" ".join(words[1:]) for words in _header_lines(file) if words[:1] in (["comment"], ["obj_info"])]
 
 
 def _last(elements: list[_Element], only: str) -> int:
+    """Return how many elements to read so that the one called `only` is the last; all if there is none."""
     return next((index + 1 for index, element in enumerate(elements) if element.name == only), len(elements))
 
 
 def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
-    """Byte order ("" for ASCII) and elements; leaves the file at the first byte of the data."""
+    """Read the byte order ("" for ASCII) and the elements. The file is left at the first byte of the data."""
     elements: list[_Element] = []
     order = None
     for words in _header_lines(file):
@@ -91,6 +117,7 @@ def _header(file: BinaryIO) -> tuple[str, list[_Element]]:
 
 
 def _header_lines(file: BinaryIO) -> Iterator[list[str]]:
+    """Yield the words of each header line. Raises ValueError if this is not a PLY header."""
     if file.readline(16).removeprefix(codecs.BOM_UTF8).strip() != b"ply":
         raise ValueError("it does not begin with 'ply'")
     while (line := file.readline(_LONGEST_HEADER)).strip() != b"end_header":
@@ -100,7 +127,9 @@ def _header_lines(file: BinaryIO) -> Iterator[list[str]]:
 
 
 def _columns(file: BinaryIO, element: _Element, order: str) -> Columns:
-    """Read one element, views of one array of records; lists must have one length throughout. Leaves the file after it."""
+    """Read one element as views of one array of records, and leave the file after it. Raises ValueError for lists of different
+    lengths.
+    """
     if not element.count or not element.properties:
         return {name: np.empty((0, 3) if counter else 0, kind) for name, (kind, counter) in element.properties.items()}
     rows = _binary_rows(file, element, order) if order else _ascii_rows(file, element)
@@ -111,6 +140,7 @@ def _columns(file: BinaryIO, element: _Element, order: str) -> Columns:
 
 
 def _binary_rows(file: BinaryIO, element: _Element, order: str) -> NDArray[Any]:
+    """Read the records of one element of a binary file."""
     record = np.dtype(_fields(element, order, _binary_lengths(file, element, order)))
     left = _size(file) - file.tell()
     if element.count * record.itemsize > left:
@@ -119,7 +149,7 @@ def _binary_rows(file: BinaryIO, element: _Element, order: str) -> NDArray[Any]:
 
 
 def _binary_lengths(file: BinaryIO, element: _Element, order: str) -> dict[str, int]:
-    """Length of each list in the first record; the file stays where it is."""
+    """Return the length of each list in the first record. The file position does not change."""
     start, lengths = file.tell(), {}
     for name, (kind, counter) in element.properties.items():
         if counter:
@@ -130,6 +160,7 @@ def _binary_lengths(file: BinaryIO, element: _Element, order: str) -> dict[str, 
 
 
 def _fields(element: _Element, order: str, lengths: Mapping[str, int]) -> list[Any]:
+    """Return the fields of the NumPy record type of an element."""
     fields: list[Any] = []
     for name, (kind, counter) in element.properties.items():
         if counter:
@@ -140,10 +171,11 @@ def _fields(element: _Element, order: str, lengths: Mapping[str, int]) -> list[A
 
 
 def _ascii_rows(file: BinaryIO, element: _Element) -> NDArray[Any]:
+    """Read the records of one element of an ASCII file."""
     start = file.tell()
     try:
         table = np.loadtxt(bounded_lines(file, element.count), ndmin=2, comments=None, encoding="ascii")
-    except ValueError:  # its words are about NumPy, not about the file
+    except ValueError:  # NumPy's message does not say which line is wrong
         file.seek(start)
         table = _rows_by_line(file, element)
     if len(table) < element.count:
@@ -158,14 +190,14 @@ def _ascii_rows(file: BinaryIO, element: _Element) -> NDArray[Any]:
 
 
 def _rows_by_line(file: BinaryIO, element: _Element) -> NDArray[np.float64]:
-    """The same line by line, which says where it is wrong: the line counts from the first one of the element."""
+    """Read the rows line by line, with errors that name the line, counted from the element's first."""
     lines = [line.decode("ascii", errors="replace") for line in bounded_lines(file, element.count)]
     width = len(split_row(lines[0], None)) if lines else 0
     return read_rows(lines, RowForm(columns=width), f"the {element.name} lines")[0]
 
 
 def _check_end(file: BinaryIO, elements: list[_Element], order: str) -> None:
-    """Raise ValueError where more stands behind the last element than its count says."""
+    """Raise ValueError if more data follow the last element than its count states."""
     last = elements[-1] if elements else None
     if last is None:
         return
@@ -181,7 +213,7 @@ def _check_end(file: BinaryIO, elements: list[_Element], order: str) -> None:
 
 
 def _filled(rows: NDArray[Any], table: NDArray[np.float64]) -> NDArray[Any]:
-    """Fill records field by field from the columns of an ASCII table; raises ValueError where there are too few or too many."""
+    """Fill records field by field from the columns of an ASCII table. Raises ValueError if it has too few or too many columns."""
     column = 0
     for name in rows.dtype.names or ():
         width = rows[name].shape[1] if rows[name].ndim == 2 else 1
@@ -193,6 +225,7 @@ def _filled(rows: NDArray[Any], table: NDArray[np.float64]) -> NDArray[Any]:
 
 
 def _size(file: BinaryIO) -> int:
+    """Return the size of an open file; its position does not change."""
     here = file.tell()
     size = file.seek(0, 2)
     file.seek(here)

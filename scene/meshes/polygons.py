@@ -1,4 +1,4 @@
-"""Divide polygons of more than three corners into triangles."""
+"""Divide polygons with more than three corners into triangles."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from scene.geometry.mesh import FloatArray, IntArray
 
 
-def triangulated(vertices: FloatArray, polygons: NDArray[np.integer]) -> IntArray:
-    """Divide polygons of equal numbers of corners into triangles, in the order of the polygons.
+def triangulate_polygons(vertices: FloatArray, polygons: NDArray[np.integer]) -> IntArray:
+    """Divide polygons with equal numbers of corners into triangles, in the order of the polygons.
 
-    A polygon is divided as a fan about its first corner if that keeps all triangles on one side, else by ear clipping in its mean
-    plane.
+    A polygon is divided into a fan about its first corner if all triangles of the fan face the same side, else by ear clipping
+    in its mean plane.
 
     Parameters
     ----------
@@ -25,24 +25,25 @@ def triangulated(vertices: FloatArray, polygons: NDArray[np.integer]) -> IntArra
     Returns
     -------
     (p (k - 2), 3) array of int
+        Vertices of the triangles.
     """
     corners = polygons.shape[1]
     fan = np.stack([np.zeros(corners - 2, int), np.arange(1, corners - 1), np.arange(2, corners)], axis=1)
     triangles = polygons[:, fan]
-    for place in np.flatnonzero(~fan_fills(vertices, polygons)):
+    for place in np.flatnonzero(~fan_is_valid(vertices, polygons)):
         triangles[place] = polygons[place][_ear_clipped(vertices[polygons[place]])]
     return np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.int32)
 
 
-def fan_fills(vertices: FloatArray, polygons: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Say of each polygon, (p,), whether the triangles of a fan about its first corner all face the polygon's own side."""
+def fan_is_valid(vertices: FloatArray, polygons: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return, for each polygon (p,), whether all triangles of a fan about its first corner face the polygon's own side."""
     spokes = vertices[polygons[:, 1:]] - vertices[polygons[:, :1]]
     normals = np.cross(spokes[:, :-1], spokes[:, 1:])
     return np.asarray(np.all(np.einsum("ptj,pj->pt", normals, normals.sum(axis=1)) >= 0.0, axis=1))
 
 
 def _ear_clipped(corners: FloatArray) -> IntArray:
-    """(k - 2, 3) corners of the triangles of one polygon, (k, 3), which Manifold divides in the plane of its mean normal."""
+    """Triangulate one polygon with corners (k, 3) in the plane of its mean normal. Returns corner numbers (k - 2, 3)."""
     spokes = corners - corners[0]
     normal = np.cross(spokes[1:-1], spokes[2:]).sum(axis=0)
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])

@@ -1,4 +1,4 @@
-"""Which side of a surface is its outside: that which the sensors see."""
+"""Orient a surface so that its outer side is the one that the sensors see, and check that sensors and surface belong together."""
 
 from __future__ import annotations
 
@@ -9,40 +9,66 @@ from numpy.typing import NDArray
 
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh, signed_volumes
-from scene.meshes.cleaning import Mended, flipped, groups, weld, wound_otherwise
+from scene.meshes.cleaning import Repaired, connected_groups, flip_faces, inconsistent_faces, weld
 from scene.ray_casting.raycast import RayCaster
 
 _FARTHEST_M = 1e5
-"""No sensor for rock walls looks farther."""
+"""No sensor for rock walls measures farther than this."""
 _GEOCENTRIC_M = 6.3e6, 6.5e6
-"""How far from the earth's centre sensors on its surface stand."""
+"""Smallest and largest distance of sensors on the earth's surface from its centre."""
 
 
-def facing(mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, cleaned: bool = False) -> Mended:
-    """The mesh wound one way in each connected piece, and counter-clockwise seen from the sensors; and what was turned, in words.
+def orient_to_sensors(mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, cleaned: bool = False) -> Repaired:
+    """Wind each connected piece of a mesh consistently, and counter-clockwise as seen from the sensors.
 
-    viewpoints: (3,) each, the mesh's frame, near its origin. A piece that shows most of its back is turned. Vertices stay.
-    cleaned: it is welded and its pieces are wound one way, as `clean` leaves them. Raises InputError for a surface with one side,
-    and for a closed solid that is seen from within.
+    A piece that mostly shows its back is flipped. Vertices do not change.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The surface.
+    viewpoints : list of (3,) arrays
+        Positions of the sensors in the mesh's frame, near its origin, m.
+    where : str
+        Name of the mesh in error messages.
+    cleaned : bool
+        Whether the mesh is already welded and consistently wound, as `clean` leaves it.
+
+    Returns
+    -------
+    TriangleMesh, str
+        The mesh, and what was flipped, in words.
+
+    Raises
+    ------
+    InputError
+        If the surface has only one side, or if a sensor stands inside a closed solid.
     """
     welded, words = mesh, []
     if not cleaned:
         welded = weld(mesh)[0]
-        odd = wound_otherwise(welded, where)
-        mesh, welded = flipped(mesh, odd), flipped(welded, odd)
+        odd = inconsistent_faces(welded, where)
+        mesh, welded = flip_faces(mesh, odd), flip_faces(welded, odd)
         words = [f"{int(odd.sum())} triangles wound the other way round"] if odd.any() else []
     backs = _pieces_seen_from_behind(mesh, welded, viewpoints, where)
     if backs.any():
-        mesh = flipped(mesh, backs)
+        mesh = flip_faces(mesh, backs)
         part = "all" if backs.all() else "a piece of"
         words.append(f"{part} {int(backs.sum())} triangles turned, as they were wound away from the sensor")
     return mesh, "; ".join(words)
 
 
-def check_near(vertices: FloatArray, viewpoints: Mapping[str, FloatArray], where: str) -> None:
-    """Raise InputError where a sensor stands so far from the surface that the two cannot be in one coordinate system.
+def check_distances(vertices: FloatArray, viewpoints: Mapping[str, FloatArray], where: str) -> None:
+    """Raise InputError if a sensor is so far from the surface that the two cannot be in one coordinate system.
 
-    vertices: (n, 3) and viewpoints: (3,) by name, world frame.
+    Parameters
+    ----------
+    vertices : (n, 3) array
+        The surface, world frame, m.
+    viewpoints : mapping of str to (3,) array
+        Positions of the sensors by name, world frame, m.
+    where : str
+        Name of the surface in the message.
     """
     centre = vertices.mean(axis=0)
     for name, position in viewpoints.items():
@@ -62,18 +88,18 @@ def check_near(vertices: FloatArray, viewpoints: Mapping[str, FloatArray], where
 def _pieces_seen_from_behind(
     mesh: TriangleMesh, welded: TriangleMesh, viewpoints: list[FloatArray], where: str
 ) -> NDArray[np.bool_]:
-    """(m,) the triangles of the pieces that are to be turned."""
+    """Return the triangles (m,) of the pieces that have to be flipped."""
     scene = RayCaster(mesh)
     seen = [scene.sides_seen(position) for position in viewpoints]
     face, behind = (np.concatenate(each) for each in zip(*seen, strict=True))
     if not behind.any():
         return np.zeros(len(mesh.faces), bool)
-    piece = groups(welded.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(welded.vertices))[welded.faces[:, 0]]
+    piece = connected_groups(welded.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(welded.vertices))[welded.faces[:, 0]]
     count = int(piece.max()) + 1
     backs = np.bincount(piece[face], np.where(behind, 1, -1), count) > 0
     if not backs.any():
         return np.zeros(len(mesh.faces), bool)
-    if (backs & _is_whole(welded, piece, count)).any():
+    if (backs & _is_outward_solid(welded, piece, count)).any():
         raise InputError(
             "the sensor stands inside a closed solid of the surface",
             where=where,
@@ -83,8 +109,8 @@ def _pieces_seen_from_behind(
     return backs[piece]
 
 
-def _is_whole(mesh: TriangleMesh, piece: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    """(count,) pieces that are closed and wound counter-clockwise seen from outside: their signed volume is above 0."""
+def _is_outward_solid(mesh: TriangleMesh, piece: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """Return which pieces (count,) are closed solids with outward normals, that is with a positive signed volume."""
     _, inverse, uses = np.unique(mesh.edges, return_inverse=True, return_counts=True)
     rim = np.bincount(np.tile(piece, 3), uses[inverse] == 1, count)
     volume = signed_volumes(mesh.corners() - mesh.vertices.mean(axis=0))

@@ -1,9 +1,9 @@
-"""The ray-casting interface: rays against one triangle mesh, with hits refined in float64.
+"""Cast rays against one triangle mesh, with hits refined in float64.
 
-Embree and OptiX trace in single precision (6 um rms at 100 m). The triangle that was hit is known, so the distance is computed
-again in float64 against that triangle's plane; which of two triangles a ray within some micrometres of their common edge meets is
-settled in float64 on request. All arrays stay on the device, lazily, so that a sensor's whole chain fuses
-into one kernel.
+Embree and OptiX trace in single precision, with an error of 6 um rms at 100 m. They say which triangle was hit, so the
+distance is recomputed in float64 from that triangle's plane. Within some micrometres of an edge, single precision may pick the
+wrong one of two triangles; on request this is decided again in float64. All arrays stay on the device and are evaluated
+lazily, so that a sensor's whole chain fuses into one kernel.
 """
 
 from __future__ import annotations
@@ -21,28 +21,42 @@ from scene.geometry.mesh import DEFAULT_ALBEDO, WALL, FloatArray, IntArray, Tria
 from scene.ray_casting.upload import on_device, vectors_on_device
 
 _LARGEST_COORDINATE = 1e4
-"""Metres from the frame's origin beyond which float32 leaves less than a millimetre."""
+"""Distance from the frame's origin, m, beyond which float32 resolves less than a millimetre."""
 
 _EDGE_SHARE = 3e-4
-"""Barycentric coordinate below which a hit counts as near an edge: 15 um on a triangle 5 cm high, as float32 errs at 100 m."""
+"""Barycentric coordinate below which a hit counts as near an edge: 15 um on a triangle 5 cm high, the error of float32 at 100 m.
+"""
 _ASIDE = 3e-7
-"""Offset of the rays beside a ray, over its length: 30 um at 100 m, more than its direction's rounding to float32."""
+"""Offset of the auxiliary rays from a ray, relative to its length: 30 um at 100 m, more than the rounding of its direction to
+float32.
+"""
 _AROUND = ((1.0, 0.0), (-0.5, 0.75**0.5), (-0.5, -(0.75**0.5)))
-"""Directions of the rays beside a ray: on both sides of any line through it."""
+"""Directions of the auxiliary rays: some lie on both sides of any line through the ray."""
 _ROUNDING = 1e-11
-"""Of barycentric coordinates in float64: a ray through an edge goes through at least one of its faces."""
+"""Tolerance of barycentric coordinates in float64, so that a ray through an edge hits at least one of its faces."""
 
 _SIGHTS = 4096
-"""Lines of sight that tell which side of a surface is seen."""
+"""Number of lines of sight that decide which side of a surface is seen."""
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What n rays hit, as lazy device arrays; entries of rays that hit nothing are meaningless where `valid` is False.
+    """What n rays hit, as lazy device arrays. Where `valid` is False, the other entries have no meaning.
 
-    valid: (n,) bool; distance: (n,) float64, in lengths of the direction vector (m for unit directions); face: (n,) uint32;
-    normal: 3 x (n,) float32 unit vectors on the side that the ray meets, as rock is opaque from both sides;
-    albedo: (n,) float32; block: (n,) int32 label of the face, WALL for a miss.
+    Attributes
+    ----------
+    valid : (n,) bool
+        Whether the ray hits anything.
+    distance : (n,) float64
+        Distance in lengths of the direction vector (m for unit directions).
+    face : (n,) uint32
+        Index of the face that is hit.
+    normal : 3 x (n,) float32
+        Unit normal on the side from which the ray comes, as rock is opaque from both sides.
+    albedo : (n,) float32
+        Mean albedo of the face.
+    block : (n,) int32
+        Block label of the face; WALL for a miss.
     """
 
     valid: mi.Bool
@@ -56,7 +70,12 @@ class Hits:
 class RayCaster:
     """A mesh prepared for ray casting, in a frame whose origin is near (the wall frame).
 
-    mesh: as given; bare: Mitsuba's own scene of it, which casts in single precision and refines nothing.
+    Attributes
+    ----------
+    mesh : TriangleMesh
+        The mesh, as given.
+    bare : mi.Scene
+        Mitsuba's scene of the mesh, which casts rays in single precision without refinement.
     """
 
     def __init__(self, mesh: TriangleMesh) -> None:
@@ -78,11 +97,12 @@ class RayCaster:
 
     @cached_property
     def _records(self) -> mi.Float32:
-        """(8 m,) float32, one record per face, half a cache line, so that a hit costs one visit to memory.
+        """(8 m,) float32 array with one record per face: half a cache line, so that a hit costs one memory access.
 
-        The face's plane is n . x = d with n scaled so that its largest component, along `axis`, is +-1; the other two (cyclic
-        order after the axis) and d are sums of two float32, which keep 48 bits. In order: n_1 high, n_1 low, n_2 high, n_2 low,
-        d high, d low, albedo, 6 block + 2 axis + (1 where n's largest component is negative).
+        The face's plane is n . x = d, with n scaled so that its largest component, along `axis`, is +-1. The other two
+        components (in cyclic order after the axis) and d are stored as sums of two float32, which keep 48 bits. The order is
+        n_1 high, n_1 low, n_2 high, n_2 low, d high, d low, albedo, 6 block + 2 axis + (1 if n's largest component is
+        negative).
         """
         index = dr.arange(mi.UInt32, len(self.mesh.faces))
         blocks = self.mesh.face_block
@@ -105,16 +125,23 @@ class RayCaster:
         return records
 
     def _albedo(self, vertex: list[mi.UInt32]) -> mi.Float32:
-        """Mean albedo of each face's three vertices."""
+        """Return the mean albedo of each face's three vertices."""
         if self.mesh.vertex_albedo is None:
             return mi.Float32(DEFAULT_ALBEDO)
         albedo = on_device(mi.Float32, self.mesh.vertex_albedo)
         return sum((dr.gather(mi.Float32, albedo, number) for number in vertex), mi.Float32(0)) / 3
 
     def intersect(self, origin: mi.Array3f64, direction: mi.Array3f64, *, coherent: bool = True, exact: bool = False) -> Hits:
-        """Cast rays; origin, direction: 3 x (n,) float64, m. The direction need not be of unit length.
+        """Cast n rays.
 
-        exact: decide in float64 which face a ray near an edge meets, instead of leaving that to the single precision.
+        Parameters
+        ----------
+        origin, direction : 3 x (n,) float64
+            Start and direction of the rays, m. The direction need not have unit length.
+        coherent : bool
+            Whether neighbouring rays are nearly parallel, which the ray tracer exploits.
+        exact : bool
+            Whether to decide in float64 which face a ray near an edge hits, instead of trusting single precision.
         """
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         found = self.bare.ray_intersect_preliminary(ray, coherent=coherent)
@@ -134,9 +161,10 @@ class RayCaster:
         return Hits(valid, distance, face, dr.normalize(towards), second.z, mi.Int32(block))
 
     def _settle(self, face: mi.UInt32, origin: mi.Array3f64, direction: mi.Array3f64, at_edge: mi.Bool) -> mi.UInt32:
-        """The face that the ray meets first in float64, of the one found and those that three rays beside it meet.
+        """Find the face that each ray near an edge hits first, in float64.
 
-        face: (n,) as found; at_edge: (n,) the rays to settle, a small share; the others keep their face.
+        The candidates are the face found in single precision and the faces that three auxiliary rays hit. `face` is (n,) as
+        found; `at_edge` (n,) marks the rays to decide again, a small share. The others keep their face.
         """
         ahead = dr.normalize(mi.Vector3f(direction))
         side, other = mi.coordinate_system(ahead)
@@ -162,7 +190,9 @@ class RayCaster:
     def _meets(
         self, face: mi.UInt32, origin: mi.Array3f64, direction: mi.Array3f64, active: mi.Bool
     ) -> tuple[mi.Float64, mi.Bool]:
-        """Distance to the plane of `face` and whether the ray goes through the face, in float64 (Moeller and Trumbore 1997)."""
+        """Return the distance to the plane of `face` and whether the ray passes through the face, in float64 (Moeller and
+        Trumbore 1997).
+        """
         numbers = (dr.gather(mi.UInt32, self._face_vertices, 3 * face + corner, active) for corner in range(3))
         a, b, c = (dr.gather(mi.Array3f64, self._vertices, number, active) for number in numbers)
         b, c, offset = b - a, c - a, origin - a
@@ -172,13 +202,33 @@ class RayCaster:
         return distance, (u >= -_ROUNDING) & (v >= -_ROUNDING) & (u + v <= 1 + _ROUNDING) & (distance > 0)
 
     def occluded(self, origin: mi.Array3f64, direction: mi.Array3f64, length: mi.Float64, *, coherent: bool = True) -> mi.Bool:
-        """Whether something lies on each ray before `length` (n,), m for unit directions."""
+        """Return whether anything lies on each ray nearer than `length` (n,).
+
+        Parameters
+        ----------
+        origin, direction : 3 x (n,) float64
+            Start and direction of the rays, m.
+        length : (n,) float64
+            Distance in lengths of the direction vector (m for unit directions).
+        coherent : bool
+            As in `intersect`.
+        """
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         ray.maxt = mi.Float(length)
         return self.bare.ray_test(ray, coherent=coherent)
 
     def nearest_vertex_label(self, hits: Hits, point: mi.Array3f64, labels: mi.Int32) -> mi.Int32:
-        """(n,) the label, out of one per vertex, of the hit face's vertex that is nearest to `point` (3 x (n,), m)."""
+        """Return, per hit, the label of the face's vertex that is nearest to the hit point.
+
+        Parameters
+        ----------
+        hits : Hits
+            The hits (n,).
+        point : 3 x (n,) float64
+            The hit points, m.
+        labels : int32, one per vertex
+            Block labels of the mesh's vertices.
+        """
         nearest, result = mi.Float32(np.inf), mi.Int32(WALL)
         for corner in range(3):
             vertex = dr.gather(mi.UInt32, self._face_vertices, 3 * hits.face + corner, hits.valid)
@@ -190,7 +240,7 @@ class RayCaster:
         return dr.select(hits.valid, result, WALL)
 
     def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Cast rays given as NumPy arrays, (n, 3) each, m; returns distance and face (n,); a miss is NaN and -1."""
+        """Cast rays given as NumPy arrays (n, 3), m. Returns the distances (n,) and faces (n,); NaN and -1 for a miss."""
         rays = (vectors_on_device(np.broadcast_to(array, directions.shape)) for array in (origins, directions))
         hits = self.intersect(*rays, coherent=False)
         distance = dr.select(hits.valid, hits.distance, np.nan)
@@ -199,9 +249,9 @@ class RayCaster:
         return np.array(distance), np.array(face)
 
     def sides_seen(self, position: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
-        """The faces that lines of sight from `position` (3,) meet first, and which of them are met from behind.
+        """Return the faces that are seen from `position` (3,), and which of them are seen from behind.
 
-        The lines go to some thousands of the mesh's vertices.
+        Lines of sight are cast to some thousands of the mesh's vertices.
         """
         vertices = self.mesh.vertices[:: max(len(self.mesh.vertices) // _SIGHTS, 1)]
         sight = vertices - position
@@ -210,14 +260,26 @@ class RayCaster:
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
     def labels_down(self, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
-        """(h, w) the label of the face seen along -z from each pixel's centre minus `shift_m` ((h, w, 2) in x and y)."""
+        """Return the block label (h, w) of the face seen along -z from each pixel centre minus `shift_m` (h, w, 2), m in x and
+        y.
+        """
         hits, _ = self.look_down(grid, shift_m)
         return np.array(hits.block).reshape(grid.shape)
 
     def look_down(self, grid: Grid, shift_m: NDArray[np.float32] | None = None) -> tuple[Hits, mi.Array3f64]:
-        """Cast one ray per pixel centre of `grid` along -z from above the mesh, row by row; returns hits and points.
+        """Cast one ray along -z through each pixel centre of `grid`, from above the mesh, row by row.
 
-        shift_m: (h, w, 2) by which the rays stand aside, towards -x and -y.
+        Parameters
+        ----------
+        grid : Grid
+            The raster.
+        shift_m : (h, w, 2) array, optional
+            Offset of each ray towards -x and -y, m.
+
+        Returns
+        -------
+        Hits and mi.Array3f64
+            The hits and the hit points, h w each.
         """
         index = dr.arange(mi.UInt32, grid.width * grid.height)
         row, column = index // grid.width, index % grid.width
@@ -232,24 +294,25 @@ class RayCaster:
 
 
 def _largest_component(vector: mi.Array3f64) -> tuple[mi.UInt32, mi.Float64]:
-    """Axis and value of the component that is largest in magnitude."""
+    """Return the axis and the value of the vector's component with the largest magnitude."""
     size = dr.abs(vector)
     axis = dr.select(size.x >= size.y, dr.select(size.x >= size.z, 0, 2), dr.select(size.y >= size.z, 1, 2))
     return mi.UInt32(axis), dr.select(axis == 0, vector.x, dr.select(axis == 1, vector.y, vector.z))
 
 
 def _split(value: mi.Float64) -> tuple[mi.Float32, mi.Float32]:
-    """`value` as the sum of two float32."""
+    """Split a float64 into the sum of two float32."""
     high = mi.Float32(value)
     return high, mi.Float32(value - mi.Float64(high))
 
 
 def _joined(high: mi.Float32, low: mi.Float32) -> mi.Float64:
+    """Join two float32 into the float64 that `_split` came from."""
     return mi.Float64(high) + mi.Float64(low)
 
 
 def _plane_normal(axis: mi.UInt32, negative: mi.Bool, following: mi.Float64, last: mi.Float64) -> mi.Array3f64:
-    """The vector whose component along `axis` is +-1; `following` and `last` are the next two in cyclic order."""
+    """Rebuild a normal from its record: the component along `axis` is +-1, then `following` and `last` in cyclic order."""
     largest = dr.select(negative, mi.Float64(-1.0), mi.Float64(1.0))
     return mi.Array3f64(
         dr.select(axis == 0, largest, dr.select(axis == 1, last, following)),
@@ -259,7 +322,7 @@ def _plane_normal(axis: mi.UInt32, negative: mi.Bool, following: mi.Float64, las
 
 
 def heights(caster: RayCaster, grid: Grid) -> NDArray[np.float32]:
-    """(height, width) raster of the highest z of the mesh at each pixel centre, m; NaN where there is no surface."""
+    """Return the highest z of the mesh at each pixel centre, (height, width), m; NaN where there is no surface."""
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     return np.array(z).reshape(grid.shape)

@@ -1,8 +1,9 @@
-"""NumPy arrays on the device.
+"""Copy NumPy arrays to the device.
 
-Dr.Jit's LLVM backend takes the memory of a NumPy array as it is, and its kernels read whole packets of 16 elements (Embree, 16
-bytes): past the array's end, where now and then the process owns no memory. So every array is copied into one with room to spare.
-A kernel is compiled anew for every pattern of arrays that start at a multiple of a packet or do not: here all of them do.
+Dr.Jit's LLVM backend uses the memory of a NumPy array directly, and its kernels read whole packets of 16 elements (Embree: 16
+bytes). They may so read past the array's end, into memory that the process does not own. Every array is therefore copied into
+a larger one. A kernel is also compiled anew for each combination of arrays that do or do not start at a multiple of a packet;
+here all of them do.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scene.common.backend import mi
 from scene.geometry.mesh import FloatArray
 
 _SPARE = 16
-"""Elements behind the last one that a kernel may read: the widest packet."""
+"""Number of elements behind the last one that a kernel may read: the widest packet."""
 _DTYPES: dict[Any, type] = {
     mi.Float32: np.float32,
     mi.Float64: np.float64,
@@ -24,10 +25,11 @@ _DTYPES: dict[Any, type] = {
     mi.UInt32: np.uint32,
     mi.Bool: np.bool_,
 }
+"""NumPy type of each device type."""
 
 
 def on_device(kind: Any, values: NDArray[Any]) -> Any:
-    """A copy of `values` of any shape as a device array (n,) in C order, of the Dr.Jit type `kind`: mi.Float64, mi.Bool ..."""
+    """Copy `values`, of any shape, to a device array (n,) in C order of the Dr.Jit type `kind`, such as mi.Float64 or mi.Bool."""
     buffer: NDArray[Any] = np.empty(values.size + 2 * _SPARE, _DTYPES[kind])
     start = -(buffer.ctypes.data // buffer.itemsize) % _SPARE
     array = buffer[start : start + values.size]
@@ -36,5 +38,5 @@ def on_device(kind: Any, values: NDArray[Any]) -> Any:
 
 
 def vectors_on_device(vectors: FloatArray) -> mi.Array3f64:
-    """(n, 3) vectors as a device vector of 3 x (n,)."""
+    """Copy vectors (n, 3) to a device vector of 3 x (n,)."""
     return mi.Array3f64(*(on_device(mi.Float64, component) for component in vectors.T))

@@ -1,6 +1,7 @@
-"""The wall's surface within the contours of blocks: its relief and its median height.
+"""Measure the relief and the median height of the wall within the contours of blocks.
 
-A contour is the convex hull of a block's vertices in the wall's plane; a block is convex but for its irregularity.
+A block's contour is the convex hull of its vertices, projected on the wall plane. Blocks are convex apart from their
+irregularity.
 """
 
 from __future__ import annotations
@@ -11,17 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.geometry.mesh import FloatArray, TriangleMesh
-from scene.geometry.under_boxes import faces_under
+from scene.geometry.under_boxes import faces_under_boxes
 from scene.ray_casting.raycast import RayCaster
 
 _SIDE = 16
-"""Heights are looked up at so many places across a contour and along it, and at four times as many on its edge."""
+"""Heights are sampled at this many positions along each axis of a contour's bounding box, and at four times as many on its
+outline.
+"""
 
 
 def highest_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
-    """(k,) the largest z of the wall within each contour, m; -inf where there is no wall.
+    """Return the largest z (k,) of the wall within each contour, m; -inf where there is no wall.
 
-    outlines: of each block points (n, 2) whose hull is its contour, m.
+    Parameters
+    ----------
+    caster : RayCaster
+        The wall, wall frame.
+    outlines : sequence of (n, 2) arrays
+        For each block, points whose convex hull is its contour, m.
     """
     hulls = [_Hull(points) for points in outlines]
     tops = np.array([values.max(initial=-np.inf) for values in _heights(caster, hulls)])
@@ -29,7 +37,7 @@ def highest_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArr
 
 
 def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
-    """(k,) the largest z of the wall's vertices within each contour, m; where it holds none, as `highest_under`."""
+    """Return the largest z (k,) of the wall's vertices within each contour, m; of the surface if a contour contains no vertex."""
     tops = _highest_vertex(caster.mesh, [_Hull(points) for points in outlines])
     bare = np.flatnonzero(np.isneginf(tops))
     if bare.size:
@@ -38,13 +46,13 @@ def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> F
 
 
 def median_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
-    """(k,) the median z of the wall over each contour, m; -inf where there is no wall. outlines: as in `highest_under`."""
+    """Return the median z (k,) of the wall over each contour, m; -inf where there is no wall. Arguments as in `highest_under`."""
     found = _heights(caster, [_Hull(points) for points in outlines], edges=False)
     return np.array([np.median(values) if values.size else -np.inf for values in found])
 
 
 class _Hull:
-    """The convex hull of (n, 2) points: corners (m, 2), and (m, 3) lines a x + b y + c that are at most 0 inside."""
+    """The convex hull of points (n, 2): its corners (m, 2), and lines (m, 3) with a x + b y + c <= 0 inside."""
 
     def __init__(self, points: FloatArray) -> None:
         from scipy.spatial import ConvexHull
@@ -59,18 +67,18 @@ class _Hull:
         return np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
 
     def holds(self, points: FloatArray) -> NDArray[np.bool_]:
-        """(n,) whether points (n, 2) lie in it."""
+        """Return whether points (n, 2) lie inside."""
         return np.asarray((points @ self._lines[:, :2].T + self._lines[:, 2] <= 0).all(axis=1))
 
     def edge(self) -> FloatArray:
-        """(n, 2) the corners and even places between them."""
+        """Return the corners and evenly spaced points on the outline, (n, 2)."""
         ends = np.concatenate([self.corners, self.corners[:1]])
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
         places = np.concatenate([along[:-1], np.linspace(0, along[-1], 4 * _SIDE, endpoint=False)])
         return np.column_stack([np.interp(places, along, ends[:, axis]) for axis in (0, 1)])
 
     def grid(self) -> FloatArray:
-        """(n, 2) even places in it."""
+        """Return evenly spaced points inside, (n, 2)."""
         low, high = self.box
         steps = (np.arange(_SIDE) + 0.5) / _SIDE
         places = low + (high - low) * np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -78,7 +86,7 @@ class _Hull:
 
 
 def _heights(caster: RayCaster, hulls: Sequence[_Hull], *, edges: bool = True) -> list[FloatArray]:
-    """Of each hull the heights of the wall, seen along -z, at even places in it and, if asked for, on its edge."""
+    """Return, for each hull, the wall's heights along -z at evenly spaced points inside and, on request, on its outline."""
     places = [np.concatenate([hull.grid(), hull.edge()]) if edges else hull.grid() for hull in hulls]
     flat = np.concatenate(places)
     start = np.column_stack([flat, np.full(len(flat), caster.mesh.bounds[1, 2] + 1.0)])
@@ -88,9 +96,9 @@ def _heights(caster: RayCaster, hulls: Sequence[_Hull], *, edges: bool = True) -
 
 
 def _highest_vertex(mesh: TriangleMesh, hulls: Sequence[_Hull]) -> FloatArray:
-    """(k,) the largest z of the vertices within each hull, -inf where there are none."""
+    """Return the largest z (k,) of the vertices within each hull; -inf if there are none."""
     boxes = np.stack([hull.box for hull in hulls])
-    near = np.unique(mesh.faces[faces_under(mesh, boxes)])
+    near = np.unique(mesh.faces[faces_under_boxes(mesh, boxes)])
     vertices = mesh.vertices[near]
     vertices = vertices[np.argsort(vertices[:, 0], kind="stable")]
     first = np.searchsorted(vertices[:, 0], boxes[:, 0, 0], side="left")

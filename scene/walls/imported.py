@@ -1,4 +1,4 @@
-"""Surfaces read from mesh files: rock walls, which are mended, and references, which stay as they are."""
+"""Read surfaces from mesh files: rock walls, which are repaired, and reference surfaces, which stay as they are."""
 
 from __future__ import annotations
 
@@ -19,26 +19,28 @@ from scene.common.lengths import METRES
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
 from scene.meshes import obj
-from scene.meshes.cleaning import clean, drop_unused, flipped
+from scene.meshes.cleaning import clean, drop_unused, flip_faces
 from scene.meshes.ply import read_elements
-from scene.meshes.polygons import triangulated
+from scene.meshes.polygons import triangulate_polygons
 from scene.meshes.rounding import check_rounding
 
-logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it cannot do comes as an exception, or is a texture
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its problems raise exceptions or concern textures
 _SMALLEST_M, _LARGEST_M = 0.5, 5000.0
-"""A wall smaller or larger than this is likely to be in another unit."""
+"""A wall smaller or larger than this is probably in another unit."""
 _FARTHEST_M = 1e8
-"""No coordinate system of the earth reaches so far: geocentric coordinates are up to 6.4e6 m, northings up to 1e7 m."""
+"""Largest plausible coordinate: geocentric coordinates reach 6.4e6 m, northings 1e7 m."""
 _MOST_BYTES = 2_000_000_000
-"""Of a file that trimesh reads, which takes it into memory as a whole, and several times that for its parts."""
+"""Largest file that is given to trimesh, which needs several times its size in memory."""
 _Y_UP = {"glb", "gltf"}
-"""Formats whose standard says that y points up (glTF 2.0, section 3.4): they are turned so that z does."""
+"""Formats whose standard says that y points up (glTF 2.0, section 3.4). They are rotated so that z does."""
 _ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
+"""Archive formats that trimesh lists among its mesh formats."""
 _COLOURS = ("red", "green", "blue")
+"""Names of the vertex colours in a PLY file."""
 _TEXTURE = {"texcoord", "texture_u", "texture_v", "s", "t", "u", "v"}
-"""Names of vertices' colours in a PLY file, and of what textures hang on."""
+"""Names in a PLY file that belong to textures."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""ITU-R BT.709, of linear red, green and blue."""
+"""ITU-R BT.709 luminance weights of linear red, green and blue."""
 
 
 class ImportedWall(Config):
@@ -47,14 +49,17 @@ class ImportedWall(Config):
     mesh: Path | tuple[Path, ...] = Field(
         description="mesh file (ply, obj, stl, off, glb, ...), or a list of files that make up the scene; in survey coordinates"
     )
-    unit: Literal["m", "cm", "mm", "ft", "us-ft"] = Field("m", description="of the file's coordinates")
+    unit: Literal["m", "cm", "mm", "ft", "us-ft"] = Field("m", description="unit of the file's coordinates")
     flipped: bool = Field(
         False,
-        description="the file's triangles are clockwise seen from the sensors' side; told by itself where the sensor's place is "
-        "given in coordinates",
+        description="whether the file's triangles are clockwise seen from the sensors' side; detected automatically if the "
+        "sensor's position is given in coordinates",
     )
     albedo: float | None = Field(
-        None, ge=0.0, le=1.0, description="of the whole wall; if not given the file's own, or the luminance of its vertex colours"
+        None,
+        ge=0.0,
+        le=1.0,
+        description="albedo of the wall; by default the file's own, or the luminance of its vertex colours",
     )
 
     @field_validator("mesh")
@@ -72,23 +77,24 @@ class ImportedWall(Config):
         return self.mesh if isinstance(self.mesh, tuple) else (self.mesh,)
 
     def load(self) -> tuple[TriangleMesh, tuple[str, ...]]:
-        """Read, join and clean the meshes.
+        """Read, join and repair the meshes.
 
-        Returns the mesh in the world frame, m, and what was mended, in words. Raises InputError where a file cannot be used.
+        Returns the mesh in the world frame, m, and the repairs in words. Raises InputError if a file cannot be used.
         """
         where = ", ".join(map(str, self.files))
         meshes, found = zip(*(read_mesh(file, self.unit) for file in self.files), strict=True)
-        mesh, notes = joined(meshes), tuple(dict.fromkeys(note for each in found for note in each))
+        mesh, notes = join_meshes(meshes), tuple(dict.fromkeys(note for each in found for note in each))
         self._check_extent(mesh, where)
-        origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres: taken off and added again without loss
+        origin = np.floor(mesh.vertices[mesh.faces[0, 0]])  # whole metres, which are subtracted and added again without rounding
         mesh, repairs = clean(mesh.with_vertices(mesh.vertices - origin), where, origin)
         if self.flipped:
-            mesh = flipped(mesh, np.ones(len(mesh.faces), bool))
+            mesh = flip_faces(mesh, np.ones(len(mesh.faces), bool))
         if self.albedo is not None:
             mesh = replace(mesh, vertex_albedo=np.full(len(mesh.vertices), self.albedo, np.float32))
         return mesh.with_vertices(mesh.vertices + origin), (*repairs, *notes)
 
     def _check_extent(self, mesh: TriangleMesh, where: str) -> None:
+        """Raise InputError if the wall's size is implausible in the stated unit."""
         extent = _extent(mesh)
         if not _SMALLEST_M <= extent <= _LARGEST_M:
             likely = [unit for unit, metres in METRES.items() if 2 <= extent / METRES[self.unit] * metres <= 1000]
@@ -101,8 +107,8 @@ class ImportedWall(Config):
             )
 
 
-def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Join meshes into one, in order. If any mesh has an albedo, those without one get the default albedo."""
+def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Join meshes into one, in order. If any of them has an albedo, those without one get the default albedo."""
     if len(meshes) == 1:
         return meshes[0]
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
@@ -116,9 +122,10 @@ def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 
 def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """A surface as known, m, and notes. Its vertices are as in the file: cleaning would move what is measured against it.
+    """Read a reference surface, m, and notes on it. Vertices stay as in the file, because repairs could move what is measured
+    against.
 
-    Raises InputError where the file cannot be used.
+    Raises InputError if the file cannot be used.
     """
     mesh, notes = read_mesh(path)
     if (extent := _extent(mesh)) > _LARGEST_M:
@@ -129,9 +136,9 @@ def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
 
 
 def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...]]:
-    """The triangles of a file, m, and notes on their coordinates.
+    """Read the triangles of a file, converted to m, and notes on their coordinates.
 
-    Raises InputError where the file cannot be read, and for coordinates that are not finite, no place on earth or rounded away.
+    Raises InputError if the file cannot be read, or if coordinates are not finite, implausibly large or spoilt by rounding.
     """
     where, metres = str(path), METRES[unit]
     mesh = _read(path, unit)
@@ -142,16 +149,16 @@ def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...
 
 
 def _extent(mesh: TriangleMesh) -> float:
-    """The longest side of the box about all triangles, m."""
+    """Return the longest side of the bounding box of all triangles, m."""
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[mesh.faces] = True
     return max(float(np.ptp(column[used])) for column in mesh.vertices.T)
 
 
 def _read(path: Path, unit: str) -> TriangleMesh:
-    """Read the file's triangles as they are, in the file's unit; all meshes of a scene joined.
+    """Read a file's triangles unchanged, in the file's unit; all meshes of a scene are joined.
 
-    Raises InputError where the file cannot be read, or states another unit than `unit`.
+    Raises InputError if the file cannot be read or states another unit than `unit`.
     """
     where, kind = str(path), _format(path)
     if not path.exists():
@@ -171,7 +178,7 @@ def _read(path: Path, unit: str) -> TriangleMesh:
         raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the permissions") from None
-    except Exception as error:  # trimesh's readers raise whatever their parsing meets
+    except Exception as error:  # trimesh's readers may raise any exception on malformed data
         problem = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"is not a valid {kind} file: {problem}", where=where, remedy="export it anew") from None
     faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
@@ -193,23 +200,23 @@ def _read(path: Path, unit: str) -> TriangleMesh:
 
 
 def _obj_source(path: Path, unit: str) -> str | io.BytesIO:
-    """Return what trimesh is to read of an OBJ file: its path, or its text where the file needs to be made plain.
+    """Return what trimesh reads of an OBJ file: its path, or preprocessed text if trimesh would misread it.
 
-    Raises OSError where it cannot be read, and InputError where a comment in the file names another unit than `unit`.
+    Raises OSError if the file cannot be read, and InputError if a comment in it names another unit than `unit`.
     """
     text = path.read_bytes()
-    stated = obj.stated_unit(text)
+    stated = obj.unit_in_comments(text)
     if stated is not None and stated[0] != unit:
         raise InputError(
             f"says in a comment that its unit is {stated[0]} ('{stated[1][:80]}'), and is to be read in {unit}",
             where=str(path),
             remedy=f"set `unit` to {stated[0]}, or remove the comment if it is wrong",
         )
-    return str(path) if obj.is_plain(text) else io.BytesIO(obj.made_plain(text))
+    return str(path) if obj.has_plain_faces(text) else io.BytesIO(obj.with_plain_faces(text))
 
 
 def _beside(path: Path) -> Any:
-    """trimesh's way to what a mesh file names, such as its buffers: files of its folder, no pipes and none too large."""
+    """Return trimesh's resolver for files that a mesh refers to, such as buffers: regular files in its folder of limited size."""
     from trimesh.resolvers import FilePathResolver
 
     class Beside(FilePathResolver):
@@ -221,9 +228,9 @@ def _beside(path: Path) -> Any:
 
 
 def _plain_ply(path: Path) -> TriangleMesh | None:
-    """A PLY file of triangles, at most with an albedo or colours of 8 bits per vertex; None where there is more to it.
+    """Read a PLY file of triangles with at most an albedo or 8-bit vertex colours; return None if it contains more than that.
 
-    That is for trimesh to read; the same mesh as trimesh's, without the second that the import of trimesh takes.
+    Other files are left to trimesh. The result is the same as trimesh's, without the second that its import takes.
     """
     try:
         elements = read_elements(path)
@@ -239,14 +246,14 @@ def _plain_ply(path: Path) -> TriangleMesh | None:
     if faces.ndim != 2 or faces.shape[1] < 3 or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
         return None
     if faces.shape[1] > 3:
-        faces = triangulated(vertices, faces)
+        faces = triangulate_polygons(vertices, faces)
     albedo = vertex["albedo"].astype(np.float32) if "albedo" in vertex else None
     albedo = _luminance(np.stack(colours, axis=1)) if albedo is None and len(colours) == 3 else albedo
     return TriangleMesh(vertices, np.ascontiguousarray(faces, dtype=np.int32), albedo)
 
 
 def _format(path: Path) -> str:
-    """The file's format by its suffix; InputError where trimesh has no mesh reader for it."""
+    """Return the file's format by its suffix. Raises InputError if trimesh has no mesh reader for it."""
     kind = path.suffix.lower().removeprefix(".")
     if kind == "ply":
         return kind
@@ -255,7 +262,7 @@ def _format(path: Path) -> str:
     known = sorted(set(trimesh.available_formats()) - _ARCHIVES)
     if kind not in known:
         raise InputError(
-            f"'{path.suffix}' is no mesh format that can be read",
+            f"'{path.suffix}' is not a mesh format that can be read",
             where=str(path),
             allowed=", ".join(known),
             remedy=nearest(kind, known),
@@ -264,14 +271,15 @@ def _format(path: Path) -> str:
 
 
 def _check_coordinates(mesh: TriangleMesh, metres: float, where: str) -> None:
+    """Raise InputError for coordinates that are not finite or implausibly large."""
     finite = np.all(np.isfinite(mesh.vertices), axis=1)
     _require(finite, mesh, "are not finite", where, "finite coordinates")
     near = np.all(np.abs(mesh.vertices) <= _FARTHEST_M / metres, axis=1)
-    _require(near, mesh, "are no place on earth", where, f"coordinates of up to {_FARTHEST_M:.0e} m")
+    _require(near, mesh, "are not on earth", where, f"coordinates of up to {_FARTHEST_M:.0e} m")
 
 
 def _require(good: NDArray[Any], mesh: TriangleMesh, problem: str, where: str, allowed: str) -> None:
-    """Raise InputError that names the first vertex that is not good (n,)."""
+    """Raise InputError naming the first vertex that is not `good` (n,)."""
     if not good.all():
         first = int(np.argmin(good))
         coordinates = ", ".join(f"{value:g}" for value in mesh.vertices[first])
@@ -284,14 +292,14 @@ def _require(good: NDArray[Any], mesh: TriangleMesh, problem: str, where: str, a
 
 
 def _albedo(mesh: Any) -> NDArray[np.float32] | None:
-    """(n,) relative luminance of the vertex colours (sRGB, IEC 61966-2-1), None where there are none."""
+    """Return the relative luminance (n,) of the vertex colours (sRGB, IEC 61966-2-1); None if there are none."""
     if getattr(mesh.visual, "kind", None) != "vertex":
         return None
     return _luminance(np.asarray(mesh.visual.vertex_colors)[:, :3])
 
 
 def _luminance(colours: NDArray[np.integer]) -> NDArray[np.float32]:
-    """(n,) relative luminance of (n, 3) sRGB colours of 8 bits."""
+    """Return the relative luminance (n,) of 8-bit sRGB colours (n, 3)."""
     colour = colours / 255.0
     linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
     return np.einsum("nc,c->n", linear, _LUMINANCE).astype(np.float32)

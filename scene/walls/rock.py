@@ -1,7 +1,8 @@
-"""What a procedural rock wall is made of: smooth noise, bedded and jointed blocks, erosional notches.
+"""Define the components of a procedural rock wall: smooth noise, bedded and jointed blocks, erosional notches.
 
-Each part is a function of the position (u along the wall, v up its slope, m) drawn on lattices of fixed size, so that the same
-rock comes out at every sampling. Parts return float32 arrays; positions are regular axes, or arrays bent by other parts.
+Each component is a function of the position (u along the wall, v up its slope, m), drawn on lattices of fixed size, so that
+every sampling gives the same rock. Components return float32 arrays. Positions are regular axes, or arrays that other
+components have bent.
 """
 
 from __future__ import annotations
@@ -20,18 +21,25 @@ Size = tuple[float, float]
 """Width and height of the wall plane, m."""
 
 _MARGIN_M = 6.0
-"""How far the tables of blocks reach beyond the wall, so that bent coordinates stay inside them."""
+"""How far the tables of blocks extend beyond the wall, so that bent coordinates stay inside them."""
 _TABLE_STEP_M = 0.01
+"""Sampling of tables of one coordinate."""
 _NOTCH_STEP_M = 0.05
+"""Spacing of the lattice of notches."""
 _RAMP_PER_STEP = 0.25
-"""Width of a step between blocks over its height: steep, but nowhere upright."""
+"""Width of a step between blocks relative to its height: steep but never vertical."""
 
 
 @dataclass(frozen=True)
 class SplineNoise:
-    """Smooth noise of unit standard deviation: a uniform cubic B-spline over a lattice of keyed normal numbers.
+    """Smooth noise with unit standard deviation: a uniform cubic B-spline over a lattice of keyed normal numbers.
 
-    lattice: (rows, columns) control values, row k at v = (k - 1) step_v_m.
+    Attributes
+    ----------
+    lattice : (rows, columns) float32 array
+        Control values; row k lies at v = (k - 1) step_v_m.
+    step_u_m, step_v_m : float
+        Spacing of the lattice, m.
     """
 
     lattice: Field
@@ -40,13 +48,14 @@ class SplineNoise:
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, step_u_m: float, step_v_m: float | None = None) -> SplineNoise:
+        """Draw the lattice for a wall plane of `size`. step_v_m: as step_u_m by default."""
         step_v_m = step_u_m if step_v_m is None else step_v_m
         shape = int(size[1] / step_v_m) + 5, int(size[0] / step_u_m) + 5
-        deviation = 0.4795  # of the spline between knots, as the mean square over a cell is (151/315)^2
+        deviation = 0.4795  # of the spline between its knots: the mean square over a cell is (151/315)^2
         return cls(random.generator().standard_normal(shape, dtype=np.float32) / deviation, step_u_m, step_v_m)
 
     def at(self, u: FloatArray, v: FloatArray) -> Field:
-        """(len(v), len(u)) values on the regular grid of the axes u and v."""
+        """Evaluate the noise (len(v), len(u)) on the regular grid of the axes u and v."""
         column, weight_u = _spline_weights(u, self.step_u_m)
         row, weight_v = _spline_weights(v, self.step_v_m)
         lattice = self.lattice[row[0] : row[-1] + 4]
@@ -55,7 +64,7 @@ class SplineNoise:
 
 
 def _spline_weights(x: FloatArray, step: float) -> tuple[NDArray[np.intp], Field]:
-    """First lattice index (n,) and the four cubic B-spline weights (4, n) of each position."""
+    """Return the first lattice index (n,) and the four cubic B-spline weights (4, n) for each position."""
     cell = np.floor(x / step)
     f = x / step - cell
     weights = np.stack([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3]) / 6
@@ -64,7 +73,7 @@ def _spline_weights(x: FloatArray, step: float) -> tuple[NDArray[np.intp], Field
 
 @dataclass(frozen=True)
 class Fractal:
-    """Noise summed over octaves whose amplitude follows amplitude_m (step / 1 m)^hurst: self-affine roughness."""
+    """Self-affine roughness: noise summed over octaves with amplitude amplitude_m (step / 1 m)^hurst."""
 
     octaves: tuple[tuple[float, SplineNoise], ...]
 
@@ -72,13 +81,30 @@ class Fractal:
     def make(
         cls, random: KeyedRandom, size: Size, amplitude: float, hurst: float, steps_m: tuple[float, float], aspect: float
     ) -> Fractal:
-        """Octaves from the coarsest step halved down to the finest; aspect: how much longer the grain is up the wall."""
+        """Draw the octaves.
+
+        Parameters
+        ----------
+        random : KeyedRandom
+            Source of the lattices.
+        size : (float, float)
+            Width and height of the wall plane, m.
+        amplitude : float
+            Amplitude at a scale of 1 m, m.
+        hurst : float
+            Hurst exponent.
+        steps_m : (float, float)
+            Coarsest and finest lattice spacing, m; each octave halves it.
+        aspect : float
+            Ratio of the grain's length up the wall to that along it.
+        """
         coarsest, finest = steps_m
         steps = [coarsest / 2**k for k in range(round(np.log2(coarsest / finest)) + 1)]
         noises = (SplineNoise.make(random.child(k), size, step, step * aspect) for k, step in enumerate(steps))
         return cls(tuple((amplitude * step**hurst, noise) for step, noise in zip(steps, noises, strict=True)))
 
     def at(self, u: FloatArray, v: FloatArray) -> Field:
+        """Evaluate the sum of all octaves (len(v), len(u)) on the regular grid of the axes u and v."""
         total = np.zeros((len(v), len(u)), np.float32)
         for amplitude, noise in self.octaves:
             total += np.float32(amplitude) * noise.at(u, v)
@@ -87,30 +113,45 @@ class Fractal:
 
 @dataclass(frozen=True)
 class Table:
-    """A function of one coordinate, sampled every centimetre from `start` and interpolated linearly; constant beyond its ends."""
+    """A function of one coordinate: samples every centimetre from `start`, linearly interpolated, constant beyond its ends."""
 
     start: float
     values: Field
 
     @classmethod
     def through(cls, knots: FloatArray, values: FloatArray) -> Table:
-        """The piecewise linear function through (knots, values), knots ascending."""
+        """Make the piecewise linear function through (knots, values); knots are ascending."""
         x = np.arange(knots[0], knots[-1] + _TABLE_STEP_M, _TABLE_STEP_M)
         return cls(float(knots[0]), np.interp(x, knots, values).astype(np.float32))
 
     def at(self, x: Field) -> Field:
+        """Evaluate the function at positions of any shape."""
         column = (x - np.float32(self.start)) / np.float32(_TABLE_STEP_M)
         return _look_up(self.values[None], column, np.zeros_like(column))
 
 
 @dataclass(frozen=True)
 class BlockRule:
-    """How rock is parted: beds across s, joints across t, and how far the blocks between them stand out.
+    """How one generation of beds and joints divides the rock into blocks, and how far the blocks protrude.
 
-    bed_m, joint_m: mean spacings; offset_m: scale of the blocks' offsets (Laplace: most stay, few stick out or are gone); tilt:
-    standard deviation of the slope of a block's face; dip: slope of the beds along the wall; lean: slope of the joints from the
-    line of greatest slope; ramp_m: width over which a step between beds climbs; spread: log-standard deviation of the
-    spacings.
+    Beds are spaced along s, joints along t; both coordinates are inclined to (u, v) by `dip` and `lean`.
+
+    Attributes
+    ----------
+    bed_m, joint_m : float
+        Mean spacing of beds and joints, m.
+    offset_m : float
+        Scale of the blocks' offsets, m. They are heavy-tailed: most blocks stay near the plane, few protrude or are missing.
+    tilt : float
+        Standard deviation of the slope of a block's face.
+    dip : float
+        Slope of the beds along the wall.
+    lean : float
+        Slope of the joints from the line of greatest slope.
+    ramp_m : float
+        Width over which a step between beds rises, m.
+    spread : float
+        Standard deviation of the logarithm of the spacings.
     """
 
     bed_m: float
@@ -125,10 +166,21 @@ class BlockRule:
 
 @dataclass(frozen=True)
 class JointedBlocks:
-    """Blocks between beds and joints: tables over (bed, t) of the face's height, its slope across the bed and its tone.
+    """Blocks between beds and joints, as tables over (bed, t).
 
-    row: the table row of s, whole inside a bed and running to the next over the ramp, so that bilinear interpolation of the
-    tables makes the steps between beds; across: distance of s from the middle of its bed, m; start: t of the first column, m.
+    Attributes
+    ----------
+    rule : BlockRule
+        How the rock is divided.
+    row : Table
+        Table row as a function of s: whole within a bed, rising to the next over the ramp, so that bilinear interpolation of
+        the tables makes the steps between beds.
+    across : Table
+        Distance of s from the middle of its bed, m.
+    start : float
+        t of the first column, m.
+    height, slope, tone : float32 arrays (beds, columns)
+        Height of the block's face (m), its slope across the bed, and its tone.
     """
 
     rule: BlockRule
@@ -141,9 +193,10 @@ class JointedBlocks:
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, rule: BlockRule) -> JointedBlocks:
+        """Draw the blocks for a wall plane of `size`."""
         draw = random.generator()
         reach_s, reach_t = _MARGIN_M + abs(rule.dip) * size[0], _MARGIN_M + abs(rule.lean) * size[1]
-        beds = partings(draw, -reach_s, size[1] + reach_s, rule.bed_m, rule.spread)
+        beds = draw_partings(draw, -reach_s, size[1] + reach_s, rule.bed_m, rule.spread)
         t = np.arange(-reach_t, size[0] + reach_t, _TABLE_STEP_M)
         height, slope, tone = np.stack([_bed_profile(draw, t, thickness, rule) for thickness in np.diff(beds)], axis=1)
         knots = ramp_knots(beds[1:-1], rule.ramp_m)
@@ -153,7 +206,7 @@ class JointedBlocks:
         return cls(rule, row_table, Table.through(knots, knots - middles), float(t[0]), height, slope, tone)
 
     def at(self, u: Field, v: Field) -> tuple[Field, Field]:
-        """Offset of the face, m, and tone (standard normal per block) at bent positions u, v, m."""
+        """Return the offset of the face, m, and the tone (standard normal per block) at bent positions u, v, m."""
         s = v - np.float32(self.rule.dip) * u
         t = u - np.float32(self.rule.lean) * v
         column = (t - np.float32(self.start)) / np.float32(_TABLE_STEP_M)
@@ -165,12 +218,15 @@ class JointedBlocks:
 
 @dataclass(frozen=True)
 class Notches:
-    """Concave erosional notches on a 5 cm lattice: a steep roof above, a longer floor below, depth in m (positive inwards)."""
+    """Concave erosional notches, as depths (m, positive inwards) on a lattice of 5 cm: a steep roof above, a longer floor
+    below.
+    """
 
     depth: Field
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, per_m2: float, median_m: float) -> Notches:
+        """Draw notches for a wall plane of `size`. per_m2: their number density; median_m: their median size, m."""
         draw = random.generator()
         u, v = (np.arange(0.0, extent + _NOTCH_STEP_M, _NOTCH_STEP_M) for extent in size)
         depth = np.zeros((len(v), len(u)), np.float32)
@@ -187,11 +243,24 @@ class Notches:
         return cls(depth)
 
     def at(self, u: Field, v: Field) -> Field:
+        """Return the depth, m, at bent positions u, v, m."""
         return _look_up(self.depth, u / np.float32(_NOTCH_STEP_M), v / np.float32(_NOTCH_STEP_M))
 
 
-def partings(draw: np.random.Generator, start: float, stop: float, mean: float, spread: float) -> FloatArray:
-    """Ascending positions from `start` to past `stop` with lognormal spacings of the given mean, m."""
+def draw_partings(draw: np.random.Generator, start: float, stop: float, mean: float, spread: float) -> FloatArray:
+    """Draw the positions of beds or joints: ascending, with lognormal spacings.
+
+    Parameters
+    ----------
+    draw : np.random.Generator
+        Source of random numbers.
+    start, stop : float
+        Range that the positions cover, m.
+    mean : float
+        Mean spacing, m.
+    spread : float
+        Standard deviation of the logarithm of the spacings.
+    """
     count = int(2 * (stop - start) / mean) + 8
     spacing = mean * np.exp(spread * draw.standard_normal(count) - spread**2 / 2)
     edges = start - mean * draw.uniform() + np.concatenate([[0.0], np.cumsum(spacing)])
@@ -199,7 +268,7 @@ def partings(draw: np.random.Generator, start: float, stop: float, mean: float, 
 
 
 def ramp_knots(edges: FloatArray, ramp: float | FloatArray) -> FloatArray:
-    """Two knots about each edge, `ramp` apart, or less where the edges are close: where a step begins and where it ends."""
+    """Return two knots about each edge, where a step begins and ends: `ramp` apart, or closer where edges are close together."""
     half = np.broadcast_to(np.asarray(ramp) / 2, edges.shape).copy()
     gap = np.diff(edges)
     half[1:] = np.minimum(half[1:], 0.4 * gap)
@@ -208,8 +277,10 @@ def ramp_knots(edges: FloatArray, ramp: float | FloatArray) -> FloatArray:
 
 
 def _bed_profile(draw: np.random.Generator, t: FloatArray, thickness: float, rule: BlockRule) -> Field:
-    """(3, n) height, slope and tone of one bed's blocks along t; no tilt lifts an edge by more than the offsets' scale."""
-    joints = partings(draw, t[0], t[-1], rule.joint_m, rule.spread)
+    """Draw height, slope and tone (3, n) of one bed's blocks along t. The tilt lifts no block's edge by more than the scale of
+    offsets.
+    """
+    joints = draw_partings(draw, t[0], t[-1], rule.joint_m, rule.spread)
     offset, tilt, slope, tone = draw.standard_normal((4, len(joints) - 1))
     offset = rule.offset_m * np.clip(offset * np.abs(offset), -3, 3)
     lift = np.clip(rule.tilt * tilt * np.diff(joints) / 2, -rule.offset_m, rule.offset_m)
@@ -222,5 +293,5 @@ def _bed_profile(draw: np.random.Generator, t: FloatArray, thickness: float, rul
 
 
 def _look_up(table: Field, column: Field, row: Field) -> Field:
-    """The table, bilinearly interpolated at fractional columns and rows; its edge values beyond it."""
+    """Interpolate a table bilinearly at fractional columns and rows; positions beyond it get its edge values."""
     return cv2.remap(table, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

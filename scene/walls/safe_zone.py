@@ -1,4 +1,4 @@
-"""The part of a wall where blocks may fall: a binary raster of the mesh, eroded by an offset."""
+"""Find the part of a wall where blocks may fall: a binary raster of the mesh, eroded by a margin."""
 
 from __future__ import annotations
 
@@ -12,16 +12,24 @@ from numpy.typing import NDArray
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray, IntArray
-from scene.geometry.under_boxes import integral
+from scene.geometry.under_boxes import integral_image
 from scene.ray_casting.raycast import RayCaster, heights
 
 _CELLS = 2e6
-"""Cells of the raster; on a wall of 70 x 45 m they measure 4 cm."""
+"""Number of raster cells. On a wall of 70 x 45 m they measure 4 cm."""
 
 
 @dataclass(frozen=True)
 class SafeZone:
-    """A raster over the wall frame's XY plane; free: (height, width) bool, True where a block's bounding box may lie."""
+    """The part of the wall where blocks may be placed.
+
+    Attributes
+    ----------
+    grid : Grid
+        Raster over the wall frame's XY plane.
+    free : (height, width) bool array
+        True where a block's bounding box may lie.
+    """
 
     grid: Grid
     free: NDArray[np.bool_]
@@ -33,10 +41,11 @@ class SafeZone:
 
     @cached_property
     def _blocked(self) -> IntArray:
-        return integral(~self.free)
+        """Integral image of the cells that are not free."""
+        return integral_image(~self.free)
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """(size, 2) points drawn uniformly from the zone, m."""
+        """Draw points (size, 2) uniformly from the zone, m."""
         row, column = np.divmod(self.cells[generator.integers(len(self.cells), size=size)], self.grid.width)
         within = generator.random((2, size))
         x = self.grid.x_min + (column + within[0]) * self.grid.gsd
@@ -44,7 +53,7 @@ class SafeZone:
         return np.stack([x, y], axis=1)
 
     def holds(self, boxes: FloatArray) -> NDArray[np.bool_]:
-        """(n,) whether each box (n, 2, 2), smallest and largest x and y in m, touches free cells only."""
+        """Return, for boxes (n, 2, 2) with smallest and largest x and y, m, whether each touches only free cells."""
         column, row = self.grid.columns(boxes[:, :, 0]), self.grid.rows(boxes[:, ::-1, 1])
         inside = (column[:, 0] >= 0) & (row[:, 0] >= 0) & (column[:, 1] < self.grid.width) & (row[:, 1] < self.grid.height)
         (x0, x1), (y0, y1) = (np.clip(np.floor(index), 0, n - 1).astype(int).T for index, n in self._axes(column, row))
@@ -53,13 +62,14 @@ class SafeZone:
         return inside & (blocked == 0)
 
     def _axes(self, column: FloatArray, row: FloatArray) -> tuple[tuple[FloatArray, int], tuple[FloatArray, int]]:
+        """Pair each axis's indices with its number of cells."""
         return (column, self.grid.width), (row, self.grid.height)
 
 
 def safe_zone(caster: RayCaster, offset_m: float) -> SafeZone:
-    """Rasterise the wall as seen along -z and erode it by `offset_m` from its border and its holes.
+    """Make the safe zone: the wall as seen along -z, eroded by `offset_m` from its border and its holes.
 
-    caster: the wall, wall frame. Raises InputError where nothing is left.
+    `caster` holds the wall in the wall frame. Raises InputError if nothing is left.
     """
     bounds = caster.mesh.bounds
     extent = bounds[1, :2] - bounds[0, :2]
@@ -69,7 +79,7 @@ def safe_zone(caster: RayCaster, offset_m: float) -> SafeZone:
     free = (covered & (distance * grid.gsd > offset_m))[1:-1, 1:-1]
     if not free.any():
         raise InputError(
-            f"{offset_m:g} m leave nothing of a wall of {extent[0]:.3g} x {extent[1]:.3g} m",
+            f"a margin of {offset_m:g} m leaves no room on a wall of {extent[0]:.3g} x {extent[1]:.3g} m",
             where="safe_zone_offset_m",
             remedy="make it smaller",
         )

@@ -1,4 +1,4 @@
-"""The wall that a run starts from: made by rule or read from a file."""
+"""Build the wall that a run starts from, by rules or from a file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,19 @@ from scene.walls.procedural import ProceduralWall
 
 @dataclass(frozen=True)
 class Wall:
-    """A rock wall. mesh: world frame, m, float64; repairs: what was mended in it, in words with counts; name: for reports; file:
-    where it was read from, for errors."""
+    """A rock wall.
+
+    Attributes
+    ----------
+    mesh : TriangleMesh
+        World frame, m, float64.
+    repairs : tuple of str
+        What was repaired in it, in words with counts.
+    name : str
+        Name for reports.
+    file : str
+        The file that it was read from, for error messages.
+    """
 
     mesh: TriangleMesh
     repairs: tuple[str, ...]
@@ -26,7 +37,7 @@ class Wall:
 
 
 def _kind(values: Any) -> str:
-    """The key `mesh` makes it an imported wall."""
+    """Tell an imported wall, which has the key `mesh`, from a procedural one."""
     named = "mesh" in values if isinstance(values, Mapping) else isinstance(values, ImportedWall)
     return "imported" if named else "procedural"
 
@@ -35,12 +46,13 @@ WallConfig = Annotated[
     Annotated[ProceduralWall, Tag("procedural")] | Annotated[ImportedWall, Tag("imported")],
     Discriminator(_kind),
 ]
+"""The wall section of a config, procedural or imported."""
 
 
 def build_wall(config: ProceduralWall | ImportedWall, random: KeyedRandom) -> Wall:
-    """The wall that `config` describes; `random` serves a procedural wall without a seed of its own.
+    """Build the wall that `config` describes. `random` serves a procedural wall without a seed of its own.
 
-    Raises InputError where the mesh file cannot be used.
+    Raises InputError if the mesh file cannot be used.
     """
     if isinstance(config, ProceduralWall):
         return Wall(config.mesh(random), (), config.style)

@@ -1,13 +1,13 @@
-"""The frame camera: Agisoft Metashape's model, its exact inverse, and a pair of cameras.
+"""Define the frame camera (Agisoft Metashape's model and its exact inverse) and the pair of cameras.
 
 With (X, Y, Z) in the camera's frame (x right, y down, z forward), x = X/Z, y = Y/Z, r2 = x^2 + y^2:
     x' = x (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + p1 (r2 + 2 x^2) + 2 p2 x y
     y' = y (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + p2 (r2 + 2 y^2) + 2 p1 x y
     u  = width/2 + cx + x' f + x' b1 + y' b2,   v = height/2 + cy + y' f
-(Metashape user manual, appendix D). The centre of the top-left pixel is (0.5, 0.5). Against OpenCV: p1 and p2 change places,
-pixel centres differ by 0.5, k4 and b2 have no counterpart.
+(Metashape user manual, appendix D). The centre of the top-left pixel is (0.5, 0.5). Differences from OpenCV: p1 and p2 are
+exchanged, pixel centres differ by 0.5, and k4 and b2 have no counterpart.
 
-The equations use arithmetic only, so they serve NumPy arrays and Dr.Jit arrays alike.
+The equations use only arithmetic, so they work for NumPy arrays and Dr.Jit arrays alike.
 """
 
 from __future__ import annotations
@@ -26,24 +26,25 @@ from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
 _FARTHEST_M = 1e8
-"""No coordinate system of a survey reaches farther."""
+"""No coordinate system of a survey extends farther, m."""
 Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 Pixels = Annotated[float, Field(ge=-100_000, le=100_000)]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Pose = tuple[FloatArray, FloatArray]
-"""Position (3,), m, and rotation (3, 3), camera to the frame of the position."""
+"""Position (3,), m, and rotation (3, 3) from the camera to the frame of the position."""
 Side = Literal["left", "right", "both"]
+"""One of the cameras of a pair, or both."""
 
 NEWTON_STEPS = 6
-"""Newton steps of the inverse distortion: they converge quadratically, four reach 1e-15 for a lens with 10 % distortion."""
+"""Newton steps of the inverse distortion. They converge quadratically: four reach 1e-15 for a lens with 10 % distortion."""
 
 INTERIOR = ("f_px", "cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
-"""The interior orientation, in Metashape's names with units (b1, b2 in px)."""
+"""The interior orientation: Metashape's names, with units (b1, b2 in px)."""
 
 
 class CameraConfig(Config):
-    """One camera: interior orientation in Metashape's model, and exterior orientation in the world frame."""
+    """One camera: interior orientation in Metashape's model, exterior orientation in the world frame."""
 
     width: int = Field(gt=0, le=100_000, description="frame width [px]")
     height: int = Field(gt=0, le=100_000, description="frame height [px]")
@@ -67,7 +68,7 @@ class CameraConfig(Config):
         return check_rotation(rotation)
 
     def camera(self) -> Camera:
-        """The camera, world frame. Raises InputError where the distortion cannot be inverted over the frame."""
+        """Return the camera, world frame. Raises InputError if the distortion cannot be inverted over the whole frame."""
         interior = {name: getattr(self, name) for name in INTERIOR}
         position, rotation = np.array(self.position_m), np.array(self.rotation)
         camera = Camera(self.width, self.height, **interior, position=position, rotation=rotation)
@@ -76,9 +77,23 @@ class CameraConfig(Config):
 
 
 def checked_camera(where: str, size: tuple[float, float], interior: Mapping[str, float], pose: Pose) -> Camera:
-    """A camera out of another program's file, held to the same bounds as our own files (`CameraConfig`).
+    """Make a camera from another program's file, with the same limits as for our own files (`CameraConfig`).
 
-    size: width and height, px; interior: by the names of INTERIOR, those that are left out are 0; where: what errors call it.
+    Parameters
+    ----------
+    where : str
+        Name of the file in error messages.
+    size : (float, float)
+        Width and height, px.
+    interior : mapping
+        Interior orientation by the names of INTERIOR; missing ones are 0.
+    pose : Pose
+        Exterior orientation, world frame.
+
+    Raises
+    ------
+    InputError
+        If a value is out of bounds or the distortion cannot be inverted.
     """
     position, rotation = (np.asarray(part, dtype=float).tolist() for part in pose)
     values = {"width": size[0], "height": size[1], **interior, "position_m": position, "rotation": rotation}
@@ -86,19 +101,30 @@ def checked_camera(where: str, size: tuple[float, float], interior: Mapping[str,
 
 
 def check_rotation(rotation: Matrix3) -> Matrix3:
-    """The rotation itself, or ValueError where it is not orthonormal (1e-6) with determinant +1."""
+    """Return the rotation unchanged. Raises ValueError if it is not orthonormal (to 1e-6) with determinant +1."""
     matrix = np.array(rotation)
     if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
-        raise ValueError("is no rotation matrix (rows must be orthonormal, determinant +1)")
+        raise ValueError("is not a rotation matrix (rows must be orthonormal, determinant +1)")
     return rotation
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera with interior orientation (Metashape's model; px) and pose.
+    """A camera with interior orientation (Metashape's model, px) and pose.
 
-    position: (3,) perspective centre, m; rotation: (3, 3), camera to the frame of `position`. On the device (`on_device`) the
-    interior orientation holds Dr.Jit scalars instead of floats, so that one compiled kernel serves all values.
+    On the device (`on_device`) the interior orientation holds Dr.Jit scalars instead of floats, so that one compiled kernel
+    serves all values.
+
+    Attributes
+    ----------
+    width, height : int
+        Size of the frame, px.
+    f_px, cx_px, cy_px, b1, b2, k1, k2, k3, k4, p1, p2
+        Interior orientation; see the module.
+    position : (3,) array
+        Perspective centre, m.
+    rotation : (3, 3) array
+        Camera to the frame of `position`.
     """
 
     width: int
@@ -118,7 +144,7 @@ class Camera:
     rotation: FloatArray
 
     def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Ideal image coordinates (tangents) to distorted ones; arrays of any one shape."""
+        """Convert ideal image coordinates (X/Z, Y/Z) to distorted ones; arrays of any shape."""
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
         return (
@@ -127,7 +153,7 @@ class Camera:
         )
 
     def undistort(self, xd: Any, yd: Any) -> tuple[Any, Any]:
-        """Distorted image coordinates to ideal ones, by Newton's method with the analytic Jacobian."""
+        """Convert distorted image coordinates to ideal ones, by Newton's method with the analytic Jacobian."""
         x, y = xd, yd
         for _ in range(NEWTON_STEPS):
             fx, fy = self.distort(x, y)
@@ -137,7 +163,7 @@ class Camera:
         return x, y
 
     def _jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Elements xx, xy (= yx) and yy of the Jacobian of `distort`, which is symmetric."""
+        """Return the elements xx, xy (= yx) and yy of the Jacobian of `distort`, which is symmetric."""
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
         slope = 2 * (self.k1 + r2 * (2 * self.k2 + r2 * (3 * self.k3 + r2 * 4 * self.k4)))  # d radial = slope (x dx + y dy)
@@ -148,39 +174,49 @@ class Camera:
         )
 
     def pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Ideal image coordinates (tangents X/Z, Y/Z) to pixels (u, v)."""
+        """Convert ideal image coordinates (X/Z, Y/Z) to pixels (u, v)."""
         xd, yd = self.distort(x, y)
         u = self.width / 2 + self.cx_px + xd * self.f_px + xd * self.b1 + yd * self.b2
         return u, self.height / 2 + self.cy_px + yd * self.f_px
 
     def tangents(self, u: Any, v: Any) -> tuple[Any, Any]:
-        """Pixels (u, v) to ideal image coordinates (X/Z, Y/Z): the exact inverse of `pixel`."""
+        """Convert pixels (u, v) to ideal image coordinates (X/Z, Y/Z): the exact inverse of `pixel`."""
         yd = (v - self.height / 2 - self.cy_px) / self.f_px
         xd = (u - self.width / 2 - self.cx_px - yd * self.b2) / (self.f_px + self.b1)
         return self.undistort(xd, yd)
 
     def on_device(self) -> Camera:
-        """The same camera with its interior orientation as Dr.Jit scalars."""
+        """Return the same camera with its interior orientation as Dr.Jit scalars."""
         return replace(self, **{name: dr.opaque(mi.Float64, float(getattr(self, name))) for name in INTERIOR})
 
     def in_wall_frame(self, frame: WallFrame) -> Camera:
-        """The same camera, its pose moved from the world into the wall frame."""
+        """Return the same camera with its pose transformed from the world to the wall frame."""
         return replace(self, position=frame.to_wall(self.position), rotation=frame.rotation @ self.rotation)
 
     def reduced(self, step: float, width: int, height: int, corner: tuple[float, float] = (0.0, 0.0)) -> Camera:
-        """The camera of an image of width x height pixels, each `step` px of this frame wide, that starts at `corner`, px."""
+        """Return the camera of a reduced or cropped image.
+
+        Parameters
+        ----------
+        step : float
+            Side of the new pixels in px of this camera's frame.
+        width, height : int
+            Size of the new image, px.
+        corner : (float, float)
+            Where the new image starts in this camera's frame, px.
+        """
         cx = (self.width / 2 + self.cx_px - corner[0]) / step - width / 2
         cy = (self.height / 2 + self.cy_px - corner[1]) / step - height / 2
         scaled = {name: getattr(self, name) / step for name in ("f_px", "b1", "b2")}
         return replace(self, width=width, height=height, cx_px=cx, cy_px=cy, **scaled)
 
     def turned(self) -> Camera:
-        """The same camera with its image read upside down: its pixel (u, v) is this one's (width - u, height - v)."""
+        """Return the same camera with its image read upside down: its pixel (u, v) is this camera's (width - u, height - v)."""
         mirrored = {name: -getattr(self, name) for name in ("cx_px", "cy_px", "p1", "p2")}
         return replace(self, rotation=self.rotation * [-1.0, -1.0, 1.0], **mirrored)
 
     def check_invertible(self) -> None:
-        """Raise InputError where `tangents` does not invert `pixel` over the whole frame (a distortion that folds the image)."""
+        """Raise InputError if `tangents` does not invert `pixel` over the whole frame, because the distortion folds the image."""
         u, v = np.meshgrid(np.linspace(0, self.width, 33), np.linspace(0, self.height, 33))
         with np.errstate(all="ignore"):
             x, y = self.tangents(u, v)
@@ -197,45 +233,57 @@ class Camera:
 
 @dataclass(frozen=True)
 class CameraPair:
-    """The left and the right camera of a fixed stereo pair, both in one frame."""
+    """The left and the right camera of a fixed stereo pair, in the same frame."""
 
     left: Camera
     right: Camera
 
     def in_wall_frame(self, frame: WallFrame) -> CameraPair:
+        """Return the pair with its poses transformed from the world to the wall frame."""
         return CameraPair(self.left.in_wall_frame(frame), self.right.in_wall_frame(frame))
 
     def exchanged(self) -> CameraPair:
-        """The same pair with the right camera's part played by the left: both turned upside down, so that sides change."""
+        """Return the pair with both cameras upside down, so that the right camera becomes the left one."""
         return CameraPair(self.right.turned(), self.left.turned())
 
     @property
     def base_m(self) -> float:
-        """The distance between the perspective centres, m."""
+        """Distance between the perspective centres, m."""
         return float(np.linalg.norm(self.right.position - self.left.position))
 
     def changed(self, side: Side, **added: float) -> CameraPair:
-        """The pair with `added` summed to the named interior parameters of the left, the right or both cameras."""
+        """Return the pair with `added` values added to interior parameters of the left, the right or both cameras."""
         return self._each(
             side, lambda camera: replace(camera, **{key: getattr(camera, key) + value for key, value in added.items()})
         )
 
     def rotated(self, side: Side, axis: int, angle_rad: float) -> CameraPair:
-        """The pair with cameras turned about their own x (0), y (1) or z (2) axis by the right-hand rule."""
+        """Return the pair with cameras rotated about their own x (0), y (1) or z (2) axis, right-handed.
+
+        Parameters
+        ----------
+        side : str
+            The camera, "left", "right" or "both".
+        axis : int
+            Axis of the rotation.
+        angle_rad : float
+            Angle, rad.
+        """
         turn = axis_rotation(axis, angle_rad)
         return self._each(side, lambda camera: replace(camera, rotation=camera.rotation @ turn))
 
     def shifted(self, side: Side, shift_m: FloatArray) -> CameraPair:
-        """The pair with perspective centres moved by (3,) m along the axes of the frame the pair is given in."""
+        """Return the pair with perspective centres moved by `shift_m` (3,), m, along the axes of the pair's frame."""
         return self._each(side, lambda camera: replace(camera, position=camera.position + shift_m))
 
     def _each(self, side: Side, change: Any) -> CameraPair:
+        """Apply `change` to one camera or to both."""
         sides = [field.name for field in fields(self)] if side == "both" else [side]
         return replace(self, **{name: change(getattr(self, name)) for name in sides})
 
 
 def axis_rotation(axis: int, angle_rad: float) -> FloatArray:
-    """(3, 3) right-handed rotation about coordinate axis 0, 1 or 2."""
+    """Return the right-handed rotation matrix (3, 3) about coordinate axis 0, 1 or 2."""
     sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
     matrix = np.eye(3)
     first, second = (axis + 1) % 3, (axis + 2) % 3

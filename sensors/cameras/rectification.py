@@ -1,4 +1,6 @@
-"""Epipolar rectification of a calibrated pair, by OpenCV (Fusiello-style row alignment, Bouguet's split of the rotation)."""
+"""Rectify a calibrated pair of cameras epipolarly, with OpenCV (Fusiello-style row alignment, Bouguet's split of the
+rotation).
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,19 @@ from sensors.cameras.camera import Camera, CameraPair
 class Rectification:
     """Two virtual cameras whose rows are epipolar lines.
 
-    left, right: (3, 3) rotations, camera frame to rectified frame; f: principal distance, px; u_left, u_right, v: principal
-    points, px; base_m: the base, m. A point at (x, y, z) of the rectified left frame has u = f x/z + u_left, v = f y/z + v,
-    and disparity d = u_l - u_r, from which z = f base / (d - (u_left - u_right)).
+    A point (x, y, z) in the rectified left frame has u = f x/z + u_left, v = f y/z + v and disparity d = u_l - u_r, so that z
+    = f base / (d - (u_left - u_right)).
+
+    Attributes
+    ----------
+    left, right : (3, 3) arrays
+        Rotation from each camera's frame to the rectified frame.
+    f : float
+        Principal distance, px.
+    u_left, u_right, v : float
+        Principal points, px.
+    base_m : float
+        Distance between the perspective centres, m.
     """
 
     left: FloatArray
@@ -32,14 +44,14 @@ class Rectification:
 
     @property
     def offset(self) -> float:
-        """The disparity of a point at infinity, px."""
+        """Disparity of a point at infinity, px."""
         return self.u_left - self.u_right
 
 
 def rectify(pair: CameraPair) -> Rectification:
-    """Rectify a pair of cameras (given in one frame). The lens distortion is not OpenCV's business: see Camera.tangents.
+    """Rectify a pair of cameras in one frame. Lens distortion is not part of this; see Camera.tangents.
 
-    Raises InputError where the cameras are swapped, stand at one place or above one another.
+    Raises InputError if the cameras are exchanged, stand at the same place, or above each other.
     """
     left, right = pair.left, pair.right
     rotation = right.rotation.T @ left.rotation
@@ -60,7 +72,7 @@ def rectify(pair: CameraPair) -> Rectification:
 
 
 def _matrix(camera: Camera) -> FloatArray:
-    """(3, 3) OpenCV camera matrix, pixel centres at integers."""
+    """Return OpenCV's camera matrix (3, 3), where pixel centres are at integers."""
     matrix: Any = np.diag([camera.f_px, camera.f_px, 1.0])
     matrix[0, 2] = camera.width / 2 + camera.cx_px - 0.5
     matrix[1, 2] = camera.height / 2 + camera.cy_px - 0.5

@@ -1,7 +1,7 @@
-"""The registry of effects: every class that a config may name.
+"""Collect all effects that a config may name into registries.
 
-An effect is known by being there: a module of this folder, or one that another package names under the entry point
-`scarpsim.effects` ("name = package.module:Class"), holds it, and what is to be known of it stands on its class.
+A class becomes an effect by its presence: in a module of this folder, or in another package that names it under the entry
+point `scarpsim.effects` ("name = package.module:Class"). Everything that is known about an effect is declared on its class.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from sensors.effects.base import Effect, Sensor
 Effects = tuple[type[Effect], ...]
 
 PLUG_INS = "scarpsim.effects"
-"""The group of entry points."""
+"""Group of entry points by which other packages add effects."""
 
 
 def _own() -> Iterator[type[Effect]]:
+    """Yield the effects in this folder."""
     for module in iter_modules(__path__, f"{__name__}."):
         held = vars(import_module(module.name)).values()
         yield from (each for each in held if _is_effect(each) and each.__module__ == module.name)
 
 
 def _is_effect(value: Any) -> bool:
+    """Return whether a value is a concrete effect class."""
     return isinstance(value, type) and issubclass(value, Effect) and not isabstract(value) and "name" in value.__annotations__
 
 
 def _registered() -> Effects:
-    """Of this folder and of other packages, along the sensors' chains, then by name."""
+    """Return the effects of this folder and of other packages, in the order of the sensors' chains, then by name."""
     found = {effect.tag(): effect for effect in _own()}
     for entry in sorted(entry_points(group=PLUG_INS), key=lambda entry: entry.name):
         effect = entry.load()
@@ -52,21 +54,21 @@ _BY_NAME = {effect.tag(): effect for effect in EFFECTS}
 TLS_EFFECTS: Effects = tuple(each for each in EFFECTS if each.sensor == "tls" and each.catalogue)
 STEREO_EFFECTS: Effects = tuple(each for each in EFFECTS if each.sensor == "stereo" and each.catalogue)
 FURTHER_EFFECTS: Effects = tuple(each for each in EFFECTS if not each.catalogue and not each.empirical)
-"""Beyond the shared catalogue: for simulation, no candidates of `scarpsim gap`."""
+"""Effects beyond the shared catalogue: for simulation only, not candidates of `scarpsim gap`."""
 
 
 def effect_of(name: str) -> type[Effect]:
-    """The class of an effect by its name, with or without the sensor's prefix. Raises KeyError."""
+    """Return an effect's class by its name, with or without the sensor's prefix. Raises KeyError."""
     return _BY_NAME[name.rpartition(".")[2]]
 
 
 def catalogue(sensor: Sensor) -> Effects:
-    """The effects of one sensor that `scarpsim gap` may name."""
+    """Return the effects of one sensor that `scarpsim gap` may name."""
     return TLS_EFFECTS if sensor == "tls" else STEREO_EFFECTS
 
 
 def _named(effects: Effects) -> Any:
-    """The type of one entry of an `effects:` list: a mapping whose `name` picks the class out of `effects`."""
+    """Return the type of one entry of an `effects:` list: a mapping whose `name` selects the class among `effects`."""
     names = [effect.tag() for effect in effects]
     prefix = f"{effects[0].sensor}."
 
@@ -84,7 +86,7 @@ def _named(effects: Effects) -> Any:
 
 
 def _doing_something(effect: Effect) -> Effect:
-    """Refuse an effect that was named without the parameter that switches it on; one that is set to null by name stays."""
+    """Refuse an effect without the parameter that switches it on. One whose parameter is explicitly set to null is allowed."""
     switches = list(effect.nulls()) or [key for key in type(effect).model_fields if key.startswith("values_")]
     if effect.is_null and not effect.model_fields_set.intersection(switches):
         raise ValueError(f"{effect.name} does nothing without {' or '.join(switches)}; give a value")
@@ -93,4 +95,4 @@ def _doing_something(effect: Effect) -> Effect:
 
 TlsEffect = _named(tuple(each for each in EFFECTS if each.sensor == "tls"))
 StereoEffect = _named(tuple(each for each in EFFECTS if each.sensor == "stereo"))
-"""What a config may name: the catalogue and, for what it does not explain, the empirical terms that `scarpsim gap` adds."""
+"""What a config may name: the catalogue, and the empirical effects that `scarpsim gap` adds for what it does not explain."""

@@ -1,4 +1,4 @@
-"""Change of affinity and skew."""
+"""Error of the calibrated affinity and skew."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class AffinitySkew(CameraEffect):
-    """b_real = b_nominal + b: the pixels are not square, or the axes not at right angles."""
+    """Pixels are not square, or rows and columns not perpendicular, other than the calibration says: b_real = b_nominal + b."""
 
     name: Literal["affinity_skew"] = "affinity_skew"
     means = "Pixels are not square or rows not at right angles to columns as calibrated: often a scanned or resampled picture."

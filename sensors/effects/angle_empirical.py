@@ -1,4 +1,4 @@
-"""An error of a recorded angle that no effect of the catalogue explains, as a curve of an angle."""
+"""Error of a recorded angle that no effect of the catalogue explains, as a curve of an angle."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from pydantic import Field, field_validator
 
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.numerics.curve import Axis, Table, surface
+from sensors.numerics.curve import Axis, Table, interpolate
 from sensors.signal_chain.pulses import Pulses
 
 Angle = Literal["azimuth", "zenith"]
 
 
 class AngleEmpirical(Effect):
-    """d(angle) = c(x), linear between values at even distances: empirical, found by `scarpsim gap`; not in the shared catalogue.
+    """An angle is recorded wrong by d(angle) = c(x), a piecewise linear curve of an angle.
 
-    The beam leaves by as much on the other side of where it is recorded, as with every error of an angle.
+    Empirical: `scarpsim gap` adds it; it is not in the shared catalogue. As with every error of an angle, the beam leaves by
+    this much on the opposite side of the recorded direction.
     """
 
     name: Literal["angle_empirical"] = "angle_empirical"
@@ -26,10 +27,12 @@ class AngleEmpirical(Effect):
     shows_in = ShowsIn.MEAN
     catalogue = False
     empirical = True
-    angle: Angle = Field("azimuth", description="the recorded angle that is off")
-    covariate: Angle = Field("azimuth", description="x [rad]")
-    along: Axis = Field(Axis(), description="where the values stand on x")
-    values_rad: Table = Field(((0.0, 0.0),), description="c, recorded minus true: one row, from low to high of x [rad]")
+    angle: Angle = Field("azimuth", description="the recorded angle that has the error")
+    covariate: Angle = Field("azimuth", description="the angle x on which the error depends [rad]")
+    along: Axis = Field(Axis(), description="range of x that the values cover")
+    values_rad: Table = Field(
+        ((0.0, 0.0),), description="c, recorded minus true: one row of equally spaced values, from low to high x [rad]"
+    )
 
     @field_validator("values_rad")
     @classmethod
@@ -44,5 +47,5 @@ class AngleEmpirical(Effect):
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         x = state.azimuth if self.covariate == "azimuth" else state.zenith
-        error = surface(x, x, self.along, Axis(), self.values_rad)
+        error = interpolate(x, x, self.along, Axis(), self.values_rad)
         return state.with_angle_error(**{self.angle: error})

@@ -1,4 +1,4 @@
-"""Random pointing errors of the beam."""
+"""Random pointing error of the beam."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class AngleNoise(Effect):
-    """The ray leaves in another direction than is recorded: white noise on azimuth and zenith.
+    """The beam leaves in another direction than is recorded, with white noise in azimuth and zenith.
 
     aim = nominal - n, n ~ N(0, sigma) for each angle and pulse.
     """

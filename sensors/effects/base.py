@@ -1,4 +1,4 @@
-"""What every effect is: one way in which a real sensor departs from the ideal one."""
+"""Define what an effect is: one way in which a real sensor differs from the ideal one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Sensor = Literal["tls", "stereo"]
 
 
 class Stage(IntEnum):
-    """Where in a sensor's chain an effect acts; the chain runs in this order, whatever the order in a config."""
+    """Where in a sensor's chain an effect acts. The chain runs in this order, whatever the order in a config."""
 
     AIM = 1  # TLS: from the pattern's direction to the emitted one
     FOOTPRINT = 2  # TLS: the beam's sub-rays
@@ -36,7 +36,7 @@ class Stage(IntEnum):
 
 
 class ShowsIn(StrEnum):
-    """In what of a measurement an effect shows."""
+    """How an effect becomes visible in a measurement."""
 
     MEAN = "mean"  # ranges or disparities are off
     SPREAD = "spread"  # they scatter more
@@ -47,10 +47,18 @@ class ShowsIn(StrEnum):
 
 @dataclass(frozen=True)
 class Search:
-    """A sine whose period is searched.
+    """Declares that an effect is a sine whose period `scarpsim gap` searches.
 
-    period: the parameter that holds it; along: the covariate it repeats along; shortest, longest: periods, in the covariate's
-    unit, None where its reach is the bound; cycles: the fewest within that reach.
+    Attributes
+    ----------
+    period : str
+        Name of the parameter that holds the period.
+    along : str
+        Covariate along which the sine repeats.
+    shortest, longest : float
+        Range of periods, in the covariate's unit; longest is None if the covariate's range is the limit.
+    cycles : float
+        Smallest number of cycles within the covariate's range.
     """
 
     period: str
@@ -61,20 +69,44 @@ class Search:
 
 
 class Effect(Config, ABC):
-    """Base of all effects: a frozen set of parameters and a pure `apply`.
+    """Base class of all effects: a frozen set of parameters and a pure `apply`.
 
-    A subclass declares `name` (the catalogue's, as a Literal field, so that it stands in configs), `sensor` and `stage`, its
-    parameters through `parameter`, and `evaluate(state, random)`. At the parameters' null values `apply` is the identity, bit
-    for bit. Signs: recorded = true + effect. Within a stage effects act by rising `order`; equal ones in the config's order.
+    A subclass declares `name` (as a Literal field, because configs contain it), `sensor`, `stage`, its parameters through
+    `parameter`, and `evaluate(state, random)`. At the null values of all parameters `apply` is the identity, bit for bit. Sign
+    convention: recorded = true + effect. Effects of a stage act by ascending `order`, and equal ones in the config's order.
 
-    What else is to be known of it stands here too, so that no other place decides by its name:
-    shows_in; looks_at: its own pulse or pixel (`element`), neighbouring ones, or the whole scan or image; needs: fields that a
-    measurement must have; catalogue: whether `scarpsim gap` may name it; empirical: a term that has no name; planned: whether a
-    plan takes it into account; means, act: what it says of an instrument, and what to do about it, in sentences; told_by: what to
-    measure to tell it, if it is a noise that depends on something, from others;
-    searched: of a sine; sets: of its parameters that are tried (default: all that switch it on,
-    together); trials: a parameter that is not fitted, with the values that are tried; shared: whether neighbours scatter alike;
-    held_out_gain: log score on held-out data up to which it is not believed.
+    Attributes
+    ----------
+    name : str
+        Name in configs and in the catalogue.
+    sensor, stage, order
+        Where the effect acts.
+    shows_in : ShowsIn
+        How it becomes visible in a measurement.
+    looks_at : str
+        What it depends on: its own pulse or pixel ("element"), neighbouring ones, or the whole scan or image.
+    needs : tuple of str
+        Fields that a measurement must have to fit it.
+    catalogue : bool
+        Whether `scarpsim gap` may name it.
+    empirical : bool
+        Whether it describes a pattern without naming a cause.
+    planned : bool
+        Whether `scarpsim inspect` takes it into account.
+    means, act : str
+        What it says about an instrument, and what to do about it, in sentences for reports.
+    told_by : str
+        For a noise that depends on something: what to measure to distinguish it from others.
+    searched : Search, optional
+        For a sine whose period is unknown.
+    sets : tuple of tuples of str
+        Sets of parameters that `scarpsim gap` fits; by default all that switch the effect on, together.
+    trials : (str, tuple of float), optional
+        A parameter that is not fitted, and the values that are tried.
+    shared : bool
+        For noise: whether neighbours share it.
+    held_out_gain : float
+        Log score on validation data that it must exceed to be accepted.
     """
 
     name: str
@@ -98,28 +130,28 @@ class Effect(Config, ABC):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        """Raises TypeError where a class declares a searched sine and not what that runs along."""
+        """Raise TypeError if a class declares a searched sine but not the argument along which it runs."""
         if cls.searched is not None and cls.argument is Effect.argument:
             raise TypeError(f"{cls.__name__} declares `searched`; it needs `argument` too, what the sine runs along")
 
     @classmethod
     def tag(cls) -> str:
-        """The name that configs hold."""
+        """Return the name that configs contain."""
         return cast(str, cls.model_fields["name"].default)
 
     @classmethod
     def scored(cls) -> bool:
-        """Whether a Gaussian log score of residuals shows what the effect is worth."""
+        """Return whether a Gaussian log score of residuals measures the effect."""
         return cls.shows_in in (ShowsIn.MEAN, ShowsIn.SPREAD)
 
     @classmethod
     def known(cls, at: Any) -> bool:
-        """Whether a geometry holds all that the effect's equation needs."""
+        """Return whether a geometry holds all that the effect's equation needs."""
         return all(getattr(at, name, None) is not None for name in cls.needs)
 
     @classmethod
     def typical_sizes(cls) -> dict[str, float]:
-        """Typical values of the parameters that are 0 where the effect is not there."""
+        """Return typical values of the parameters that are 0 when the effect is off."""
         found = {key: info.json_schema_extra for key, info in cls.model_fields.items()}
         return {
             key: float(known["typical"])  # type: ignore[arg-type]
@@ -128,51 +160,69 @@ class Effect(Config, ABC):
         }
 
     def argument(self, at: Any) -> FloatArray:
-        """(n,) what a searched sine runs along, in the unit of its period. Raises TypeError where the effect is none."""
-        raise TypeError(f"{self.name} is no searched sine")
+        """Return the argument (n,) of a searched sine, in the unit of its period. Raises TypeError for other effects."""
+        raise TypeError(f"{self.name} is not a searched sine")
 
     def mean(self, at: Any) -> FloatArray:
-        """(n,) by how much the effect changes a recorded range (m) or disparity (px) on average.
+        """Return the mean change (n,) of a recorded range (m) or disparity (px).
 
-        at: what the sensor's equations look at, as host arrays (`PulseGeometry`, or the pixels' geometry of a stereo pair).
+        at: geometry for the sensor's equations, as host arrays (`PulseGeometry`, or the pixels' geometry of a stereo pair).
         """
         return np.zeros(len(at))
 
     def variance(self, at: Any) -> FloatArray:
-        """(n,) variance that the effect adds to a recorded range (m2) or disparity (px2)."""
+        """Return the variance (n,) that the effect adds to a recorded range (m2) or disparity (px2)."""
         return np.zeros(len(at))
 
     def kept(self, at: Any) -> FloatArray:
-        """(n,) probability that a return is not lost to the effect."""
+        """Return the probability (n,) that a return is not lost to the effect."""
         return np.ones(len(at))
 
     @property
     def is_null(self) -> bool:
-        """Whether every parameter has the value at which the effect does nothing."""
+        """Whether every parameter has the value at which the effect is off."""
         return all(getattr(self, key) == null for key, null in self.nulls().items())
 
     @classmethod
     def nulls(cls) -> dict[str, float]:
-        """The value at which the effect does nothing, by parameter; a period or a phase has none."""
+        """Return the value at which the effect is off, by parameter; a period or a phase has none."""
         extras = ((key, info.json_schema_extra) for key, info in cls.model_fields.items())
         return {
             key: cast(float, extra["null"]) for key, extra in extras if isinstance(extra, dict) and extra.get("null") is not None
         }
 
     def apply(self, state: StateT, random: KeyedRandom) -> StateT:
-        """The state (`Pulses`, `Beam`, `CameraPair`, `Matches`, `RecordedPoints`) after this effect; `random`: its own source."""
+        """Return the state (`Pulses`, `Beam`, `CameraPair`, `ImageRows`, `Matches` or `RecordedPoints`) after this effect.
+
+        `random` is the effect's own source of random numbers.
+        """
         return state if self.is_null else self.evaluate(state, random)
 
     @abstractmethod
     def evaluate(self, state: Any, random: KeyedRandom) -> Any:
-        """The state after this effect, for parameters that are not null."""
+        """Return the state after this effect, for parameters that are not null."""
 
 
 def apply_stage(effects: Sequence[Effect], stage: Stage, state: StateT, random: KeyedRandom) -> StateT:
-    """Apply the effects of one stage by rising `order`.
+    """Apply the effects of one stage by ascending `order`.
 
-    Each draws from a child of `random` named by its name and its number among the effects of that name, so that the other effects
-    of a config do not change its random numbers.
+    Each effect draws from a child of `random` named after the effect and its number among those of the same name, so that the
+    other effects of a config do not change its random numbers.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        Effects of any stage.
+    stage : Stage
+        The stage to apply.
+    state
+        What the stage acts on.
+    random : KeyedRandom
+        Source of random numbers.
+
+    Returns
+    -------
+    The changed state.
     """
     numbers: Counter[str] = Counter()
     for effect in sorted((effect for effect in effects if effect.stage == stage), key=lambda effect: effect.order):
@@ -191,10 +241,25 @@ def parameter(
     typical: float | None = None,
     **bounds: float,
 ) -> Any:
-    """A parameter of an effect: its meaning, unit, source, the value at which the effect is off, and bounds (ge, gt, le, lt).
+    """Declare a parameter of an effect.
 
-    A `null` of None marks a parameter that does not switch the effect off (a period or a phase); it needs a `default`. The
-    gallery shows the effect at its parameters' `typical` values (by default the `default`).
+    Parameters
+    ----------
+    meaning : str
+        What the parameter is.
+    unit : str
+        Its unit.
+    source : str
+        Paper, data sheet or "empirical".
+    null : float or None
+        Value at which the effect is off. None for a parameter that does not switch it off (a period, a phase), which needs a
+        `default`.
+    default : float, optional
+        Default value; by default `null`.
+    typical : float, optional
+        Value that the gallery shows; by default `default`.
+    **bounds : float
+        Limits: ge, gt, le, lt.
     """
     value = null if default is None else default
     extra: dict[str, Any] = {"unit": unit, "null": null, "source": source, "typical": default if typical is None else typical}

@@ -1,4 +1,4 @@
-"""The beam has a footprint: sub-rays that share its energy."""
+"""Footprint of the beam: sub-rays share its energy, and edges give mixed returns."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from sensors.signal_chain.beam import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
 
 
 class BeamDivergence(Effect):
-    """A Gaussian beam of full divergence D (1/e^2), as sub-rays; which of a pulse's returns is recorded, and where (`footprint`).
+    """The beam has a Gaussian cross section with full divergence D (1/e^2), represented by sub-rays.
 
-    Ranging by pulse: echoes closer than c tau / 2 run into one return at their centroid, weighted by power (mixed pixels); the
-    first return is recorded, the strongest, the mean of all, or (multiple) the strongest in the grid of the scan and every other
-    one beside it. Ranging by phase: all echoes add as phasors; the mode does not matter. On a tilted plane the footprint is
-    D R / cos i long, and the mean is the axis's range to second order in D. The block label is that of the strongest echo in the
-    return. At edges a return leans to the surface that is hit more squarely, whose echo is stronger: 0.18 +- 0.03 mm on average
-    over a rough wall of 1 M pulses at 105 m; with equal echoes it is -0.01 +- 0.02, so the sub-rays have no bias of their own.
+    A pulse scanner merges echoes closer than c tau / 2 into one return at their centroid, weighted by power (mixed pixels). It
+    records the first return, the strongest, the mean of all, or (multiple) the strongest in the scan's grid and all others
+    beside it. A phase scanner adds all echoes as phasors, whatever the mode. On a tilted plane the footprint is D R / cos i
+    long, and the mean range is that of the axis to second order in D. The block label is that of the strongest echo in the
+    return. At edges a return is biased towards the surface that is hit more squarely, whose echo is stronger: 0.18 +- 0.03 mm
+    on average over a rough wall of 1 M pulses at 105 m. With equal echoes it is -0.01 +- 0.02 mm, so the sub-rays themselves
+    have no bias.
     """
 
     name: Literal["beam_divergence"] = "beam_divergence"
@@ -33,7 +34,7 @@ class BeamDivergence(Effect):
         "full divergence, 1/e^2", unit="rad", source="datasheets (mind their conventions)", typical=3e-4, ge=0, le=0.1
     )
     mode: Mode = Field("strongest", description="which of several returns is recorded: first, strongest, mean, multiple (all)")
-    sub_rays: Literal[1, 7, 19, 37, 61, 91] = Field(19, description="sub-rays of a pulse")
+    sub_rays: Literal[1, 7, 19, 37, 61, 91] = Field(19, description="number of sub-rays of a pulse")
     pulse_width_s: float = parameter(
         "pulse width tau: echoes closer than c tau / 2 are one return",
         unit="s",

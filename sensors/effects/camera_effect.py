@@ -1,4 +1,4 @@
-"""The real camera departs from the nominal one, whose calibration the reconstruction uses."""
+"""Define the base class of effects by which the real camera differs from the nominal one used in the reconstruction."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from sensors.effects.base import Effect, ShowsIn, Stage
 
 
 class CameraEffect(Effect):
-    """Acts on the pair of cameras (`CameraPair`); what that does to disparities follows from projecting through both pairs."""
+    """An effect on the pair of cameras (`CameraPair`). Its effect on disparities follows from projecting through both pairs."""
 
     sensor = "stereo"
     stage = Stage.CAMERA

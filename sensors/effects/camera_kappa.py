@@ -11,7 +11,10 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class CameraKappa(CameraEffect):
-    """R_real = R_nominal R_z(angle), camera to world: right-handed about the camera's z axis (x right, y down, z forward)."""
+    """A camera is rotated about its own z axis against its nominal orientation.
+
+    R_real = R_nominal R_z(angle), camera to world; right-handed (x right, y down, z forward).
+    """
 
     name: Literal["camera_kappa"] = "camera_kappa"
     means = "A camera is turned about its viewing axis against its surveyed pose."

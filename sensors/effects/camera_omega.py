@@ -11,7 +11,10 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class CameraOmega(CameraEffect):
-    """R_real = R_nominal R_x(angle), camera to world: right-handed about the camera's x axis (x right, y down, z forward)."""
+    """A camera is rotated about its own x axis against its nominal orientation.
+
+    R_real = R_nominal R_x(angle), camera to world; right-handed (x right, y down, z forward).
+    """
 
     name: Literal["camera_omega"] = "camera_omega"
     means = "A camera is turned about its x axis against its surveyed pose."

@@ -11,7 +11,10 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class CameraPhi(CameraEffect):
-    """R_real = R_nominal R_y(angle), camera to world: right-handed about the camera's y axis (x right, y down, z forward)."""
+    """A camera is rotated about its own y axis against its nominal orientation.
+
+    R_real = R_nominal R_y(angle), camera to world; right-handed (x right, y down, z forward).
+    """
 
     name: Literal["camera_phi"] = "camera_phi"
     means = "A camera is turned about its y axis against its surveyed pose: the convergence of the pair is wrong."

@@ -1,4 +1,4 @@
-"""Line of sight not at right angles to the trunnion axis."""
+"""Line of sight not perpendicular to the trunnion axis."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class Collimation(AimEffect):
-    """daz = c / sin z, to first order in c (Lichti 2007, B6); z beyond pi, the second face, turns the sign.
+    """The line of sight is not perpendicular to the trunnion axis, which makes the azimuth wrong.
 
-    Fails towards the zenith, where an azimuth has no meaning.
+    daz = c / sin z, to first order in c (Lichti 2007, B6). A zenith angle z beyond pi (second face) reverses the sign. Not
+    valid towards the zenith, where an azimuth has no meaning.
     """
 
     name: Literal["collimation"] = "collimation"

@@ -15,7 +15,10 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class DetectionLimit(Effect):
-    """No return where rho cos i / R^2 < minimum, relative to albedo 1, squarely hit, at 100 m (lidar range equation)."""
+    """An echo below a minimum power gives no return.
+
+    The power is rho cos i / R^2, relative to that of albedo 1 at 100 m and normal incidence (lidar range equation).
+    """
 
     name: Literal["detection_limit"] = "detection_limit"
     means = "Echoes below a power are lost: dark, wet, distant or slanting rock leaves holes."

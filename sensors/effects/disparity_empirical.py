@@ -1,4 +1,4 @@
-"""An error of the disparity that no effect of the catalogue explains, as a curve of what it was seen to depend on."""
+"""Error of the disparity that no effect of the catalogue explains, as a curve or a surface."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pydantic import Field
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.numerics.curve import Axis, Table, surface
+from sensors.numerics.curve import Axis, Table, interpolate
 from sensors.signal_chain.matches import Matches
 
 Covariate = Literal["image_x", "image_y", "radius", "disparity", "disparity_fraction", "depth"]
 
 
 class DisparityEmpirical(Effect):
-    """dd = c(x) or c(x, y), linear between values at even distances: empirical, found by `scarpsim gap`; not in the shared
-    catalogue.
+    """The disparity is wrong by dd = c(x) or c(x, y), piecewise linear.
 
-    x, y: column, row or distance from the centre of the left image (px), disparity or its fraction (px), or depth (m).
+    x and y are column, row or distance from the centre of the left image (px), the disparity or its fraction (px), or the
+    depth (m). Empirical: `scarpsim gap` adds it; it is not in the shared catalogue.
     """
 
     name: Literal["disparity_empirical"] = "disparity_empirical"
@@ -30,11 +30,11 @@ class DisparityEmpirical(Effect):
     catalogue = False
     empirical = True
     order = 25
-    covariate: Covariate = Field("image_x", description="x")
-    along: Axis = Field(Axis(), description="where the values stand on x")
-    second: Covariate | None = Field(None, description="y, for a surface")
-    across: Axis = Field(Axis(), description="where the rows of values stand on y")
-    values_px: Table = Field(((0.0, 0.0),), description="c: rows along y, each from low to high of x [px]")
+    covariate: Covariate = Field("image_x", description="the quantity x on which the error depends")
+    along: Axis = Field(Axis(), description="range of x that the values cover")
+    second: Covariate | None = Field(None, description="a second quantity y, for a surface")
+    across: Axis = Field(Axis(), description="range of y that the rows cover")
+    values_px: Table = Field(((0.0, 0.0),), description="c: equally spaced rows along y, each from low to high x [px]")
 
     @property
     def is_null(self) -> bool:
@@ -42,10 +42,11 @@ class DisparityEmpirical(Effect):
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
         x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
-        return replace(state, disparity=state.disparity + surface(x, y, self.along, self.across, self.values_px))
+        return replace(state, disparity=state.disparity + interpolate(x, y, self.along, self.across, self.values_px))
 
     @staticmethod
     def _of(matches: Matches, covariate: Covariate) -> mi.Float64:
+        """Return a quantity (n,) by its name."""
         match covariate:
             case "image_x":
                 return matches.u

@@ -1,4 +1,4 @@
-"""Foreground that grows over the background at depth steps."""
+"""Edge fattening: the foreground grows over the background at depth steps."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from pydantic import Field
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import parameter
 from sensors.effects.raster_effect import RasterEffect
-from sensors.signal_chain.matches import bridged
+from sensors.signal_chain.matches import fill_gaps
 
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
 
 
 class EdgeFattening(RasterEffect):
-    """d(p) = max of d(q) over |q - p| <= r, q on the near side of a depth step: outlines grow by r, niches' rims shrink.
+    """At depth steps the foreground grows over the background by r: outlines become larger, niches smaller.
 
-    A depth step is where neighbouring cells differ by more than one pixel of the image that is matched: semi-global matching's
-    discontinuities (Hirschmueller 2008); a matcher that follows steeper slopes has a higher `step_px`. Slopes below that stay as
-    they are. Half-occluded cells within r get the foreground's disparity too, since both images' outlines grow alike and pass the
-    left-right check. r is used in whole cells, rounded down.
+    d(p) = max of d(q) over |q - p| <= r, for q on the near side of a depth step. A depth step is where neighbouring cells
+    differ by more than one pixel of the matched image (the discontinuities of semi-global matching, Hirschmueller 2008); for a
+    matcher that follows steeper slopes, increase `step_px`. Smaller slopes do not change. Half-occluded cells within r get the
+    foreground's disparity too, since the outlines in both images grow alike and pass the left-right check. r is rounded down
+    to whole cells.
     """
 
     name: Literal["edge_fattening"] = "edge_fattening"
@@ -35,7 +36,7 @@ class EdgeFattening(RasterEffect):
         1.0,
         gt=0,
         le=1000,
-        description="neighbours that differ by more are a depth step, at least a pixel of the match [px]",
+        description="neighbours that differ by more are a depth step; at least one pixel of the matched image [px]",
     )
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
@@ -43,11 +44,18 @@ class EdgeFattening(RasterEffect):
 
 
 def fattened(disparity: FloatArray, radius: int, step_px: float) -> FloatArray:
-    """(rows, columns) disparities, px, NaN where unmatched, with the near side of each step grown by `radius` cells.
+    """Let the near side of each depth step grow.
 
-    step_px: neighbours that differ by more are a step; across an unmatched strip, the strip counts as background.
+    Parameters
+    ----------
+    disparity : (rows, columns) array
+        Disparities, px, NaN where unmatched.
+    radius : int
+        How far the foreground grows, cells.
+    step_px : float
+        Neighbours that differ by more than this are a depth step, px. An unmatched strip counts as background.
     """
-    background = bridged(disparity, np.inf)
+    background = fill_gaps(disparity, np.inf)
     lowest = cv2.erode(np.where(np.isnan(background), np.inf, background), _CROSS)
     rim = np.where(disparity - lowest > step_px, disparity, -np.inf)
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]

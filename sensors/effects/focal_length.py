@@ -1,4 +1,4 @@
-"""Change of the principal distance."""
+"""Error of the calibrated principal distance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class FocalLength(CameraEffect):
-    """f_real = f_nominal + delta: the lens warms or is refocused (46 mm at 100 m for 20 K, Glendale lens)."""
+    """The real principal distance differs from the calibrated one: f_real = f_nominal + delta.
+
+    Causes are a change of temperature or focus (46 mm of depth at 100 m for 20 K with Glendale's lens).
+    """
 
     name: Literal["focal_length"] = "focal_length"
     means = "The principal distance is another than the calibration's: refocused, another temperature, or a weak calibration."

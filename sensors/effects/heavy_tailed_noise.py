@@ -1,4 +1,4 @@
-"""Smooth matching noise with heavy tails, as textured and bare, flat and broken rock together give it."""
+"""Grid-correlated matching noise with heavy tails, as textured and bare rock in one image give it."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import parameter
 from sensors.effects.matching_noise import NodeNoise
 from sensors.signal_chain.matches import Matches
-from sensors.signal_chain.node_grid import even_correlation, smooth_field
+from sensors.signal_chain.node_grid import smooth_field, uniform_field_correlation
 
 
 class HeavyTailedNoise(NodeNoise):
-    """dd = sigma a exp(t b - t^2), a and b independent smooth fields over the image of mean 0 and variance 1.
+    """Matching noise whose size varies log-normally over the image.
 
-    A normal error whose size varies log-normally from place to place: standard deviation sigma, kurtosis 3 exp(4 t^2). Both
-    fields: Gaussian values on a grid of nodes `step` apart, bilinear. Not in the shared catalogue; drawn from OpenCV's
-    semi-global matching of rendered and of real pictures (docs/explanation/matching.md).
+    dd = sigma a exp(t b - t^2), with a and b independent smooth fields of mean 0 and variance 1. The standard deviation is
+    sigma, the kurtosis 3 exp(4 t^2). Both fields have Gaussian values on a grid of nodes `step` apart, with bilinear
+    interpolation. The model was fitted to OpenCV's semi-global matching of rendered and real pictures
+    (docs/explanation/matching.md). It is not in the shared catalogue.
     """
 
     name: Literal["heavy_tailed_noise"] = "heavy_tailed_noise"
@@ -33,9 +34,9 @@ class HeavyTailedNoise(NodeNoise):
     order = 35
     catalogue = False
     sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.5, ge=0, le=1000)
-    step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=12.0, gt=0)
+    step_px: float = parameter("distance between nodes", unit="px", source="empirical", null=None, default=12.0, gt=0)
     tail: float = parameter(
-        "standard deviation of the size's logarithm; 0: normal errors",
+        "standard deviation of the logarithm of the local noise level; 0: normal errors",
         unit="1",
         source="empirical",
         null=None,
@@ -51,10 +52,11 @@ class HeavyTailedNoise(NodeNoise):
         return replace(state, disparity=state.disparity + mi.Float64(noise))
 
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """sigma^2 (1 - <r exp(t^2 (r - 1))>), r the correlation of the fields at two places, averaged over the places.
+        """Return sigma^2 (1 - <r exp(t^2 (r - 1))>), where r is the correlation of the fields at two positions; < > averages over
+        positions.
 
-        From E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b, b' of variance 1.
+        This follows from E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b, b' of variance 1.
         """
-        correlation = even_correlation(lag / self.step_px)
+        correlation = uniform_field_correlation(lag / self.step_px)
         kept = correlation * np.exp(self.tail**2 * (correlation - 1))
         return np.asarray(self.sigma_px**2 * (1 - kept.mean(axis=1)))

@@ -11,7 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class HorizontalEccentricity(AimEffect):
-    """daz = a sin(az + phase), once per turn (Lichti 2007, B2 and B3)."""
+    """The horizontal circle is not centred on its axis, which gives an azimuth error that repeats once per turn.
+
+    daz = a sin(az + phase) (Lichti 2007, B2 and B3).
+    """
 
     name: Literal["horizontal_eccentricity"] = "horizontal_eccentricity"
     means = "The horizontal circle is not centred on its axis: azimuths are off by a wave that repeats with the turn."

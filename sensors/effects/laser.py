@@ -1,7 +1,7 @@
-"""The three kinds that most effects of a laser scanner are of, each an equation written once for the device and for the host.
+"""Define the three base classes of most laser scanner effects, in which each equation is written once for device and host.
 
-An equation is given `at`, what it looks at (`PulseGeometry`), `m`, the functions of such arrays, and `p`, the effect's own
-parameters as numbers of the same kind.
+An equation gets `at`, the geometry (`PulseGeometry`); `m`, the functions for such arrays; and `p`, the effect's own parameters
+as numbers of the same kind.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from scene.common.backend import mi
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.numerics.functions import DEVICE, HOST, Functions, OnDevice
+from sensors.numerics.functions import DEVICE, HOST, DeviceParameters, Functions
 from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class AimEffect(Effect):
-    """The beam leaves in another direction than is recorded.
+    """An effect by which the beam leaves in another direction than is recorded.
 
-    An error d of a recorded angle makes it leave by -d, and the range that is recorded is that of where it went:
-    dR = -d dR/dangle, to first order.
+    With an error d of a recorded angle the beam leaves by -d, and the recorded range is that of where it went: dR = -d
+    dR/dangle, to first order.
     """
 
     sensor = "tls"
@@ -32,10 +32,10 @@ class AimEffect(Effect):
 
     @abstractmethod
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
-        """Recorded minus true azimuth and zenith, rad."""
+        """Return recorded minus true azimuth and zenith, rad."""
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        azimuth, zenith = self.angles(state.geometry(), DEVICE, OnDevice(self))
+        azimuth, zenith = self.angles(state.geometry(), DEVICE, DeviceParameters(self))
         return state.with_angle_error(azimuth, zenith)
 
     def mean(self, at: PulseGeometry) -> FloatArray:
@@ -44,7 +44,7 @@ class AimEffect(Effect):
 
 
 class RangeEffect(Effect):
-    """The recorded range is off."""
+    """An effect that changes the recorded range systematically."""
 
     sensor = "tls"
     stage = Stage.RANGE
@@ -52,17 +52,17 @@ class RangeEffect(Effect):
 
     @abstractmethod
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Recorded minus true range, m."""
+        """Return recorded minus true range, m."""
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        return state.with_range_error(self.error(state.geometry(), DEVICE, OnDevice(self)))
+        return state.with_range_error(self.error(state.geometry(), DEVICE, DeviceParameters(self)))
 
     def mean(self, at: PulseGeometry) -> FloatArray:
         return np.broadcast_to(self.error(at, HOST, self), len(at)).astype(np.float64)
 
 
 class RangeSpread(Effect):
-    """The recorded range scatters: white noise, a number of its own for each pulse."""
+    """An effect that adds white noise to the recorded range, independent for each pulse."""
 
     sensor = "tls"
     stage = Stage.RANGE
@@ -71,10 +71,10 @@ class RangeSpread(Effect):
 
     @abstractmethod
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Standard deviation of the range, m."""
+        """Return the standard deviation of the range, m."""
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        sigma = self.sigma(state.geometry(), DEVICE, OnDevice(self))
+        sigma = self.sigma(state.geometry(), DEVICE, DeviceParameters(self))
         return state.with_range_error(sigma * mi.Float64(state.normals(random).x))
 
     def variance(self, at: PulseGeometry) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What noise of the matching is: it makes disparities scatter, each by itself or together with its neighbours."""
+"""Define the base classes of matching noise, which makes disparities scatter independently or together with their neighbours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sensors.effects.base import Effect, ShowsIn, Stage, parameter
 
 
 class MatchingNoise(Effect):
-    """Noise of the disparity, of which the semivariogram is known in closed form."""
+    """Noise of the disparity whose semivariogram is known in closed form."""
 
     sensor = "stereo"
     stage = Stage.MATCH
@@ -21,16 +21,16 @@ class MatchingNoise(Effect):
 
     @abstractmethod
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """(k,) half the mean squared difference of two pixels `lag` ((k, 2), px, columns and rows) apart, px2."""
+        """Return half the mean squared difference (k,) of two pixels `lag` (k, 2) apart, px2; lag in px, columns and rows."""
 
     @property
     def total_variance(self) -> float:
-        """Variance of a disparity on average over the image, px2: what the semivariogram tends to."""
+        """Mean variance of a disparity over the image, px2: the limit of the semivariogram at large lags."""
         far = np.array([[1e9, 1e9]])
         return float(self.semivariogram(far)[0])
 
     def covariance(self, lag: FloatArray) -> FloatArray:
-        """(k,) of two pixels `lag` ((k, 2), px) apart, px2."""
+        """Return the covariance (k,) of two pixels `lag` (k, 2), px, apart, px2."""
         return self.total_variance - self.semivariogram(lag)
 
     def variance(self, at: Any) -> FloatArray:
@@ -38,7 +38,7 @@ class MatchingNoise(Effect):
 
 
 class NodeNoise(MatchingNoise):
-    """Noise that neighbours share: random numbers on the nodes of a grid, interpolated."""
+    """Grid-correlated noise: random numbers on the nodes of a grid, interpolated between them."""
 
     shared = True
     step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=32.0, gt=0)

@@ -7,14 +7,14 @@ from typing import Literal
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Stage, parameter
 from sensors.effects.raster_effect import RasterEffect
-from sensors.signal_chain.matches import bridged
+from sensors.signal_chain.matches import fill_gaps
 
 
 class OcclusionFill(RasterEffect):
-    """d = min(d_before, d_after): an unmatched strip of a row, at most `reach` wide, is taken for background.
+    """The matcher fills half-occluded strips of a row with the background's disparity.
 
-    d_before and d_after are the disparities at the strip's two ends; the smaller is farther away (Hirschmueller 2008, 2.5.3).
-    Strips that reach a row's end stay empty.
+    d = min(d_before, d_after) in an unmatched strip at most `reach` wide, where d_before and d_after are the disparities at
+    its ends; the smaller one is farther away (Hirschmueller 2008, 2.5.3). Strips that reach the end of a row stay empty.
     """
 
     name: Literal["occlusion_fill"] = "occlusion_fill"
@@ -24,4 +24,4 @@ class OcclusionFill(RasterEffect):
     reach_px: float = parameter("widest strip that is filled", unit="px", source="Hirschmueller 2008", typical=80.0, ge=0, le=1e5)
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
-        return bridged(disparity, self.reach_px / cell_px)
+        return fill_gaps(disparity, self.reach_px / cell_px)

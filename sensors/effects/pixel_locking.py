@@ -1,4 +1,4 @@
-"""Sub-pixel estimates drawn towards whole pixels."""
+"""Pixel locking: sub-pixel disparities are biased towards whole pixels."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from sensors.signal_chain.matches import Matches
 
 
 class PixelLocking(Effect):
-    """dd = A sin(2 pi d / n + phase), d the disparity that the matcher finds, n the reduction of the image that it matches.
+    """The matcher's sub-pixel disparities are biased towards whole pixels.
 
-    n (2, 4, 8 for high, medium, low) makes d / n count the matched image's pixels. Semi-global matching has A of about 0.2 to
-    0.25 px of the matched image, thus n times that here (Shimizu & Okutomi 2005). Acts last, on noise and all.
+    dd = A sin(2 pi d / n + phase), with d the disparity that the matcher finds and n the reduction of the matched image (2, 4,
+    8 for high, medium, low), so that d / n counts its pixels. Semi-global matching has A of about 0.2 to 0.25 px of the
+    matched image, that is n times as much here (Shimizu & Okutomi 2005). The effect acts last, after all noise.
     """
 
     name: Literal["pixel_locking"] = "pixel_locking"
@@ -36,11 +37,11 @@ class PixelLocking(Effect):
     )
 
     period_px: float | None = Field(
-        None, gt=0, description="n, where another rectification's pixels are not those of this one [px]; null: the reduction"
+        None, gt=0, description="n, if the matcher rectified to pixels of another size than here [px]; null: the reduction"
     )
-    phase_rad: float = Field(0.0, description="where another rectification's columns count from elsewhere [rad]")
+    phase_rad: float = Field(0.0, description="phase, if the matcher's rectified columns start elsewhere than here [rad]")
     tilt_rad: float = Field(
-        0.0, gt=-1, lt=1, description="by which another rectification is turned about the base against this one [rad]"
+        0.0, gt=-1, lt=1, description="rotation about the base of the matcher's rectification against the one here [rad]"
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
@@ -58,10 +59,12 @@ class PixelLocking(Effect):
 
 
 def _turned(disparity: Any, tangent: Any, infinity: Any, turn: Any) -> Any:
-    """Disparities in a rectification that is turned about the base: f B / Z' with Z' = Z (1 + y tan w), its scale left to n."""
+    """Return disparities in a rectification that is rotated about the base: f B / Z' with Z' = Z (1 + y tan w). Its scale is part
+    of n.
+    """
     return infinity + (disparity - infinity) / (1 + turn * tangent)
 
 
 def _wave(pixels: Any, phase: Any, m: Functions) -> Any:
-    """(n,) sin(2 pi d / n + phase) of disparities in pixels d / n; without whole pixels, for precision."""
+    """Return sin(2 pi d / n + phase), (n,), of disparities in pixels, d / n. Whole pixels are subtracted first, for precision."""
     return m.sin(2 * math.pi * (pixels - m.floor(pixels)) + phase)

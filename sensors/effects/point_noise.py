@@ -1,4 +1,4 @@
-"""Noise of a cloud's points in metres, for a cloud whose cameras are not known."""
+"""Noise of a cloud's points in metres, for a cloud whose cameras are unknown."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sensors.signal_chain.surface_places import RecordedPoints
 
 
 class PointNoise(Effect):
-    """dn ~ N(0, sqrt(sigma^2 + (steep b)^2)), b the slope against the wall's plane in radians, and beside it
-    sum_ij w_ij(x, y) g_ij with g_ij ~ N(0, shared) at nodes a step apart on the wall's plane.
+    """Points lie above or below the surface, along its normal, by white and by grid-correlated noise.
 
-    By so much single points, and neighbours in common, lie above the surface along its normal. Empirical, found by `scarpsim gap`
-    and `scarpsim measurement`; not in the shared catalogue.
+    The white part has the standard deviation sqrt(sigma^2 + (steep b)^2), with b the slope against the wall's plane in
+    radians. The correlated part is sum_ij w_ij(x, y) g_ij with g_ij ~ N(0, shared) at nodes a step apart on the wall's plane.
+    Empirical: `scarpsim gap` and `scarpsim measurement` estimate it; it is not in the shared catalogue.
     """
 
     name: Literal["point_noise"] = "point_noise"
@@ -37,27 +37,31 @@ class PointNoise(Effect):
         le=10,
     )
     shared_sigma_m: float = parameter("standard deviation at the nodes", unit="m", source="empirical", ge=0, le=10)
-    shared_step_m: float = parameter("distance of the nodes", unit="m", source="empirical", null=None, default=0.1, gt=0, le=1000)
+    shared_step_m: float = parameter(
+        "distance between nodes", unit="m", source="empirical", null=None, default=0.1, gt=0, le=1000
+    )
 
     @property
     def shared_variance(self) -> float:
-        """Of what neighbours have in common, on average over the surface, m2."""
+        """Variance of the grid-correlated part, averaged over the surface, m2."""
         return MEAN_VARIANCE * self.shared_sigma_m**2
 
     def variance(self, at: Any) -> FloatArray:
         return self._own_variance(at) + self.shared_variance
 
     def _own_variance(self, at: Any) -> FloatArray:
-        """(n,) of what single points have by themselves, m2."""
+        """Return the variance (n,) of the white part, m2."""
         own = np.full(len(at), self.sigma_m**2)
         return own + (self.steep_sigma_m * np.nan_to_num(at.covariates["slope"])) ** 2 if self.steep_sigma_m else own
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
         white = np.sqrt(self._own_variance(state.places)) * random.child("point").generator().standard_normal(len(state.above))
-        return state.raised(white + self.shared_sigma_m * self._field(state.places.point[:, :2], random.child("nodes")))
+        return state.with_height_error(
+            white + self.shared_sigma_m * self._field(state.places.point[:, :2], random.child("nodes"))
+        )
 
     def _field(self, at: FloatArray, random: KeyedRandom) -> FloatArray:
-        """(n,) of variance 1 at the nodes, at places (n, 2), m; 0 where a place is NaN."""
+        """Return the correlated field (n,), with variance 1 at the nodes, at positions (n, 2), m; 0 where a position is NaN."""
         known = np.isfinite(at).all(axis=1)
         field = np.zeros(len(at))
         if not self.shared_sigma_m or not known.any():

@@ -1,4 +1,4 @@
-"""Shift of the principal point along x."""
+"""Error of the calibrated principal point along x."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class PrincipalPointX(CameraEffect):
-    """cx_real = cx_nominal + delta."""
+    """The real principal point is shifted along x against the calibrated one: cx_real = cx_nominal + delta."""
 
     name: Literal["principal_point_x"] = "principal_point_x"
     means = (

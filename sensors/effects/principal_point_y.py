@@ -1,4 +1,4 @@
-"""Shift of the principal point along y."""
+"""Error of the calibrated principal point along y."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class PrincipalPointY(CameraEffect):
-    """cy_real = cy_nominal + delta."""
+    """The real principal point is shifted along y against the calibrated one: cy_real = cy_nominal + delta."""
 
     name: Literal["principal_point_y"] = "principal_point_y"
     means = (

@@ -1,4 +1,4 @@
-"""Change of the radial distortion."""
+"""Error of the calibrated radial distortion."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class RadialDistortion(CameraEffect):
-    """k_real = k_nominal + k: a doming of the surface, on a rectified pair in the ratio 3 : 1 of u to v.
+    """The real radial distortion differs from the calibrated one, which domes or dishes the surface.
 
-    dZ = -Z k1 [3 (u - b/2)^2 + v^2 + b^2/4] (James & Robson 2014), with u, v tangents of the
-    rectified left camera and b = base / Z.
+    k_real = k_nominal + k. On a rectified pair the doming is in the ratio 3 : 1 along u and v: dZ = -Z k1 [3 (u - b/2)^2 + v^2
+    + b^2/4] (James & Robson 2014), with u, v tangents in the rectified left camera and b = base / Z.
     """
 
     name: Literal["radial_distortion"] = "radial_distortion"

@@ -15,7 +15,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeCyclic(RangeEffect):
-    """dR = A sin(2 pi R / period + phase): crosstalk in the phase measurement (Lichti 2007, A3 and A4)."""
+    """The range error repeats with the range, from crosstalk in the phase measurement.
+
+    dR = A sin(2 pi R / period + phase) (Lichti 2007, A3 and A4).
+    """
 
     name: Literal["range_cyclic"] = "range_cyclic"
     means = "The range error repeats with the range: crosstalk in a phase-shift instrument, at a fraction of its wavelength."

@@ -1,4 +1,4 @@
-"""An error of the range that no effect of the catalogue explains, as a curve of what it was seen to depend on."""
+"""Error of the range that no effect of the catalogue explains, as a curve or a surface."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import Field
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.numerics.curve import Axis, Table, surface
+from sensors.numerics.curve import Axis, Table, interpolate
 from sensors.numerics.device import bounded
 from sensors.signal_chain.pulses import Pulses
 
@@ -17,10 +17,10 @@ Covariate = Literal["range", "azimuth", "zenith", "incidence", "intensity", "tim
 
 
 class RangeEmpirical(Effect):
-    """dR = c(x) or c(x, y), linear between values at even distances: empirical, found by `scarpsim gap`; not in the shared
-    catalogue.
+    """The range is wrong by dR = c(x) or c(x, y), piecewise linear.
 
-    x, y: range (m), azimuth, zenith or incidence (rad), the logarithm of the received power, or the share of the scan's duration.
+    x and y are range (m), azimuth, zenith or incidence angle (rad), the logarithm of the received power, or the elapsed share
+    of the scan's duration. Empirical: `scarpsim gap` adds it; it is not in the shared catalogue.
     """
 
     name: Literal["range_empirical"] = "range_empirical"
@@ -29,11 +29,11 @@ class RangeEmpirical(Effect):
     shows_in = ShowsIn.MEAN
     catalogue = False
     empirical = True
-    covariate: Covariate = Field("range", description="x")
-    along: Axis = Field(Axis(), description="where the values stand on x")
-    second: Covariate | None = Field(None, description="y, for a surface")
-    across: Axis = Field(Axis(), description="where the rows of values stand on y")
-    values_m: Table = Field(((0.0, 0.0),), description="c: rows along y, each from low to high of x [m]")
+    covariate: Covariate = Field("range", description="the quantity x on which the error depends")
+    along: Axis = Field(Axis(), description="range of x that the values cover")
+    second: Covariate | None = Field(None, description="a second quantity y, for a surface")
+    across: Axis = Field(Axis(), description="range of y that the rows cover")
+    values_m: Table = Field(((0.0, 0.0),), description="c: equally spaced rows along y, each from low to high x [m]")
 
     @property
     def is_null(self) -> bool:
@@ -41,10 +41,11 @@ class RangeEmpirical(Effect):
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
-        return state.with_range_error(surface(x, y, self.along, self.across, self.values_m))
+        return state.with_range_error(interpolate(x, y, self.along, self.across, self.values_m))
 
     @staticmethod
     def _of(pulses: Pulses, covariate: Covariate) -> mi.Float64:
+        """Return a quantity (n,) by its name."""
         match covariate:
             case "range":
                 return pulses.true_range

@@ -11,7 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry, slant
 
 
 class RangeIncidenceBias(RangeEffect):
-    """dR = k (1 / cos i - 1): the stretched echo of a slanting surface is timed late, or early (TLS against tracker)."""
+    """The range error grows with the incidence angle, because the stretched echo of an inclined surface is timed late or early.
+
+    dR = k (1 / cos i - 1) (TLS against laser tracker).
+    """
 
     name: Literal["range_incidence_bias"] = "range_incidence_bias"
     means = "Ranges on slanting rock are biased: the oblique footprint stretches the echo."

@@ -15,10 +15,11 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class RangeIntensityBias(RangeEffect):
-    """dR = k ln(I / I_0), I the received power and I_0 the median of all pulses that return, or a given one.
+    """The range error depends on the received power (time walk).
 
-    A weaker echo crosses a fixed threshold later, so that k is negative there. The median belongs to one scan: give I_0 where
-    scans or parts of a scan are to agree. Pulses that are lost only at the return stage still count in the median.
+    dR = k ln(I / I_0), with I the received power and I_0 a given one, or the median of all pulses that return. A weaker echo
+    crosses a fixed threshold later, so k is negative there. The median belongs to one scan: give I_0 if several scans, or
+    parts of a scan, have to agree. Pulses that are lost only at the return stage count in the median.
     """
 
     name: Literal["range_intensity_bias"] = "range_intensity_bias"
@@ -30,7 +31,7 @@ class RangeIntensityBias(RangeEffect):
         "range error per e-fold of the received power", unit="m", source="pulse scanners, empirical", typical=0.005, ge=-10, le=10
     )
     reference_power: float | None = parameter(
-        "received power without an error; none: the scan's median",
+        "received power I_0 at which the error is zero; none: the scan's median",
         unit="1, relative to albedo 1 at 100 m",
         source="empirical",
         null=None,
@@ -51,5 +52,5 @@ class RangeIntensityBias(RangeEffect):
         return super().mean(at) if self.reference_power else self._about(at.power).mean(at)
 
     def _about(self, power: FloatArray) -> RangeIntensityBias:
-        """The same effect with the median of some powers as I_0."""
+        """Return the same effect with the median of some powers as I_0."""
         return self.model_copy(update={"reference_power": (float(np.median(power)) if power.size else 0.0) or 1.0})

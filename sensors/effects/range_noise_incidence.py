@@ -11,7 +11,9 @@ from sensors.signal_chain.pulses import PulseGeometry, slant
 
 
 class RangeNoiseIncidence(RangeSpread):
-    """dR ~ N(0, s (1 / cos i - 1)) per pulse (Soudarissanane et al. 2011)."""
+    """Range noise grows with the incidence angle: dR ~ N(0, s (1 / cos i - 1)), independent for each pulse (Soudarissanane et al.
+    2011).
+    """
 
     name: Literal["range_noise_incidence"] = "range_noise_incidence"
     means = "Ranges scatter more on slanting rock."

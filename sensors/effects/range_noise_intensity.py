@@ -1,4 +1,4 @@
-"""Range noise that falls with the received power."""
+"""Range noise that decreases with the received power."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeNoiseIntensity(RangeSpread):
-    """dR ~ N(0, a I^exponent) per pulse, I the received power (Wujanz et al. 2017; Schmitz et al. 2019).
+    """Range noise decreases with the received power I: dR ~ N(0, a I^exponent), independent for each pulse.
 
-    The exponent is about -0.5 where photons are counted (shot noise), -1 where the receiver's noise dominates (thermal).
+    The exponent is about -0.5 where photon counts dominate (shot noise) and -1 where the receiver's noise dominates (thermal)
+    (Wujanz et al. 2017; Schmitz et al. 2019).
     """
 
     name: Literal["range_noise_intensity"] = "range_noise_intensity"

@@ -11,7 +11,9 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeNoiseProportional(RangeSpread):
-    """dR ~ N(0, ppm R 1e-6) per pulse, the second figure of a datasheet's "1 mm + 10 ppm"."""
+    """Range noise grows with the range: dR ~ N(0, ppm R 1e-6), independent for each pulse; the second figure of "1 mm + 10
+    ppm".
+    """
 
     name: Literal["range_noise_proportional"] = "range_noise_proportional"
     means = "Ranges scatter more the farther the rock: less light returns, or the air is unsteady."

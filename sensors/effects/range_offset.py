@@ -11,7 +11,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeOffset(RangeEffect):
-    """dR = offset: the rangefinder's zero point (Lichti 2007, A0; NIST x10)."""
+    """Every range is wrong by the same length, the rangefinder's zero error: dR = offset (Lichti 2007, A0; NIST x10)."""
 
     name: Literal["range_offset"] = "range_offset"
     means = (

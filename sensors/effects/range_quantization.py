@@ -1,4 +1,4 @@
-"""The smallest step in which ranges are counted."""
+"""Quantisation: ranges are recorded in steps."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class RangeQuantization(Effect):
-    """R to the nearest multiple of the step, after all other range effects: the counter reads what was timed, noise included.
+    """Ranges are rounded to the nearest multiple of a step, after all other range effects.
 
-    Where the range noise exceeds a third of the step, that adds the variance step^2 / 12 of a uniform error.
+    Where the range noise exceeds a third of the step, this adds the variance step^2 / 12 of a uniform error.
     """
 
     name: Literal["range_quantization"] = "range_quantization"

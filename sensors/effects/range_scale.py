@@ -11,7 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeScale(RangeEffect):
-    """dR = scale R: the instrument's scale, air temperature and pressure (about +1 ppm/K, -0.28 ppm/hPa; Lichti 2007, A1)."""
+    """Ranges are wrong in proportion to their length: dR = scale R.
+
+    Causes are the instrument's scale, and air temperature and pressure (about +1 ppm/K, -0.28 ppm/hPa; Lichti 2007, A1).
+    """
 
     name: Literal["range_scale"] = "range_scale"
     means = (

@@ -1,4 +1,4 @@
-"""What a matcher does to disparities by their neighbours: a filter of the depth map."""
+"""Define the base class of effects that filter the depth map, as a matcher does with neighbouring disparities."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sensors.signal_chain.matches import Matches
 
 
 class RasterEffect(Effect):
-    """A pure function of the raster of disparities."""
+    """An effect that is a pure function of the raster of disparities."""
 
     sensor = "stereo"
     stage = Stage.MATCH
@@ -20,9 +20,16 @@ class RasterEffect(Effect):
 
     @abstractmethod
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
-        """(rows, columns) disparities afterwards, px, NaN where there is no match.
+        """Return the changed disparities.
 
-        disparity: before, px; cell_px: px of the frame per cell; jump_px: neighbours that differ by more are a depth step.
+        Parameters
+        ----------
+        disparity : (rows, columns) array
+            Disparities, px, NaN without a match.
+        cell_px : float
+            Frame px per cell.
+        jump_px : float
+            Neighbours that differ by more than this are a depth step, px.
         """
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:

@@ -1,4 +1,4 @@
-"""Smooth matching noise, as semi-global matching makes it."""
+"""Grid-correlated matching noise, as the regularisation of semi-global matching causes it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from sensors.signal_chain.node_grid import node_semivariogram, smooth_field
 
 
 class RegularizationNoise(NodeNoise):
-    """Gaussian values on the nodes of a grid over the image, interpolated bilinearly (thesis 3.4).
+    """Neighbouring disparities share errors: Gaussian values on the nodes of a grid over the image, interpolated bilinearly.
 
-    dd(u, v) = sum_ij w_ij(u, v) g_ij, g_ij ~ N(0, sigma), nodes at multiples of the step. Midway between nodes the variance is
-    sigma^2 / 4 (bilinear), over the whole image 4 sigma^2 / 9 on average.
+    dd(u, v) = sum_ij w_ij(u, v) g_ij, g_ij ~ N(0, sigma), with nodes at multiples of the step (thesis 3.4). The variance is
+    sigma^2 / 4 midway between nodes, and 4 sigma^2 / 9 on average over the image.
     """
 
     name: Literal["regularization_noise"] = "regularization_noise"

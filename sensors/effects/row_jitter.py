@@ -1,4 +1,4 @@
-"""Rows of an image displaced sideways, by a rolling shutter or vibration."""
+"""Image rows displaced sideways, by a rolling shutter or vibration."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Side
 from sensors.effects.base import Effect, Search, ShowsIn, Stage, parameter
-from sensors.numerics.functions import DEVICE, HOST, Functions, OnDevice
+from sensors.numerics.functions import DEVICE, HOST, DeviceParameters, Functions
 from sensors.signal_chain.matches import ImageRows
 
 
 class RowJitter(Effect):
-    """dx = A sin(2 pi row / n + phase): the recorded column of a pixel minus its ideal one; row = v, px from the frame's top.
+    """Image rows are displaced sideways by a wave, as by a rolling shutter or vibration during the exposure.
 
-    In the left image it changes the disparity by +dx and makes each pixel look dx px to the left of where it belongs; in the
-    right image it changes the disparity by -dx at the right image's row. Two cameras that shake alike (`both`) therefore keep
-    the depth but for the difference of the rows that a point has in the two images.
+    dx = A sin(2 pi row / n + phase) is the recorded minus the ideal column of a pixel; row = v, px from the top of the frame.
+    In the left image this changes the disparity by +dx, and each pixel sees what lies dx px to the left. In the right image it
+    changes the disparity by -dx at the right image's row. If both cameras shake alike (`both`), the depth is preserved except
+    for the difference between the rows of a point in the two images.
     """
 
     name: Literal["row_jitter"] = "row_jitter"
@@ -37,13 +38,13 @@ class RowJitter(Effect):
     phase_rad: float = parameter("phase at the frame's top", unit="rad", source="empirical", null=None, default=0.0)
 
     def shift(self, row: Any, m: Functions, p: Any) -> Any:
-        """(n,) recorded minus ideal column, px, of pixels at `row` (px)."""
+        """Return recorded minus ideal column (n,), px, of pixels at `row`, px."""
         return p.amplitude_px * m.sin(2 * math.pi * row / p.rows_per_cycle + p.phase_rad)
 
     def evaluate(self, state: ImageRows, random: KeyedRandom) -> ImageRows:
         if self.camera not in (state.camera, "both"):
             return state
-        return replace(state, du=state.du + self.shift(state.v, DEVICE, OnDevice(self)))
+        return replace(state, du=state.du + self.shift(state.v, DEVICE, DeviceParameters(self)))
 
     def mean(self, at: Any) -> FloatArray:
         left = self.shift(at.v, HOST, self) if self.camera != "right" else 0.0

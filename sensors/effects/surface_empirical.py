@@ -1,4 +1,4 @@
-"""An error of a cloud's points that is described over the surface, for a cloud whose cameras are not known."""
+"""Error of a cloud's points described over the surface, for a cloud whose cameras are unknown."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from pydantic import Field
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn, Stage
-from sensors.numerics.curve import Axis, Table, surface_on_host
+from sensors.numerics.curve import Axis, Table, interpolate_on_host
 from sensors.signal_chain.surface_places import Covariate, RecordedPoints, SurfacePlaces
 
 
 class SurfaceEmpirical(Effect):
-    """dn = c(x) or c(x, y), linear between values at even distances: how far points lie above the surface along its normal.
-    Empirical, found by `scarpsim gap`; not in the shared catalogue.
+    """Points lie above the surface, along its normal, by dn = c(x) or c(x, y), piecewise linear.
 
-    x, y: place along the wall, up it or out of its plane (m), slope against that plane (rad), roughness, convexity, or distance
-    to the nearest edge (m).
+    x and y are the position along the wall, up it or out of its plane (m), the slope against that plane (rad), roughness,
+    convexity, or the distance to the nearest edge (m). Empirical: `scarpsim gap` adds it; it is not in the shared catalogue.
     """
 
     name: Literal["surface_empirical"] = "surface_empirical"
@@ -27,11 +26,11 @@ class SurfaceEmpirical(Effect):
     shows_in = ShowsIn.MEAN
     catalogue = False
     empirical = True
-    covariate: Covariate = Field("along", description="x")
-    along: Axis = Field(Axis(), description="where the values stand on x")
-    second: Covariate | None = Field(None, description="y, for a surface")
-    across: Axis = Field(Axis(), description="where the rows of values stand on y")
-    values_m: Table = Field(((0.0, 0.0),), description="c: rows along y, each from low to high of x [m]")
+    covariate: Covariate = Field("along", description="the quantity x on which the error depends")
+    along: Axis = Field(Axis(), description="range of x that the values cover")
+    second: Covariate | None = Field(None, description="a second quantity y, for a surface")
+    across: Axis = Field(Axis(), description="range of y that the rows cover")
+    values_m: Table = Field(((0.0, 0.0),), description="c: equally spaced rows along y, each from low to high x [m]")
 
     @property
     def is_null(self) -> bool:
@@ -39,9 +38,9 @@ class SurfaceEmpirical(Effect):
 
     def mean(self, at: SurfacePlaces) -> FloatArray:
         found = at.covariates
-        return surface_on_host(
+        return interpolate_on_host(
             found[self.covariate], found[self.second or self.covariate], self.along, self.across, self.values_m
         )
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
-        return state.raised(self.mean(state.places))
+        return state.with_height_error(self.mean(state.places))

@@ -1,4 +1,4 @@
-"""Change of the tangential distortion."""
+"""Error of the calibrated tangential distortion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class TangentialDistortion(CameraEffect):
-    """p_real = p_nominal + p, in Metashape's order (OpenCV's p1 and p2 change places)."""
+    """The real tangential distortion differs from the calibrated one: p_real = p_nominal + p.
+
+    The parameters are in Metashape's order; OpenCV exchanges p1 and p2.
+    """
 
     name: Literal["tangential_distortion"] = "tangential_distortion"
     means = "The lens's elements are not centred as the calibration says."

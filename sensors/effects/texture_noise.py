@@ -15,21 +15,22 @@ from sensors.effects.base import Effect, ShowsIn, Stage, parameter
 from sensors.signal_chain.matches import Matches
 
 WINDOW = 5
-"""Side of the window whose gradients add up, cells."""
+"""Side of the window over which gradients are summed, cells."""
 
 WHITE = 255.0
 """Grey value of albedo 1."""
 
 LARGEST_SIGMA_PX = 1.0
-"""Where there is no texture the matcher's smoothness holds the disparity: sigma_d ends here."""
+"""Upper limit of sigma_d: without texture, the matcher's smoothness constrains the disparity."""
 
 
 class TextureNoise(Effect):
-    """sigma_d^2 = k sigma_I^2 / sum gx^2, at most 1 px^2: the Cramer-Rao bound of matching a window by its texture.
+    """Matching noise grows where the rock has little texture, by the Cramer-Rao bound of matching a window.
 
-    gx: horizontal gradient of the image, grey values per px of the full-resolution frame, summed over 5 x 5 cells; for the
-    simulated matcher the image is 255 x albedo (no shading, no texture finer than the wall's triangles). sigma_I: 1 grey value
-    of 255. k = 2 is the bound for two equally noisy images; a finer texture than the albedo's makes it smaller.
+    sigma_d^2 = k sigma_I^2 / sum gx^2, at most 1 px^2. gx is the horizontal gradient of the image, in grey values per px of
+    the full-resolution frame, summed over 5 x 5 cells. For the simulated matcher the image is 255 x albedo (no shading, no
+    texture finer than the wall's triangles). sigma_I is 1 grey value of 255. k = 2 is the bound for two equally noisy images;
+    texture finer than the albedo's makes k smaller.
     """
 
     name: Literal["texture_noise"] = "texture_noise"
@@ -58,7 +59,7 @@ class TextureNoise(Effect):
 
 
 def texture(image: FloatArray, reduction: int) -> FloatArray:
-    """(rows, columns) sum of squared horizontal gradients over the window, in (grey values per px of the frame)^2.
+    """Sum the squared horizontal gradients over the window (rows, columns), in (grey values per px of the frame)^2.
 
     image: grey values, NaN where unknown; gradients that need an unknown value count as 0. reduction: frame px per cell.
     """

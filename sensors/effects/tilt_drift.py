@@ -11,11 +11,11 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class TiltDrift(AimEffect):
-    """Recorded directions are the true ones turned about the scanner's x and y axes by angles that grow from 0 to the rates.
+    """The scanner tilts during the scan, so that directions are rotated by angles that grow from 0 to the given rates.
 
-    With w = s (rate_x, rate_y, 0), s the share of the scan's duration that has passed, and right-handed rotations:
-    recorded - true = w x u, that is daz = -cot z (w_x cos az + w_y sin az) and dz = w_y cos az - w_x sin az. The scanner itself
-    then tilts by -w. First order in the angles: 60 arcsec leave less than 0.01 mm at 100 m.
+    With w = s (rate_x, rate_y, 0), s the elapsed share of the scan's duration, and right-handed rotations about the scanner's
+    axes: recorded - true = w x u, that is daz = -cot z (w_x cos az + w_y sin az) and dz = w_y cos az - w_x sin az. The scanner
+    itself then tilts by -w. First order in the angles: 60 arcsec leave an error below 0.01 mm at 100 m.
     """
 
     name: Literal["tilt_drift"] = "tilt_drift"

@@ -1,4 +1,4 @@
-"""Trunnion axis not at right angles to the standing axis."""
+"""Trunnion axis not perpendicular to the standing axis."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class TrunnionTilt(AimEffect):
-    """daz = t cot z, to first order in t (Lichti 2007, B7; NIST x7); z beyond pi, the second face, turns the sign.
+    """The trunnion axis is not perpendicular to the standing axis, which makes the azimuth wrong in proportion to cot z.
 
-    Fails towards the zenith, where an azimuth has no meaning.
+    daz = t cot z, to first order in t (Lichti 2007, B7; NIST x7). A zenith angle z beyond pi (second face) reverses the sign.
+    Not valid towards the zenith, where an azimuth has no meaning.
     """
 
     name: Literal["trunnion_tilt"] = "trunnion_tilt"

@@ -11,7 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class VerticalEccentricity(AimEffect):
-    """dz = a sin(z + phase), once per turn (Lichti 2007, C2)."""
+    """The vertical circle is not centred on its axis, which gives a zenith error that repeats once per turn.
+
+    dz = a sin(z + phase) (Lichti 2007, C2).
+    """
 
     name: Literal["vertical_eccentricity"] = "vertical_eccentricity"
     means = "The vertical circle is not centred on its axis: zenith angles are off by a wave."

@@ -11,7 +11,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class VerticalIndex(AimEffect):
-    """dz = offset, the same in both faces: the recorded zenith angle is too large by it (Lichti 2007, C0; NIST x4)."""
+    """All zenith angles are too large by the same angle, in both faces: dz = offset (Lichti 2007, C0; NIST x4)."""
 
     name: Literal["vertical_index"] = "vertical_index"
     means = "All zenith angles are off by one angle: the vertical circle's zero."

@@ -1,4 +1,4 @@
-"""Standing axis that wobbles as the scanner turns."""
+"""Standing axis that wobbles as the scanner rotates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class Wobble(AimEffect):
-    """dz = a sin(2 pi line / n + phase), line the scan line's number from the scan's first, one step in azimuth each."""
+    """The standing axis wobbles as the scanner rotates, which tilts whole scan lines by a wave.
+
+    dz = a sin(2 pi line / n + phase), with `line` the number of the scan line from the scan's first; one line per azimuth
+    step.
+    """
 
     name: Literal["wobble"] = "wobble"
     means = "The standing axis wobbles as the scanner turns: whole scan lines are tilted by a wave."

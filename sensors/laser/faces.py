@@ -1,4 +1,4 @@
-"""Both faces of a laser scanner: the mean that instrument errors of opposite sign cancel in."""
+"""Average the two faces of a laser scanner, in which instrument errors of opposite sign cancel."""
 
 from __future__ import annotations
 
@@ -12,10 +12,18 @@ from sensors.signal_chain.observation import Observation
 
 
 def mean_of_faces(first: Observation, second: Observation, tolerance_m: float) -> Observation:
-    """One observation of two scans of the same directions, (h, w) each, from the same place.
+    """Average two scans (h, w) of the same directions from the same place.
 
-    A cell holds the mean of both where their ranges differ by at most `tolerance_m`, else what the first face saw (a mean over an
-    edge would be a point in the air), or the only return there is. Labels and times are the first face's.
+    A cell holds the mean if the two ranges differ by at most `tolerance_m`. Otherwise it holds the first face's point, because
+    a mean across a depth edge would lie in the air; if only one face has a return, it holds that one. Labels and times are
+    those of the first face.
+
+    Parameters
+    ----------
+    first, second : Observation
+        The scans in the first and in the second face.
+    tolerance_m : float
+        Largest difference of the ranges that is averaged, m.
     """
     both = np.abs(first.depth - second.depth) <= tolerance_m
     filled = ~first.valid

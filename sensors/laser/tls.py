@@ -1,4 +1,7 @@
-"""The terrestrial laser scanner: pulses in a pattern of azimuth and zenith, ray-traced, recorded in their nominal directions."""
+"""Simulate the terrestrial laser scanner.
+
+Pulses leave in a pattern of azimuth and zenith, are ray-traced, and are recorded in their nominal directions.
+"""
 
 from __future__ import annotations
 
@@ -29,14 +32,14 @@ from sensors.signal_chain.beam import Beam, Echo, SubRays
 from sensors.signal_chain.observation import FurtherReturns, Observation, offset_of, packed
 from sensors.signal_chain.polar import polar
 from sensors.signal_chain.pulses import REFERENCE_RANGE_M, Pulses, direction, tangents
-from sensors.signal_chain.returns import MOST_RETURNS, Recorded, further_returns
+from sensors.signal_chain.returns import MOST_RETURNS, RecordedReturns, further_returns
 
 Window = tuple[float, float]
 
 _RAYS_AT_ONCE = 1 << 20
-"""Sub-rays whose echoes are held at a time: 25 MB."""
+"""Number of sub-rays whose echoes are held in memory at a time: 25 MB."""
 _BYTES_PER_PULSE = 400
-"""What a pulse takes at the peak: rays, points, surface and the difference's ray tracing of it."""
+"""Peak memory per pulse: rays, points, surface, and the ray tracing of the difference map."""
 
 
 class ScannerConfig(Config):
@@ -57,7 +60,7 @@ class ScannerConfig(Config):
     face_tolerance_m: float = Field(
         0.1, ge=0, description="ranges of both faces that differ by more are not averaged, the first face's is kept [m]"
     )
-    wavelength_nm: float = Field(1550.0, ge=300, le=3000, description="of the laser, for the extinction in haze [nm]")
+    wavelength_nm: float = Field(1550.0, ge=300, le=3000, description="wavelength of the laser, for the extinction in haze [nm]")
 
     @model_validator(mode="after")
     def _ordered(self) -> ScannerConfig:
@@ -76,7 +79,7 @@ class ScannerConfig(Config):
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient of the air, 1/m; 0 where no visibility is given."""
+        """Extinction coefficient of the air, 1/m; 0 without a visibility."""
         return 0.0 if self.visibility_m is None else extinction_per_m(self.visibility_m, self.wavelength_nm)
 
 
@@ -93,7 +96,10 @@ class Pattern:
 
     @classmethod
     def over(cls, azimuth: Window, zenith: Window, config: ScannerConfig) -> Pattern:
-        """The pattern that starts at the windows' starts and ends at or before their stops."""
+        """Make the pattern that starts at the start of the windows and ends at or before their stop.
+
+        Raises InputError if it would not fit in the free memory.
+        """
         lines, pulses = (
             int(np.floor((stop - start) / step + 1e-9)) + 1
             for (start, stop), step in ((azimuth, config.azimuth_step_rad), (zenith, config.zenith_step_rad))
@@ -109,7 +115,7 @@ class Pattern:
         return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)
 
     def second_face(self) -> Pattern:
-        """The same directions in the other face: the azimuth turned by pi, the zenith angle 2 pi less what it was."""
+        """Return the same directions in the second face: azimuth + pi, and 2 pi minus the zenith angle."""
         return replace(
             self,
             azimuth_start=self.azimuth_start + np.pi,
@@ -122,8 +128,22 @@ class Pattern:
 class LaserScanner:
     """A scanner on its station.
 
-    position: (3,) m and rotation: (3, 3), scanner to wall frame, as surveyed; pattern: what it scans; truth: whether channels of
-    it are kept; pose_sigma: how well the pose is known.
+    Attributes
+    ----------
+    position : (3,) array
+        As surveyed, wall frame, m.
+    rotation : (3, 3) array
+        Scanner to wall frame, as surveyed.
+    pattern : Pattern
+        The directions that are scanned.
+    config : ScannerConfig
+        The instrument.
+    model : TlsModel
+        Its noise and effects.
+    truth : bool
+        Whether to keep error-free channels.
+    pose_sigma : PoseSigma
+        Standard deviations of the surveyed pose.
     """
 
     position: FloatArray
@@ -145,9 +165,29 @@ class LaserScanner:
         truth: bool = False,
         pose_sigma: PoseSigma = EXACT_POSE,
     ) -> LaserScanner:
-        """A scanner whose window, where the config leaves it open, is the extent of `vertices` ((n, 3), wall frame).
+        """Make a scanner whose window, unless the config states one, covers the whole wall.
 
-        station: position (3,) and rotation (3, 3) scanner to world.
+        Parameters
+        ----------
+        station : (position, rotation)
+            Position (3,), m, and rotation (3, 3), scanner to world.
+        frame : WallFrame
+            The wall frame.
+        vertices : (n, 3) array
+            Vertices of the wall, wall frame, m.
+        config : ScannerConfig
+            The instrument.
+        model : TlsModel
+            Its noise and effects.
+        truth : bool
+            Whether to keep error-free channels.
+        pose_sigma : PoseSigma
+            Standard deviations of the surveyed pose.
+
+        Raises
+        ------
+        InputError
+            If the wall lies outside the scanner's field of view.
         """
         position, rotation = frame.to_wall(station[0]), frame.rotation @ station[1]
         azimuth, zenith = _extent(vertices, position, rotation)
@@ -163,7 +203,10 @@ class LaserScanner:
         return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model, truth, pose_sigma)
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """One scan; rows are scan lines (azimuth), columns the pulses of a line (zenith). Recorded from the surveyed pose."""
+        """Scan the scene once. Rows are scan lines (azimuth), columns the pulses of a line (zenith).
+
+        Points are computed with the surveyed pose; pulses leave from the real one, which is drawn with `pose_sigma`.
+        """
         position, rotation = self.pose_sigma.displaced(self.position, self.rotation, random.child("pose"))
         real = replace(self, position=position, rotation=rotation)
         seen = self._scan(real, scene, random)
@@ -173,23 +216,23 @@ class LaserScanner:
         return mean_of_faces(seen, turned._scan(real, scene, random.child("face", 2)), self.config.face_tolerance_m)
 
     def _scan(self, real: LaserScanner, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """A scan in one face; real: the scanner where it really stands."""
+        """Scan in one face. real: the scanner in its real pose."""
         pulses, beam = self.emitted(self.emit(), random)
         if beam.records_several and self.config.faces == 2:
             raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
-        echo = real.echo(scene, pulses, beam, beam.received)
+        echo = real.echo(scene, pulses, beam, beam.combine_echoes)
         seen = self._record(self.measured(pulses, echo, random), real)
         if echo.returns is None or not np.any(echo.returns.numpy() > 1):
             return seen
         return replace(seen, further=self._further(real, scene, random, seen, echo.returns))
 
     def emitted(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
-        """The pulses as they really leave, and the beam."""
+        """Apply the effects on aim and footprint: return the pulses as they actually leave, and the beam."""
         effects = self.model.chain()
         return apply_stage(effects, Stage.AIM, pulses, random), apply_stage(effects, Stage.FOOTPRINT, Beam(), random)
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
-        """What the instrument makes of the return of each pulse."""
+        """Apply the effects on range, power and returns to the pulses, given their echoes."""
         pulses = replace(
             pulses,
             true_range=echo.range_m,
@@ -207,15 +250,15 @@ class LaserScanner:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(lines, pulses of a line) of an observation."""
+        """(lines, pulses per line) of an observation."""
         return self.pattern.lines, self.pattern.pulses
 
     def emit(self) -> Pulses:
-        """The pattern's pulses, in order of lines, before any effect."""
+        """Return all pulses of the pattern, line by line, before any effect."""
         return self.pulses_at(dr.arange(mi.UInt32, self.pattern.lines * self.pattern.pulses))
 
     def pulses_at(self, index: mi.UInt32) -> Pulses:
-        """The pulses of these numbers, which count along the lines of the pattern, before any effect."""
+        """Return the pulses with these numbers, which count line by line through the pattern, before any effect."""
         pattern = self.pattern
         line = index // dr.opaque(mi.UInt32, pattern.pulses)
         pulse = index - line * dr.opaque(mi.UInt32, pattern.pulses)
@@ -235,9 +278,21 @@ class LaserScanner:
         )
 
     def echo(self, scene: RayCaster, pulses: Pulses, beam: Beam, merge: Callable[[SubRays], Echo]) -> Echo:
-        """Ray-trace the emitted beams; `merge` makes one echo of those of a pulse's sub-rays.
+        """Ray-trace the emitted beams.
 
-        Rays start from memory and echoes end there, so that one compiled kernel serves whatever effects come before and after.
+        Rays start from evaluated memory and echoes end there, so that one compiled kernel serves whatever effects come before
+        and after.
+
+        Parameters
+        ----------
+        scene : RayCaster
+            The wall, wall frame.
+        pulses : Pulses
+            The pulses as they leave.
+        beam : Beam
+            The cross section of the beam.
+        merge : callable
+            Combines the echoes of each pulse's sub-rays into one.
         """
         dr.eval(pulses.aim_azimuth, pulses.aim_zenith)
         count, parts = dr.width(pulses.aim_azimuth, pulses.aim_zenith), []
@@ -249,9 +304,9 @@ class LaserScanner:
         return Echo.joined(parts)
 
     def _sub_ray_echoes(self, scene: RayCaster, pulses: Pulses, beam: Beam, start: int, count: int) -> SubRays:
-        """The echoes of all sub-rays of `count` pulses from the number `start` on.
+        """Return the echoes of all sub-rays of `count` pulses from number `start` on.
 
-        The rays of one pulse are traced together: they are neighbours, and several times as fast as one ray of each pulse.
+        The rays of one pulse are traced together: they are neighbours, which is several times as fast as one ray per pulse.
         """
         ray, many = dr.arange(mi.UInt32, count * beam.sub_rays), dr.opaque(mi.UInt32, beam.sub_rays)
         own = ray // many
@@ -264,14 +319,16 @@ class LaserScanner:
         return SubRays(echoes, beam.sub_rays)
 
     def _axes(self, pulses: Pulses, start: int, count: int) -> tuple[mi.Array3f64, ...]:
-        """Unit vectors along the beams of `count` pulses from the number `start` on, and two across each, wall frame."""
+        """Return unit vectors along the beams of `count` pulses from number `start` on, and two perpendicular to each, wall
+        frame.
+        """
         pulse = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
         azimuth, zenith = (dr.gather(mi.Float64, angle, pulse) for angle in (pulses.aim_azimuth, pulses.aim_zenith))
         vectors = direction(azimuth, zenith), *tangents(azimuth, zenith)
         return tuple(rotated(self.rotation, each) for each in vectors)
 
     def _traced(self, scene: RayCaster, ray: mi.Array3f64) -> Echo:
-        """What rays along unit vectors bring back; power by the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
+        """Trace rays along unit vectors. The power follows the lidar range equation, rho cos i / R^2 exp(-2 sigma R)."""
         hits = scene.intersect(vector(self.position), ray, exact=True)
         cos_incidence = -dr.dot(hits.normal, mi.Vector3f(ray))
         power = hits.albedo * cos_incidence * dr.square(REFERENCE_RANGE_M / mi.Float32(hits.distance))
@@ -282,7 +339,7 @@ class LaserScanner:
         return Echo(hits.distance, cos_incidence, hits.albedo, power, hits.block, returned)
 
     def _record(self, pulses: Pulses, real: LaserScanner) -> Observation:
-        """The scan's grid; real: the scanner where it really stands."""
+        """Make the observation of the scan's grid. real: the scanner in its real pose."""
         shape = self.shape
         found = self._recorded(pulses, real)
         if np.isnan(found.depth).all():
@@ -302,10 +359,10 @@ class LaserScanner:
             offset=found.offset.reshape(*shape, 2),
         )
 
-    def _recorded(self, pulses: Pulses, real: LaserScanner) -> Recorded:
-        """Points from the nominal direction and the recorded range; NaN and WALL where nothing returned.
+    def _recorded(self, pulses: Pulses, real: LaserScanner) -> RecordedReturns:
+        """Compute points from the nominal direction and the recorded range; NaN and WALL where nothing returned.
 
-        real: the scanner where it really stands.
+        real: the scanner in its real pose.
         """
         returned = pulses.returned
         range_m = dr.select(returned, pulses.range_m, np.nan)
@@ -319,7 +376,7 @@ class LaserScanner:
         channels = {"true_range_m": pulses.true_range, "cos_incidence": pulses.cos_incidence} if self.truth else {}
         truth = {name: dr.select(returned, channel, np.nan) for name, channel in channels.items()}
         dr.eval(points, offset, range_m, power, block, truth)
-        return Recorded(
+        return RecordedReturns(
             points=points.numpy().reshape(-1, 3),
             offset=offset.numpy().reshape(-1, 2),
             depth=range_m.numpy(),
@@ -331,47 +388,50 @@ class LaserScanner:
     def _further(
         self, real: LaserScanner, scene: RayCaster, random: KeyedRandom, seen: Observation, count: mi.UInt32
     ) -> FurtherReturns:
-        """The returns of pulses with `count` of them beside those in the grid; each number is traced again, for few pulses.
+        """Find the returns beyond those in the grid, for pulses with `count` returns.
 
-        Every return has noise of its own. An effect that compares with the whole scan compares with the returns of one number.
+        Each return number is traced again for the few pulses that have it. Every return has its own noise. An effect that
+        compares a pulse with the whole scan compares it with the returns of the same number.
         """
         found, emitted = [], self.emit().evaluated()
         for number in range(1, min(int(count.numpy().max()), MOST_RETURNS) + 1):
             index = dr.compress(count >= max(number, 2))
             pulses, beam = self.emitted(emitted.at(index), random)
-            echo = real.echo(scene, pulses, beam, partial(beam.numbered, number=dr.opaque(mi.UInt32, number)))
+            echo = real.echo(scene, pulses, beam, partial(beam.return_of_number, number=dr.opaque(mi.UInt32, number)))
             recorded = self._recorded(self.measured(pulses, echo, random.child("return", number)), real)
             found.append((index.numpy().astype(np.int64), np.array(echo.strongest, dtype=bool), recorded))
         return further_returns(found, seen)
 
 
 def _grid_number(start: float, step: float) -> mi.UInt32:
-    """Number of a pattern's first line or pulse on the grid of multiples of `step`; one more for every step further.
+    """Return the number of a pattern's first line or pulse on the grid of multiples of `step`.
 
-    A start between two multiples belongs to the lower one up to a share that no simple fraction meets, so that rounding errors
-    do not decide.
+    A start between two multiples belongs to the lower one up to a share (0.618) that no simple fraction equals, so that
+    rounding errors do not decide.
     """
     return dr.opaque(mi.UInt32, int(np.floor(start / step + 0.381966)) % 2**32)
 
 
 def _extent(vertices: FloatArray, position: FloatArray, rotation: FloatArray) -> tuple[Window, Window]:
-    """Windows in azimuth and zenith, rad, that hold all vertices; azimuth is measured from the vertices' mean direction."""
+    """Return the windows in azimuth and zenith, rad, that contain all vertices."""
     middle_x, middle_y, _ = (vertices.mean(axis=0) - position) @ rotation
     middle = float(np.arctan2(middle_y, middle_x))
-    turn = rotation @ axis_rotation(2, middle)  # so that no azimuth window straddles the cut at pi
+    turn = rotation @ axis_rotation(2, middle)  # measure azimuths from the mean direction, away from the cut at pi
     limits = np.array([_angles((vertices[rows : rows + _CHUNK] - position) @ turn) for rows in range(0, len(vertices), _CHUNK)])
     low, high = limits[:, :, 0].min(axis=0), limits[:, :, 1].max(axis=0)
     return (middle + float(low[0]), middle + float(high[0])), (float(low[1]), float(high[1]))
 
 
 _CHUNK = 1 << 20
+"""Number of vertices processed at a time."""
 
 
 def _angles(local: FloatArray) -> list[list[float]]:
-    """Smallest and largest azimuth, then zenith, of (n, 3) points in the scanner's frame, rad."""
+    """Return smallest and largest azimuth, then zenith, rad, of points (n, 3) in the scanner's frame."""
     _, *angles = polar(local)
     return [[angle.min(), angle.max()] for angle in angles]
 
 
 def _padded(window: Window, step: float) -> Window:
+    """Extend a window by one step on both sides."""
     return window[0] - step, window[1] + step

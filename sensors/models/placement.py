@@ -1,4 +1,4 @@
-"""Where a sensor stands that is given by its distance from the wall instead of by coordinates."""
+"""Place a sensor that is described by its distance from the wall instead of by coordinates."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from scene.ray_casting.raycast import RayCaster
 from sensors.cameras.camera import Camera, CameraPair, Matrix3, Vector3, axis_rotation, check_rotation
 
 _FARTHEST_M = 1e5
+"""Largest distance of a sensor, m."""
 Height = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 VERTICAL = np.array([0.0, 0.0, 1.0])
+"""Direction up, world frame."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +31,14 @@ class Target:
 
     @cached_property
     def centre(self) -> FloatArray:
-        """(3,) the middle of the bounding box, m."""
+        """(3,) centre of the bounding box, m."""
         return self.mesh.bounds.mean(axis=0)
 
     @cached_property
     def outward(self) -> FloatArray:
-        """(3,) horizontal unit vector from the wall towards the side its faces look to.
+        """(3,) horizontal unit vector from the wall towards the side that its faces look to.
 
-        Raises InputError where the mesh faces straight up or down or is closed, so that no side is in front of it.
+        Raises InputError if the mesh faces straight up or down or is closed, so that it has no front.
         """
         area = area_normals(self.mesh.corners())
         total, horizontal = np.linalg.norm(area, axis=1).sum(), area.sum(axis=0) * [1.0, 1.0, 0.0]
@@ -47,13 +49,15 @@ class Target:
         return horizontal / np.linalg.norm(horizontal)
 
     def stand(self, distance_m: float, height_m: float | None) -> FloatArray:
-        """(3,) the point at `distance_m` horizontally in front of the centre, `height_m` above the toe (None: level with it)."""
+        """Return the point (3,) at `distance_m` horizontally in front of the centre, and `height_m` above the toe (None: level
+        with the centre).
+        """
         position = self.centre + distance_m * self.outward
         return position if height_m is None else np.append(position[:2], self.mesh.bounds[0, 2] + height_m)
 
 
 class RigConfig(Config):
-    """A stereo pair of equal cameras in front of the wall, both looking at its centre (Glendale's geometry by default)."""
+    """A stereo pair of equal cameras in front of the wall, both looking at its centre (by default Glendale's geometry)."""
 
     distance_m: float = Field(105.0, gt=0, le=_FARTHEST_M, description="horizontal distance from the wall's centre [m]")
     base_m: float = Field(28.0, gt=0, description="distance between the cameras [m]")
@@ -66,12 +70,13 @@ class RigConfig(Config):
     k2: float = Field(0.0, description="radial distortion, r^4")
 
     def place(self, target: Target) -> CameraPair:
-        """The pair in front of `target`, world frame; seen from the cameras, the left one stands on the left."""
+        """Return the pair in front of `target`, world frame. Seen from the cameras, the left one stands on the left."""
         middle = target.stand(self.distance_m, self.height_m)
         shift = self.base_m / 2 * np.cross(-target.outward, VERTICAL)
         return CameraPair(self._camera(middle - shift, target.centre), self._camera(middle + shift, target.centre))
 
     def _camera(self, position: FloatArray, aim: FloatArray) -> Camera:
+        """Make one camera at `position` that looks at `aim`."""
         f_px = self.focal_length_m / self.sensor_width_m * self.width
         distortion = {"k1": self.k1, "k2": self.k2, "k3": 0.0, "k4": 0.0, "p1": 0.0, "p2": 0.0}
         camera = Camera(
@@ -82,7 +87,7 @@ class RigConfig(Config):
 
 
 def look_at(position: FloatArray, aim: FloatArray) -> FloatArray:
-    """(3, 3) camera to world, of a level camera at `position` whose axis passes through `aim`."""
+    """Return the rotation (3, 3), camera to world, of a level camera at `position` whose axis passes through `aim`."""
     forward = (aim - position) / np.linalg.norm(aim - position)
     right = np.cross(forward, VERTICAL)
     right /= np.linalg.norm(right)
@@ -90,13 +95,13 @@ def look_at(position: FloatArray, aim: FloatArray) -> FloatArray:
 
 
 class PoseSigma(Config):
-    """How well a station's pose is known; the difference of real and surveyed pose is drawn anew at each observation."""
+    """How well a station's pose is known; the difference between real and surveyed pose is drawn for each observation."""
 
     position_m: float = Field(0.0, ge=0, description="standard deviation of each coordinate [m]")
-    rotation_rad: float = Field(0.0, ge=0, le=0.1, description="standard deviation of the turn about each axis [rad]")
+    rotation_rad: float = Field(0.0, ge=0, le=0.1, description="standard deviation of the rotation about each axis [rad]")
 
     def displaced(self, position: FloatArray, rotation: FloatArray, random: KeyedRandom) -> tuple[FloatArray, FloatArray]:
-        """Where a scanner of surveyed pose (position (3,) m, rotation (3, 3) scanner to frame) really stands."""
+        """Draw the real pose of a scanner with the surveyed position (3,), m, and rotation (3, 3), scanner to frame."""
         if self.position_m == self.rotation_rad == 0:
             return position, rotation
         shift, turn = random.generator().standard_normal((2, 3)) * [[self.position_m], [self.rotation_rad]]
@@ -108,7 +113,7 @@ EXACT_POSE = PoseSigma()
 
 
 class StationConfig(Config):
-    """Where the laser scanner stands: by coordinates, or at a distance in front of the wall's centre."""
+    """Where the laser scanner stands: at given coordinates, or at a distance in front of the wall's centre."""
 
     position_m: Vector3 | None = Field(None, description="scanner's centre, world frame; none: from distance_m and height_m [m]")
     distance_m: float = Field(
@@ -124,7 +129,7 @@ class StationConfig(Config):
         return None if rotation is None else check_rotation(rotation)
 
     def place(self, target: Target) -> tuple[FloatArray, FloatArray]:
-        """Position (3,) m and rotation (3, 3) scanner to world."""
+        """Return position (3,), m, and rotation (3, 3), scanner to world."""
         position = np.array(self.position_m) if self.position_m else target.stand(self.distance_m, self.height_m)
         if self.rotation:
             return position, np.array(self.rotation)
@@ -136,13 +141,13 @@ class StationConfig(Config):
 
 
 def check_in_front(scene: RayCaster, position: FloatArray, where: str) -> None:
-    """Raise InputError where a sensor at `position` ((3,), the scene's frame) sees the rock mostly from inside or from behind.
+    """Raise InputError if a sensor at `position` (3,), in the scene's frame, sees the rock mostly from inside or from behind.
 
-    It counts the sides of the faces that lines of sight meet first.
+    This is decided from the sides of the faces that lines of sight hit first.
     """
     _, from_behind = scene.sides_seen(position)
     if 2 * int(from_behind.sum()) > len(from_behind):
-        share = f"{100 * from_behind.mean():.0f} %"  # single rays along edges differ between processors
+        share = f"{100 * from_behind.mean():.0f} %"  # rounded, as single rays along edges differ between processors
         raise InputError(
             f"{share} of the lines of sight meet the rock from behind: the sensor stands in or behind it",
             where=where,

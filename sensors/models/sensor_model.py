@@ -1,4 +1,6 @@
-"""The sensor model: base noise and a list of effects, as a config's `sensor:` section and a measurement's model.yaml hold it."""
+"""Define the sensor models: base noise and a list of effects, as in a config's `sensor:` section and a measurement's
+model.yaml.
+"""
 
 from __future__ import annotations
 
@@ -34,11 +36,11 @@ from sensors.effects.tangential_distortion import TangentialDistortion
 from sensors.signal_chain.pulses import PulseGeometry
 
 MOST_EFFECTS = 100
-"""Each adds to the kernel that observes, which is compiled anew."""
+"""Most effects in a model. Each adds to the kernel of an observation, which then has to be compiled."""
 
 
 class TlsNoise(Config):
-    """A laser scanner's white noise, as a datasheet states it."""
+    """White noise of a laser scanner, as a data sheet states it."""
 
     range_sigma_m: float = Field(0.003, ge=0, le=10, description="standard deviation of the range [m]")
     range_ppm: float = Field(0.0, ge=0, le=1e5, description="further standard deviation of the range, in proportion to it [ppm]")
@@ -46,7 +48,7 @@ class TlsNoise(Config):
 
 
 class TlsModel(Config):
-    """What the simulation believes about a laser scanner."""
+    """Sensor model of a laser scanner: base noise and effects."""
 
     sensor: Literal["tls"] = "tls"
     noise: TlsNoise = TlsNoise()
@@ -61,15 +63,15 @@ class TlsModel(Config):
         return self
 
     def without_noise(self) -> TlsModel:
-        """The same effects alone."""
+        """Return the model with the same effects but no base noise."""
         return self.model_copy(update={"noise": TlsNoise(range_sigma_m=0.0, angle_sigma_rad=0.0)})
 
     def variance(self, at: PulseGeometry) -> FloatArray:
-        """(n,) variance of a recorded range that the model predicts, m2."""
+        """Return the variance (n,) of a recorded range that the model predicts, m2."""
         return np.asarray(sum((effect.variance(at) for effect in self.chain()), np.zeros(len(at))))
 
     def chain(self) -> tuple[Effect, ...]:
-        """The base noise and the effects, as one list of effects."""
+        """Return the base noise and the effects as one list of effects."""
         noise = self.noise
         return (
             AngleNoise(azimuth_sigma_rad=noise.angle_sigma_rad, zenith_sigma_rad=noise.angle_sigma_rad),
@@ -79,8 +81,8 @@ class TlsModel(Config):
         )
 
 
-class Spread(Config):
-    """Mean and standard deviation of an orientation parameter drawn anew at each observation; a number alone is the latter."""
+class DrawnParameter(Config):
+    """Mean and standard deviation of an orientation parameter, drawn at each observation; a single number is the latter."""
 
     mean: float = Field(0.0, description="mean, in the parameter's unit")
     sigma: float = Field(0.0, ge=0, description="standard deviation, in the parameter's unit")
@@ -92,28 +94,31 @@ class Spread(Config):
 
 
 class OrientationNoise(Config):
-    """Noise on the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values."""
+    """Noise of the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values."""
 
-    omega_rad: Spread = Field(Spread(), description="rotation about the camera's x axis [rad]")
-    phi_rad: Spread = Field(Spread(), description="rotation about the camera's y axis [rad]")
-    kappa_rad: Spread = Field(Spread(), description="rotation about the camera's z axis [rad]")
-    x_m: Spread = Field(Spread(), description="perspective centre, world x [m]")
-    y_m: Spread = Field(Spread(), description="perspective centre, world y [m]")
-    z_m: Spread = Field(Spread(), description="perspective centre, world z [m]")
-    f_px: Spread = Field(Spread(), description="principal distance [px]")
-    cx_px: Spread = Field(Spread(), description="principal point x [px]")
-    cy_px: Spread = Field(Spread(), description="principal point y [px]")
-    b1: Spread = Field(Spread(), description="affinity [px]")
-    b2: Spread = Field(Spread(), description="skew [px]")
-    k1: Spread = Field(Spread(), description="radial distortion, r^2")
-    k2: Spread = Field(Spread(), description="radial distortion, r^4")
-    k3: Spread = Field(Spread(), description="radial distortion, r^6")
-    k4: Spread = Field(Spread(), description="radial distortion, r^8")
-    p1: Spread = Field(Spread(), description="tangential distortion, Metashape's order")
-    p2: Spread = Field(Spread(), description="tangential distortion, Metashape's order")
+    omega_rad: DrawnParameter = Field(DrawnParameter(), description="rotation about the camera's x axis [rad]")
+    phi_rad: DrawnParameter = Field(DrawnParameter(), description="rotation about the camera's y axis [rad]")
+    kappa_rad: DrawnParameter = Field(DrawnParameter(), description="rotation about the camera's z axis [rad]")
+    x_m: DrawnParameter = Field(DrawnParameter(), description="perspective centre, world x [m]")
+    y_m: DrawnParameter = Field(DrawnParameter(), description="perspective centre, world y [m]")
+    z_m: DrawnParameter = Field(DrawnParameter(), description="perspective centre, world z [m]")
+    f_px: DrawnParameter = Field(DrawnParameter(), description="principal distance [px]")
+    cx_px: DrawnParameter = Field(DrawnParameter(), description="principal point x [px]")
+    cy_px: DrawnParameter = Field(DrawnParameter(), description="principal point y [px]")
+    b1: DrawnParameter = Field(DrawnParameter(), description="affinity [px]")
+    b2: DrawnParameter = Field(DrawnParameter(), description="skew [px]")
+    k1: DrawnParameter = Field(DrawnParameter(), description="radial distortion, r^2")
+    k2: DrawnParameter = Field(DrawnParameter(), description="radial distortion, r^4")
+    k3: DrawnParameter = Field(DrawnParameter(), description="radial distortion, r^6")
+    k4: DrawnParameter = Field(DrawnParameter(), description="radial distortion, r^8")
+    p1: DrawnParameter = Field(DrawnParameter(), description="tangential distortion, Metashape's order")
+    p2: DrawnParameter = Field(DrawnParameter(), description="tangential distortion, Metashape's order")
 
     def draw(self, side: Side, random: KeyedRandom) -> tuple[Effect, ...]:
-        """One draw of all parameters for one camera, as effects; each parameter has its own random number."""
+        """Draw all parameters of one camera, as effects. Each parameter has its own random number.
+
+        Raises InputError if a drawn value exceeds an effect's bounds.
+        """
         value = {name: self._draw(name, random.child(name)) for name in type(self).model_fields}
         try:
             return self._effects(side, value)
@@ -123,6 +128,7 @@ class OrientationNoise(Config):
             raise InputError(f"a drawn value is out of bounds: {problem}", where="noise.orientation", remedy=remedy) from None
 
     def _effects(self, side: Side, value: dict[str, float]) -> tuple[Effect, ...]:
+        """Convert drawn values to effects."""
         return (
             FocalLength(camera=side, delta_px=value["f_px"]),
             PrincipalPointX(camera=side, delta_px=value["cx_px"]),
@@ -137,48 +143,50 @@ class OrientationNoise(Config):
         )
 
     def _draw(self, name: str, random: KeyedRandom) -> float:
-        spread: Spread = getattr(self, name)
+        """Draw one parameter."""
+        spread: DrawnParameter = getattr(self, name)
         return spread.mean + spread.sigma * float(random.generator().standard_normal())
 
 
 class StereoNoise(Config):
-    """A stereo pair's noise: matching, and orientation drawn anew at each observation."""
+    """Noise of a stereo pair: matching noise, and orientation noise drawn at each observation."""
 
     parallax_sigma_px: float = Field(
         0.3, ge=0, le=1000, description="white noise of the disparity [px of the full-resolution frame]"
     )
     regularization_sigma_px: float = Field(
-        0.1, ge=0, le=1000, description="smooth noise of the disparity, at the nodes of a grid [px]"
+        0.1, ge=0, le=1000, description="grid-correlated noise of the disparity: standard deviation at the nodes [px]"
     )
     regularization_step_px: float = Field(
-        32.0, gt=0, le=100_000, description="distance of the grid's nodes [px of the full-resolution frame]"
+        32.0, gt=0, le=100_000, description="distance between the grid's nodes [px of the full-resolution frame]"
     )
     point_sigma_m: float = Field(
         0.0, ge=0, le=10, description="white noise of the points along the surface's normal, for a cloud without cameras [m]"
     )
     point_shared_sigma_m: float = Field(
-        0.0, ge=0, le=10, description="such noise that neighbours share, at the nodes of a grid over the wall's plane [m]"
+        0.0, ge=0, le=10, description="grid-correlated noise of the points, at the nodes of a grid over the wall's plane [m]"
     )
-    point_shared_step_m: float = Field(0.1, gt=0, le=1000, description="distance of that grid's nodes [m]")
+    point_shared_step_m: float = Field(0.1, gt=0, le=1000, description="distance between that grid's nodes [m]")
     orientation: OrientationNoise = OrientationNoise()
     orientation_drawn: Literal["each_camera", "both_alike"] = Field(
-        "each_camera", description="orientation noise of its own for each camera, or one draw for both, most of which cancels"
+        "each_camera",
+        description="whether each camera has its own orientation noise, or both share one draw, most of which cancels",
     )
 
     def draw(self, random: KeyedRandom) -> tuple[Effect, ...]:
-        """The orientation noise of one observation, as effects."""
+        """Draw the orientation noise of one observation, as effects."""
         sides: tuple[Side, ...] = ("both",) if self.orientation_drawn == "both_alike" else ("left", "right")
         return tuple(effect for side in sides for effect in self.orientation.draw(side, random.child(side)))
 
     @property
     def of_points(self) -> PointNoise:
-        """The noise of the points in metres."""
+        """Noise of the points in metres, as an effect."""
         sigma, shared, step = self.point_sigma_m, self.point_shared_sigma_m, self.point_shared_step_m
         return PointNoise(sigma_m=sigma, shared_sigma_m=shared, shared_step_m=step)
 
 
 class StereoModel(Config):
-    """What the simulation believes about a stereo pair."""
+    """Sensor model of a stereo pair: base noise and effects."""
 
     sensor: Literal["stereo"] = "stereo"
     noise: StereoNoise = StereoNoise()
@@ -187,12 +195,12 @@ class StereoModel(Config):
     )
 
     def without_noise(self) -> StereoModel:
-        """The same effects alone."""
+        """Return the model with the same effects but no base noise."""
         return self.model_copy(update={"noise": StereoNoise(parallax_sigma_px=0.0, regularization_sigma_px=0.0)})
 
     @property
     def matching_noise(self) -> tuple[MatchingNoise, ...]:
-        """What makes disparities scatter, by a known semivariogram: the base noise, and effects of that kind."""
+        """The base noise and effects that make disparities scatter with a known semivariogram."""
         noise = self.noise
         base = (
             ParallaxNoise(sigma_px=noise.parallax_sigma_px),
@@ -202,15 +210,15 @@ class StereoModel(Config):
 
     @property
     def variance(self) -> float:
-        """Variance of a disparity that the model predicts, px2, on average over the image."""
+        """Mean variance of a disparity over the image that the model predicts, px2."""
         return sum(effect.total_variance for effect in self.matching_noise)
 
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """(k,) semivariogram of a disparity that the model predicts, px2, at `lag` ((k, 2), px)."""
+        """Return the semivariogram (k,) of a disparity that the model predicts, px2, at `lag` (k, 2), px."""
         return np.asarray(sum((effect.semivariogram(lag) for effect in self.matching_noise), np.zeros(len(lag))))
 
     def chain(self, random: KeyedRandom) -> tuple[Effect, ...]:
-        """The base noise and the effects, as one list of effects; the orientation is drawn from `random`."""
+        """Return the base noise and the effects as one list of effects; the orientation noise is drawn from `random`."""
         noise = self.noise
         return (
             *noise.draw(random.child("orientation")),
@@ -221,5 +229,5 @@ class StereoModel(Config):
         )
 
     def of_points(self) -> tuple[Effect, ...]:
-        """What it says of points in metres: the base noise, and effects of that stage."""
+        """Return the base noise and the effects that act on recorded points, in metres."""
         return (self.noise.of_points, *(effect for effect in self.effects if effect.stage == Stage.POINT))

@@ -1,5 +1,5 @@
-"""Hold the small numerical tools of the sensors: functions on host and device, vector algebra, linear interpolation.
+"""Provide numerical tools for the sensors: functions on host and device, vector algebra, linear interpolation.
 
-Nothing here knows a camera or a scanner.
-Start with `functions.py`, which lets each equation be written once for NumPy and Dr.Jit.
+Nothing here depends on a camera or a scanner. Start with `functions.py`, which lets each equation be written once for NumPy
+and Dr.Jit.
 """

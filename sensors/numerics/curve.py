@@ -1,4 +1,4 @@
-"""Curves and surfaces by values at even distances, linear between them: what an empirical term is."""
+"""Interpolate tables linearly: curves and surfaces given by equally spaced values, the form of empirical effects."""
 
 from __future__ import annotations
 
@@ -15,24 +15,26 @@ from sensors.numerics.device import bounded, cell_index, opaque
 
 Rows = tuple[tuple[float, ...], ...]
 _MOST_VALUES = 4096
+"""Most values in one table."""
 
 
 def _rectangular(rows: Rows) -> Rows:
+    """Check that all rows have the same length, with at least two values and not too many in all."""
     if not rows or len({len(row) for row in rows}) != 1 or len(rows[0]) < 2 or len(rows) * len(rows[0]) > _MOST_VALUES:
         raise ValueError(f"needs rows of one length, 2 values each at least, {_MOST_VALUES} in all at most")
     return rows
 
 
 Table = Annotated[Rows, AfterValidator(_rectangular)]
-"""Values of a surface: rows of one length."""
+"""Values of a curve (one row) or a surface (several rows of equal length)."""
 
 
 class Axis(Config):
-    """What an empirical term depends on, from `low` to `high` and held beyond."""
+    """Range of the variable that an empirical effect depends on; beyond it the outermost values hold."""
 
     low: float = Field(0.0, description="x of the first value, in its unit; held below")
     high: float = Field(1.0, description="x of the last value, in its unit; held above")
-    period: float = Field(0.0, ge=0, description="of x, which then counts modulo it; 0: none")
+    period: float = Field(0.0, ge=0, description="period after which x repeats; 0: x does not repeat")
 
     @model_validator(mode="after")
     def _forward(self) -> Axis:
@@ -41,7 +43,10 @@ class Axis(Config):
         return self
 
     def place(self, x: Any, count: int) -> tuple[Any, Any]:
-        """The value before x and the share of the way to the next, of `count` values; x on the device."""
+        """Locate x, a device array, among `count` equally spaced values.
+
+        Returns the index of the value before x, and the position between it and the next as a share in [0, 1].
+        """
         if count < 2:
             return mi.UInt32(0), mi.Float64(0.0)
         if self.period:
@@ -53,7 +58,7 @@ class Axis(Config):
         return index, place - mi.Float64(index)
 
     def place_on_host(self, x: FloatArray, count: int) -> tuple[Any, FloatArray]:
-        """The same for a NumPy array (n,)."""
+        """Do the same as `place` for a NumPy array (n,)."""
         if count < 2:
             return np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
         turned = np.mod(x, self.period) if self.period else x
@@ -62,8 +67,18 @@ class Axis(Config):
         return index, place - index
 
 
-def surface(x: Any, y: Any, along: Axis, across: Axis, rows_of_values: Rows) -> mi.Float64:
-    """The surface at x, y: values in rows along y, columns along x, bilinear; of one row a curve of x."""
+def interpolate(x: Any, y: Any, along: Axis, across: Axis, rows_of_values: Rows) -> mi.Float64:
+    """Evaluate a table at x, y on the device, bilinearly; a single row is a curve of x.
+
+    Parameters
+    ----------
+    x, y : device arrays, (n,)
+        Where to evaluate. y plays no role for a single row.
+    along, across : Axis
+        Ranges of x and of y.
+    rows_of_values : Table
+        Rows along y, each with values along x.
+    """
     values = np.asarray(rows_of_values, dtype=np.float64)
     rows, columns = values.shape
     (i, a), (j, b) = across.place(y, rows), along.place(x, columns)
@@ -74,12 +89,13 @@ def surface(x: Any, y: Any, along: Axis, across: Axis, rows_of_values: Rows) -> 
 
 
 def _between(table: mi.Float64, index: mi.UInt32, share: mi.Float64) -> mi.Float64:
+    """Interpolate linearly between the table's entries at `index` and after it."""
     left, right = (dr.gather(mi.Float64, table, index + offset) for offset in (0, 1))
     return left + share * (right - left)
 
 
-def surface_on_host(x: FloatArray, y: FloatArray, along: Axis, across: Axis, rows_of_values: Rows) -> FloatArray:
-    """The same for NumPy arrays (n,); NaN where x or y is."""
+def interpolate_on_host(x: FloatArray, y: FloatArray, along: Axis, across: Axis, rows_of_values: Rows) -> FloatArray:
+    """Do the same as `interpolate` for NumPy arrays (n,); NaN where x or y is NaN."""
     values = np.asarray(rows_of_values, dtype=np.float64)
     rows, columns = values.shape
     (i, a), (j, b) = across.place_on_host(y, rows), along.place_on_host(x, columns)

@@ -1,4 +1,4 @@
-"""The functions that a sensor's equations need, on the host and on the device, so that each equation is written once."""
+"""Provide elementary functions for NumPy and for Dr.Jit arrays under the same names, so that each equation is written once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene.common.backend import dr, mi
 
 @dataclass(frozen=True)
 class Functions:
-    """Elementary functions of arrays of one kind; select(condition, a, b): a where the condition holds, else b."""
+    """Elementary functions for one kind of array. select(condition, a, b) is a where the condition holds, else b."""
 
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]
@@ -24,11 +24,13 @@ class Functions:
 
 
 HOST = Functions(np.sin, np.cos, np.log, np.exp, np.floor, np.where)
+"""Functions of NumPy arrays."""
 DEVICE = Functions(dr.sin, dr.cos, dr.log, dr.exp, dr.floor, dr.select)
+"""Functions of Dr.Jit arrays."""
 
 
-class OnDevice:
-    """The numbers of a model as device scalars: arguments of the compiled kernel, not constants in it."""
+class DeviceParameters:
+    """Presents the numeric attributes of a model as device scalars: arguments of the compiled kernel, not constants in it."""
 
     def __init__(self, model: Any) -> None:
         self._model = model

@@ -1,5 +1,5 @@
-"""Define what passes along a sensor's chain of stages: laser pulses and beams, matched pixels, returns, and the observation.
+"""Define the data that pass along a sensor's chain of stages: laser pulses, beams, returns, matched pixels, and the observation.
 
-Effects (`sensors/effects`) change these objects; the sensors (`sensors/laser`, `sensors/stereo`) make them and run the chain.
-Start with `observation.py`, the result of every sensor, then `pulses.py` or `matches.py`.
+Effects (`sensors/effects`) change these objects; the sensors (`sensors/laser`, `sensors/stereo`) create them and run the
+chain. Start with `observation.py`, the result of every sensor, then `pulses.py` or `matches.py`.
 """

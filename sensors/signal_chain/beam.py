@@ -1,11 +1,13 @@
-"""The laser beam's cross section: sub-rays that share a pulse's energy, and how their echoes become the pulse's return.
+"""Model the cross section of a laser beam by sub-rays that share a pulse's energy, and combine their echoes into the pulse's
+return.
 
-Energy falls with the angle r from the axis as exp(-8 r^2 / D^2), D the full divergence where it has fallen to 1/e^2. A fraction u
-of it lies within 8 r^2 / D^2 = -ln(1 - u). Rings of 6, 12, 18... sub-rays surround a central one; every sub-ray carries the same
-energy, so ring j stands for the annulus between two such fractions, at its root-mean-square radius, and all radii are scaled so
-that the second moments are the Gaussian's, D^2/16 about each axis. The share of the energy that a straight edge cuts off is then
-right to 0.11 at worst with 19 sub-rays (root mean square 0.03), 0.22 with 7, 0.07 with 37. A hexagonal grid with Gaussian weights
-does worse (0.15 with 19): an edge along the grid crosses many of its sub-rays at once.
+The energy density falls with the angle r from the axis as exp(-8 r^2 / D^2), where D is the full divergence (1/e^2). A
+fraction u of the energy lies within 8 r^2 / D^2 = -ln(1 - u). Rings of 6, 12, 18, ... sub-rays surround a central one, and all
+sub-rays carry the same energy. Ring j thus represents the annulus between two such fractions, at its root-mean-square radius.
+All radii are scaled so that the second moments equal the Gaussian's, D^2/16 about each axis. The share of the energy that a
+straight edge cuts off is then wrong by at most 0.11 with 19 sub-rays (root mean square 0.03), 0.22 with 7 and 0.07 with 37. A
+hexagonal grid with Gaussian weights is worse (0.15 with 19), because an edge along the grid crosses many of its sub-rays at
+once.
 """
 
 from __future__ import annotations
@@ -21,19 +23,29 @@ from scene.geometry.mesh import FloatArray
 from scene.ray_casting.upload import on_device
 
 Mode = Literal["first", "strongest", "mean", "multiple"]
+"""Which of a pulse's returns is recorded; multiple: all of them."""
 Ranging = Literal["pulse", "phase"]
+"""How the range is measured."""
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+"""Rotation from one ring of sub-rays to the next."""
 _NOWHERE_M = 1e30
-"""Beyond every echo."""
+"""A range beyond every echo."""
 
 
 @dataclass(frozen=True)
 class Echo:
-    """What one ray of every pulse, or a whole pulse, brings back; device arrays (n,). Names as in `Pulses`; range in m.
+    """The echo of one ray of each of n pulses, or the return of each pulse, as device arrays (n,).
 
-    returns: how many the pulse has; strongest: whether this is the strongest of them; None where only one is recorded.
+    Attributes
+    ----------
+    range_m, cos_incidence, albedo, power, block, returned
+        As in `Pulses`.
+    returns : (n,) uint32, optional
+        Number of returns of the pulse; None if only one is recorded.
+    strongest : (n,) bool, optional
+        Whether this is the strongest of them; None if only one is recorded.
     """
 
     range_m: mi.Float64
@@ -46,27 +58,30 @@ class Echo:
     strongest: mi.Bool | None = None
 
     def at(self, index: mi.UInt32) -> Echo:
-        """The echoes at the given places."""
+        """Return the echoes at the given indices."""
         return Echo(**{name: dr.gather(type(value), value, index) for name, value in self._known()})
 
     @staticmethod
     def joined(parts: Sequence[Echo]) -> Echo:
-        """The echoes of all parts, one part after the other."""
+        """Concatenate the echoes of all parts."""
         return Echo(**{name: dr.concat([getattr(part, name) for part in parts]) for name, _ in parts[0]._known()})
 
     def _known(self) -> list[tuple[str, Any]]:
+        """Return name and value of the attributes that are not None."""
         return [(name, value) for name, value in vars(self).items() if value is not None]
 
 
 @dataclass(frozen=True)
 class SubRays:
-    """The echoes (n times `many`,) of all sub-rays of n pulses in memory, pulse by pulse."""
+    """The echoes (n times `many`,) of all sub-rays of n pulses, evaluated in memory, pulse by pulse."""
 
     echoes: Echo
     many: int
 
     def over(self, step: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
-        """The state after `step(echo, *state)` for one sub-ray of every pulse after another: a loop in the compiled kernel."""
+        """Run `step(echo, *state)` for one sub-ray of every pulse after another, in a loop of the compiled kernel; return the
+        final state.
+        """
         many = dr.opaque(mi.UInt32, self.many)
         first = many * dr.arange(mi.UInt32, dr.width(self.echoes.range_m) // self.many)
 
@@ -79,11 +94,20 @@ class SubRays:
 
 @dataclass(frozen=True)
 class Beam:
-    """A beam and its receiver: a pencil unless a footprint effect widens it.
+    """A beam and its receiver. Without a footprint effect the beam is a single ray.
 
-    divergence_rad: full angle, 1/e^2; sub_rays: 1 + 3 m (m + 1) for m rings; mode: which return of several is recorded,
-    multiple: the strongest and beside it all others; separation_m: echoes nearer to each other than this run into one return
-    (c tau / 2); modulation_wavelength_m: of a phase scanner's finest measuring wave, None for pulses.
+    Attributes
+    ----------
+    divergence_rad : float
+        Full divergence (1/e^2), rad.
+    sub_rays : int
+        Number of sub-rays, 1 + 3 m (m + 1) for m rings.
+    mode : str
+        Which of several returns is recorded. "multiple" records the strongest in the scan's grid, and all others beside it.
+    separation_m : float
+        Echoes closer than this, c tau / 2, merge into one return, m.
+    modulation_wavelength_m : float, optional
+        Finest measuring wave of a phase scanner, m; None for a pulse scanner.
     """
 
     divergence_rad: float = 0.0
@@ -93,9 +117,16 @@ class Beam:
     modulation_wavelength_m: float | None = None
 
     def sub_ray(self, axis: mi.Array3f64, across: Sequence[mi.Array3f64], number: mi.UInt32) -> mi.Array3f64:
-        """Unit vectors of sub-rays by `number` (n,), 3 x (n,), about the axis and with the two unit vectors across it.
+        """Return the unit vectors 3 x (n,) of sub-rays.
 
-        The three stand upright on each other, so that weights of unit length make unit vectors.
+        Parameters
+        ----------
+        axis : 3 x (n,)
+            Unit vectors along the beams.
+        across : two 3 x (n,)
+            Unit vectors perpendicular to the axis and to each other.
+        number : mi.UInt32, (n,)
+            Number of the sub-ray within its beam.
         """
         if self.sub_rays == 1:
             return axis
@@ -104,8 +135,8 @@ class Beam:
         along, first, second = dr.gather(mi.Array3f64, on_device(mi.Float64, weights), number)
         return along * axis + first * across[0] + second * across[1]
 
-    def received(self, rays: SubRays) -> Echo:
-        """The recorded return of every pulse, from the echoes of its sub-rays."""
+    def combine_echoes(self, rays: SubRays) -> Echo:
+        """Combine the echoes of each pulse's sub-rays into the return that is recorded."""
         if rays.many == 1:
             return rays.echoes
         if self.modulation_wavelength_m is not None:
@@ -118,18 +149,20 @@ class Beam:
 
     @property
     def records_several(self) -> bool:
-        """Whether there may be returns beside the one of `received`."""
+        """Whether a pulse may have more returns than the one of `combine_echoes`."""
         return self.mode == "multiple" and self.sub_rays > 1 and self.modulation_wavelength_m is None
 
-    def numbered(self, rays: SubRays, number: mi.UInt32) -> Echo:
-        """The return of a number, counted by range from 1; the strongest is the one of `received`."""
+    def return_of_number(self, rays: SubRays, number: mi.UInt32) -> Echo:
+        """Return each pulse's return of a given number, counted by range from 1. The strongest is the one of `combine_echoes`."""
         _, chosen, strongest = self._separated(rays, number)
         return replace(_merged(rays, chosen.holds), strongest=chosen.low == strongest.low)
 
     def _separated(self, rays: SubRays, number: mi.UInt32) -> tuple[mi.UInt32, _Span, _Span]:
-        """How many returns every pulse has, the reach of the one of a number, counted by range from 1, and of the strongest.
+        """Separate each pulse's echoes into returns.
 
-        A return is a chain of echoes, each within the separation of another: no bins, so no bias.
+        A return is a chain of echoes, each within the separation of the next one, so that no bins introduce a bias. Returns
+        the number of returns, the range interval of the return `number` (counted by range from 1), and that of the strongest
+        one.
         """
         gap = dr.opaque(mi.Float64, self.separation_m)
 
@@ -165,21 +198,26 @@ class Beam:
 
 @dataclass
 class _Span:
-    """From the nearest to the farthest echo of a return, m. Not frozen: Dr.Jit's loops put their own variables in."""
+    """Range interval from the nearest to the farthest echo of a return, m. Not frozen, because Dr.Jit's loops replace its
+    variables.
+    """
 
     low: mi.Float64
     high: mi.Float64
 
     def holds(self, echo: Echo) -> mi.Bool:
+        """Return whether an echo lies in the interval."""
         return echo.returned & (echo.range_m >= self.low) & (echo.range_m <= self.high)
 
     def where(self, condition: mi.Bool, other: _Span) -> _Span:
-        """This span where the condition holds, else the other."""
+        """Return this interval where the condition holds, else the other one."""
         return _Span(dr.select(condition, self.low, other.low), dr.select(condition, self.high, other.high))
 
 
 def unit_offsets(sub_rays: int) -> FloatArray:
-    """(k, 2) offsets of the sub-rays from the axis for D = 1 (see the module's text); ring j is turned by j golden angles."""
+    """Return the offsets (k, 2) of the sub-rays from the axis for D = 1, as the module describes. Ring j is rotated by j golden
+    angles.
+    """
     rings = round((np.sqrt(12 * sub_rays - 3) - 3) / 6)
     bounds = np.cumsum([0, 1, *(6 * ring for ring in range(1, rings + 1))]) / sub_rays
     offsets = [np.zeros((1, 2))]
@@ -191,9 +229,9 @@ def unit_offsets(sub_rays: int) -> FloatArray:
 
 
 def _ring_radius(inner: float, outer: float) -> float:
-    """Root-mean-square radius, in units of D, of the energy between two fractions of it.
+    """Return the root-mean-square radius, in units of D, of the energy between two fractions.
 
-    The energy with t = 8 r^2 / D^2 beyond t is exp(-t), and the integral of t exp(-t) from t on is (t + 1) exp(-t).
+    With t = 8 r^2 / D^2, the energy beyond t is exp(-t), and the integral of t exp(-t) from t on is (t + 1) exp(-t).
     """
 
     def tail(fraction: float) -> float:
@@ -203,7 +241,7 @@ def _ring_radius(inner: float, outer: float) -> float:
 
 
 def _merged(rays: SubRays, belongs: Callable[[Echo], mi.Bool]) -> Echo:
-    """One return from the echoes that belong to it, weighted by power; the block is the strongest one's."""
+    """Merge the echoes that belong to a return, weighted by power. The block label is that of the strongest echo."""
 
     def gathered(echo: Echo, total: Any, nearest: Any, strongest: Any, block: Any) -> tuple[Any, ...]:
         power = dr.select(belongs(echo), echo.power, mi.Float32(0))
@@ -233,10 +271,10 @@ def _merged(rays: SubRays, belongs: Callable[[Echo], mi.Bool]) -> Echo:
 
 
 def _in_phase(rays: SubRays, wavelength_m: float) -> Echo:
-    """The return of a phase scanner: R = R_c + w / (4 pi) arg S, S = sum_k p_k exp(4 pi i (R_k - R_c) / w).
+    """Compute the return of a phase scanner: R = R_c + w / (4 pi) arg S, S = sum_k p_k exp(4 pi i (R_k - R_c) / w).
 
-    Sub-rays add as phasors of the amplitude-modulated wave of length w; the magnitude is the recorded power. The cycle is the
-    one nearest to the centroid R_c, which the scanner's longer waves give.
+    The sub-rays add as phasors of the amplitude-modulated wave of length w; the magnitude is the recorded power. The cycle
+    nearest to the centroid R_c is chosen, as the scanner's longer waves determine it.
     """
     centroid = _merged(rays, lambda echo: echo.returned)
     wave = dr.opaque(mi.Float64, 4 * np.pi / wavelength_m)

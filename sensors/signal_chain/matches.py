@@ -1,8 +1,8 @@
-"""The stereo pair's image rows and matched pixels on their way through the chain.
+"""Define the stereo pair's image rows and matched pixels as they pass along the sensor's chain.
 
-Effects on the matching act in this order, whatever a config's: the true disparities are fattened at their edges, then smoothed;
-regularization, parallax and texture noise are added; last come the locking, which acts on the fraction that the matcher finds,
-and, at its own stage, the filling of half-occluded strips.
+Matching effects act in a fixed order, whatever the order in a config. Edge fattening and then smoothing act on the true
+disparities. Regularisation, parallax and texture noise are added next. Pixel locking is last, because it depends on the
+fraction that the matcher finds. The filling of half-occluded strips has its own, later stage.
 """
 
 from __future__ import annotations
@@ -19,9 +19,16 @@ from scene.ray_casting.upload import on_device
 
 @dataclass(frozen=True)
 class ImageRows:
-    """n pixels of one camera as it exposes them, lazy device arrays (n,), px of the full-resolution frame.
+    """n pixels of one camera during the exposure, as lazy device arrays (n,), in px of the full-resolution frame.
 
-    v: the row; du: recorded minus ideal column.
+    Attributes
+    ----------
+    camera : str
+        "left" or "right".
+    v : mi.Float64
+        Row.
+    du : mi.Float64
+        Recorded minus ideal column.
     """
 
     camera: Literal["left", "right"]
@@ -31,13 +38,32 @@ class ImageRows:
 
 @dataclass(frozen=True)
 class Matches:
-    """n cells of the left depth map as lazy device arrays, all (n,); image quantities in px of the full-resolution frame.
+    """n cells of the left depth map as lazy device arrays (n,); image quantities in px of the full-resolution frame.
 
-    index: the cell's number, row by row (keys its random numbers); u, v: the cell's centre in the left image; disparity: of the
-    rectified pair; matched: whether the cell has a match; block, true_depth (m, along the real left camera's axis), albedo: of
-    the surface that the left camera sees there, albedo None for a wall that has none. width, height: of the frame; reduction:
-    frame px per cell, so that one cell is one px of the image that is matched. tangent: of the angle between a rectified row and
-    the rectified axis; infinity: disparity of a point at infinity.
+    Attributes
+    ----------
+    index : mi.UInt32
+        Number of the cell, row by row; it keys the cell's random numbers.
+    u, v : mi.Float64
+        Centre of the cell in the left image.
+    disparity : mi.Float64
+        Disparity of the rectified pair.
+    matched : mi.Bool
+        Whether the cell has a match.
+    block : mi.Int32
+        Block label of the surface that the left camera sees there.
+    true_depth : mi.Float64
+        Depth of that surface along the real left camera's axis, m.
+    albedo : mi.Float32 or None
+        Albedo of that surface; None for a wall without albedo.
+    width, height : int
+        Size of the frame.
+    reduction : int
+        Frame px per cell; one cell is one px of the image that is matched.
+    tangent : mi.Float64
+        Tangent of the angle between the rectified row and the rectified axis.
+    infinity : float
+        Disparity of a point at infinity.
     """
 
     index: mi.UInt32
@@ -60,34 +86,41 @@ class Matches:
         return self.height // self.reduction, self.width // self.reduction
 
     def raster(self) -> FloatArray:
-        """(rows, columns) disparities, px, NaN where there is no match, for effects that look at a cell's neighbours."""
+        """Return the disparities (rows, columns), px, NaN without a match, for effects that depend on a cell's neighbours."""
         self._evaluate()
         return np.where(self.matched.numpy(), self.disparity.numpy(), np.nan).reshape(self.shape)
 
     def albedo_raster(self) -> FloatArray | None:
-        """(rows, columns) albedo, NaN where there is no match; None for a wall without albedo."""
+        """Return the albedo (rows, columns), NaN without a match; None for a wall without albedo."""
         if self.albedo is None:
             return None
         self._evaluate()
         return np.where(self.matched.numpy(), self.albedo.numpy(), np.nan).reshape(self.shape)
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
-        """(n,) the values of a (rows, columns) raster, each where its match is."""
+        """Return the values (n,) of a raster (rows, columns) at the matches."""
         return on_device(mi.Float64, raster)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
-        """The same cells with these (rows, columns) disparities, px, matched where they are not NaN."""
+        """Return the same cells with the given disparities (rows, columns), px; cells are matched where these are not NaN."""
         return replace(self, disparity=on_device(mi.Float64, disparity), matched=on_device(mi.Bool, ~np.isnan(disparity)))
 
     def _evaluate(self) -> None:
-        """Everything that comes out of the ray tracing at once, so that no later evaluation traces the rays again."""
+        """Evaluate everything that the ray tracing yields at once, so that no later evaluation traces the rays again."""
         dr.eval(self.disparity, self.matched, self.block, self.true_depth, self.albedo)
 
 
-def bridged(disparity: FloatArray, reach: float) -> FloatArray:
-    """Unmatched runs of at most `reach` cells between two matched ones of a row take the background of the two.
+def fill_gaps(disparity: FloatArray, reach: float) -> FloatArray:
+    """Fill unmatched runs between two matched cells of a row with the background's disparity, the smaller of the two.
 
-    disparity: (rows, columns), NaN where unmatched; the background is the smaller disparity. Runs at a row's end stay unmatched.
+    Runs at the end of a row remain unmatched.
+
+    Parameters
+    ----------
+    disparity : (rows, columns) array
+        NaN where unmatched.
+    reach : float
+        Longest run that is filled, cells.
     """
     rows, columns = disparity.shape
     matched, column = ~np.isnan(disparity), np.arange(columns, dtype=np.int32)

@@ -1,4 +1,7 @@
-"""Smooth random fields over the image: Gaussian values on the nodes of a grid, interpolated bilinearly."""
+"""Generate smooth random fields over the image: Gaussian values on the nodes of a grid, interpolated bilinearly.
+
+The module also computes the fields' semivariogram and correlation in closed form.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,20 @@ from sensors.signal_chain.matches import Matches
 
 
 def smooth_field(state: Matches, step_px: float, random: KeyedRandom, *, even: bool = False) -> mi.Float32:
-    """(n,) the field at the cells of `state`: sum_ij w_ij(u, v) g_ij, g_ij ~ N(0, 1), nodes at multiples of `step_px`.
+    """Evaluate a random field (n,) at the cells of `state`: sum_ij w_ij(u, v) g_ij with g_ij ~ N(0, 1).
 
-    Its variance is 1 at the nodes, 1/4 midway between them and 4/9 on average; even: divided by the root of sum w_ij^2, so that
-    it is 1 everywhere.
+    The variance is 1 at the nodes, 1/4 midway between them and 4/9 on average.
+
+    Parameters
+    ----------
+    state : Matches
+        The cells.
+    step_px : float
+        Distance between nodes, px; nodes lie at multiples of it.
+    random : KeyedRandom
+        Source of the node values.
+    even : bool
+        Whether to divide by the root of sum w_ij^2, which makes the variance 1 everywhere.
     """
     columns, rows = (int(np.ceil(size / step_px)) + 1 for size in (state.width, state.height))
     nodes = on_device(mi.Float32, random.generator().standard_normal((rows, columns)))
@@ -37,33 +50,38 @@ def smooth_field(state: Matches, step_px: float, random: KeyedRandom, *, even: b
 MEAN_VARIANCE = 4 / 9
 """Mean variance of a field whose nodes have variance 1."""
 _PHASES = (np.arange(24) + 0.5) / 24
-"""Places within a cell of nodes over which a mean is taken."""
+"""Positions within a cell of nodes over which averages are taken."""
 
 
 def node_semivariogram(lag: FloatArray) -> FloatArray:
-    """(k,) semivariogram of a field of variance 1 at the nodes, at `lag` ((k, 2), in steps of the nodes), the mean over places.
+    """Compute the semivariogram (k,) of a field with variance 1 at the nodes, averaged over positions.
 
-    4/9 - B(x) B(y), B the cubic B-spline (2/3 at 0, 0 from 2 on): two hat functions convolved.
+    It is 4/9 - B(x) B(y), where B is the cubic B-spline (2/3 at 0, 0 from 2 on), the convolution of two hat functions. `lag`
+    is (k, 2), in steps of the nodes.
     """
     across, down = (_spline(np.abs(lag[:, axis])) for axis in (0, 1))
     return np.asarray(MEAN_VARIANCE - across * down)
 
 
 def _spline(x: FloatArray) -> FloatArray:
+    """Evaluate the cubic B-spline at x >= 0."""
     near, far = 2 / 3 - x**2 + x**3 / 2, np.maximum(2 - x, 0.0) ** 3 / 6
     return np.where(x < 1, near, far)
 
 
-def even_correlation(lag: FloatArray) -> FloatArray:
-    """(k, m) correlation of an even field with itself at `lag` ((k, 2), in steps of the nodes), at m places within a cell."""
+def uniform_field_correlation(lag: FloatArray) -> FloatArray:
+    """Compute the correlation (k, m) of a field with uniform variance (`even`) at `lag` (k, 2), in steps of the nodes.
+
+    It depends on the position within a cell; m positions are evaluated.
+    """
     across, down = (_along_axis(np.abs(lag[:, axis])) for axis in (0, 1))
     return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(lag), -1))
 
 
 def _along_axis(lag: FloatArray) -> FloatArray:
-    """(k, phases) of hat functions along one axis: which nodes two places share, and by how much."""
+    """Compute the correlation (k, positions) along one axis: which nodes two positions share, and with which weights."""
     here = _PHASES[None, :]
-    ahead = here + np.minimum(lag, 4.0)[:, None]  # none is shared from 2 on
+    ahead = here + np.minimum(lag, 4.0)[:, None]  # from a lag of 2 on no node is shared
     cells = np.floor(ahead)
     there = ahead - cells
     shared = np.select([cells == 0, cells == 1], [(1 - here) * (1 - there) + here * there, here * (1 - there)], 0.0)

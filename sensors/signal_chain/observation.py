@@ -1,4 +1,4 @@
-"""What a sensor returns from one look at a scene."""
+"""Define what a sensor returns from one observation of a scene."""
 
 from __future__ import annotations
 
@@ -16,11 +16,27 @@ from scene.ray_casting.raycast import RayCaster
 
 @dataclass(frozen=True)
 class FurtherReturns:
-    """The returns of a scan beside those in its grid, of pulses that have several; n of them, by cell, then by range.
+    """The returns of a scan beyond those in its grid, for pulses with several returns. There are n of them, by cell, then by
+    range.
 
-    cell: (n,) int64 the pulse's place in the grid, counted in rows; number: (n,) uint8 return number, 1 the nearest; points:
-    (n, 3) float64, m; depth: (n,) float64 range, m; block: (n,) int32; intensity: (n,) float32; truth: named (n,) channels, as
-    the grid's; grid_number, grid_count: (h, w) uint8 return number of the point in the grid, and the pulse's number of returns.
+    Attributes
+    ----------
+    cell : (n,) int64 array
+        Position of the pulse in the grid, row by row.
+    number : (n,) uint8 array
+        Return number; 1 is the nearest.
+    points : (n, 3) float64 array
+        Recorded points, wall frame, m.
+    depth : (n,) float64 array
+        Range, m.
+    block : (n,) int32 array
+        Block label.
+    intensity : (n,) float32 array
+        Relative received power.
+    truth : dict of (n,) arrays
+        Channels as in the grid.
+    grid_number, grid_count : (h, w) uint8 arrays
+        Return number of the point in the grid, and the pulse's number of returns.
     """
 
     cell: NDArray[np.int64]
@@ -36,18 +52,35 @@ class FurtherReturns:
 
 @dataclass(frozen=True)
 class Observation:
-    """One observation with the sensor's own organisation, wall frame.
+    """One observation in the sensor's own organisation, wall frame.
 
-    Rows and columns are the sensor's: image rows and columns of the depth map (stereo), scan lines and pulses of a line (TLS:
-    azimuth, zenith). Cells without a return are NaN in the float arrays and WALL in `block`.
+    Rows and columns are the sensor's: those of the depth map (stereo), or scan lines and the pulses of a line (TLS: azimuth,
+    zenith). Cells without a return are NaN in the float arrays and WALL in `block`.
 
-    points: (h, w, 3) float64, m, as recorded; depth: (h, w) float64, m, range (TLS) or distance along the camera's axis (stereo);
-    block: (h, w) int32, the block whose niche was hit (0: wall); viewpoint: (3,) m, where the sensor stands;
-    intensity: (h, w) float32 relative received power; pulse_interval_s: time from one cell to the next, in order of rows; truth:
-    named (h, w) channels, such as `true_range_m`, present where the sensor was asked for them; further: returns beside those in
-    the grid, of a scanner that records several; None where no pulse has any; zenith_rad: (w,) nominal zenith angle of each column
-    of a scanner's grid; offset: (h, w, 2) float32, m, x and y of the recorded minus the
-    true point, None where it is not known.
+    Attributes
+    ----------
+    sensor : str
+        "tls" or "stereo".
+    points : (h, w, 3) float64 array
+        Recorded points, m.
+    depth : (h, w) float64 array
+        Range (TLS) or distance along the camera's axis (stereo), m.
+    block : (h, w) int32 array
+        The block whose niche was hit; 0 is the wall.
+    viewpoint : (3,) array
+        Position of the sensor, m.
+    intensity : (h, w) float32 array, optional
+        Relative received power.
+    pulse_interval_s : float, optional
+        Time from one cell to the next, in order of rows.
+    truth : dict of (h, w) arrays
+        Error-free channels, such as `true_range_m`, if the sensor was asked for them.
+    further : FurtherReturns, optional
+        Returns beyond those in the grid; None if no pulse has any.
+    zenith_rad : (w,) array, optional
+        Nominal zenith angle of each column of a scanner's grid.
+    offset : (h, w, 2) float32 array, optional
+        x and y of the recorded minus the true point, m; None if unknown.
     """
 
     sensor: str
@@ -64,30 +97,30 @@ class Observation:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(h, w) where there is a return."""
+        """(h, w) True where there is a return."""
         return ~np.isnan(self.depth)
 
     @property
     def gps_time(self) -> FloatArray | None:
-        """(h, w) float64, s since the scan's start; None for a sensor that sees everything at once."""
+        """(h, w) float64, s since the start of the scan; None for a sensor that records everything at once."""
         if self.pulse_interval_s is None:
             return None
         return self.pulse_interval_s * np.arange(self.depth.size, dtype=np.float64).reshape(self.depth.shape)
 
 
 def packed(point: mi.Array3f64) -> mi.Float64:
-    """The 3 x (n,) device points as one (3 n,) array, point by point, so that it is written once and needs no transpose."""
+    """Flatten device points 3 x (n,) into one array (3 n,), point by point, which is written once and needs no transpose."""
     return dr.ravel(point)
 
 
 def offset_of(recorded: mi.Array3f64, true: mi.Array3f64) -> mi.Float32:
-    """(2 n,) x and y of the recorded minus the true points, point by point."""
+    """Return x and y of the recorded minus the true points as one array (2 n,), point by point."""
     return dr.ravel(mi.Array2f(recorded.x - true.x, recorded.y - true.y))
 
 
 class Sensor(Protocol):
-    """A sensor: it observes a scene with a keyed source of random numbers."""
+    """A sensor: anything that observes a scene with a keyed source of random numbers."""
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """Look once at `scene` (wall frame); the same `random` gives the same observation to the byte."""
+        """Observe `scene` (wall frame) once. The same `random` gives the same observation to the byte."""
         ...

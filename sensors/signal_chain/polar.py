@@ -1,4 +1,4 @@
-"""Compute a scanner's polar coordinates on the host: azimuth = atan2(y, x), zenith angle from +z.
+"""Convert to a scanner's polar coordinates on the host: azimuth = atan2(y, x), zenith angle from +z.
 
 `pulses.py` does the same on the device.
 """
@@ -11,13 +11,15 @@ from scene.geometry.mesh import FloatArray
 
 
 def polar(local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Range, azimuth and zenith angle of (n, 3) points in the scanner's frame, each (n,), m and rad."""
+    """Return range (m), azimuth and zenith angle (rad), each (n,), of points (n, 3) in the scanner's frame."""
     level = np.hypot(local[:, 0], local[:, 1])
     return np.hypot(level, local[:, 2]), np.arctan2(local[:, 1], local[:, 0]), np.arctan2(level, local[:, 2])
 
 
 def polar_axes(azimuth: FloatArray, zenith: FloatArray) -> list[FloatArray]:
-    """(n, 3) unit vectors, scanner frame: along the beam, towards rising azimuth, and towards rising zenith."""
+    """Return unit vectors (n, 3) in the scanner's frame: along the beam, towards increasing azimuth, towards increasing
+    zenith.
+    """
     sin_az, cos_az, sin_ze, cos_ze = np.sin(azimuth), np.cos(azimuth), np.sin(zenith), np.cos(zenith)
     beam = [sin_ze * cos_az, sin_ze * sin_az, cos_ze]
     columns = [beam, [-sin_az, cos_az, np.zeros_like(azimuth)], [cos_ze * cos_az, cos_ze * sin_az, -sin_ze]]

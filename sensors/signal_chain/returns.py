@@ -1,4 +1,4 @@
-"""Several returns of one pulse: how those beside the scan's grid are put in order."""
+"""Order and number the returns of pulses that have several."""
 
 from __future__ import annotations
 
@@ -13,14 +13,23 @@ from scene.geometry.mesh import FloatArray, IntArray
 from sensors.signal_chain.observation import FurtherReturns, Observation
 
 MOST_RETURNS = 15
-"""Of one pulse; what LAS 1.4 can number. Farther ones are dropped."""
+"""Most returns of one pulse, as LAS 1.4 can number them. Farther ones are dropped."""
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """Recorded returns of n pulses: points (n, 3), depth, intensity, block and channels of the truth (n,); NaN, WALL for none.
+class RecordedReturns:
+    """The recorded returns of n pulses; NaN and WALL where there is none.
 
-    offset: (n, 2) x and y of the recorded minus the true points, m.
+    Attributes
+    ----------
+    points : (n, 3) array
+        Recorded points, m.
+    offset : (n, 2) array
+        x and y of the recorded minus the true points, m.
+    depth, intensity, block : (n,) arrays
+        Range (m), relative received power, block label.
+    truth : dict of (n,) arrays
+        Error-free channels.
     """
 
     points: FloatArray
@@ -31,11 +40,20 @@ class Recorded:
     truth: dict[str, NDArray[np.floating]]
 
 
-def further_returns(found: Sequence[tuple[NDArray[np.int64], NDArray[np.bool_], Recorded]], seen: Observation) -> FurtherReturns:
+def further_returns(
+    found: Sequence[tuple[NDArray[np.int64], NDArray[np.bool_], RecordedReturns]], seen: Observation
+) -> FurtherReturns:
     """Order returns by cell and range, and number those that were recorded.
 
-    found: by rising range, the cells of pulses with several returns, whether each return is the one in the grid of `seen`, and
-    what was recorded of it. Effects may have lost returns: numbers and counts are of what is left.
+    Effects may have lost returns: numbers and counts refer to the remaining ones.
+
+    Parameters
+    ----------
+    found : sequence of (cells, in_grid, returns)
+        By increasing return number: the cells of pulses with several returns, whether each return is the one in the grid of
+        `seen`, and what was recorded of it.
+    seen : Observation
+        The scan's grid.
     """
     shape = seen.depth.shape
     cell, in_grid, depth = (np.concatenate(part) for part in zip(*[(c, g, r.depth) for c, g, r in found], strict=True))

@@ -1,8 +1,7 @@
-"""Places on a surface with what an error of their recorded points may depend on, whatever sensor saw them.
+"""Describe places on a surface by the properties on which errors of recorded points may depend, whatever the sensor.
 
-Lengths are in the wall frame: x along the wall, y up it, z out of it. What a vertex's neighbourhood tells (its normal, roughness
-and convexity) is that of the plane of least squares through the 24 nearest vertices, so that it belongs to a length of about
-three spacings of the mesh's vertices.
+Lengths are in the wall frame: x along the wall, y up, z out of it. Normal, roughness and convexity of a vertex come from the
+least-squares plane through the 24 nearest vertices, so they describe a length of about three vertex spacings.
 """
 
 from __future__ import annotations
@@ -20,17 +19,32 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 Covariate = Literal["along", "up", "out", "slope", "roughness", "convexity", "edge_distance"]
+"""Names of the properties."""
 _NEIGHBOURS = 24
+"""Number of vertices through which a plane is fitted."""
 _AT_ONCE = 100_000
+"""Number of vertices processed at a time."""
 _CREASE = float(np.cos(np.radians(45.0)))
-"""Cosine between the normals of two neighbouring vertices below which the surface has an edge between them."""
+"""Cosine between the normals of two neighbouring vertices below which there is an edge between them."""
 
 
 @dataclass(frozen=True)
 class SurfacePlaces:
-    """n places. point: (n, 3), wall frame, m; normal: (n, 3) unit, out of the rock; roughness: (n,) standard deviation of the
-    neighbours from their plane, m; convexity: (n,) height above the neighbours' middle, m; edge_distance: (n,) m to the nearest
-    edge of the mesh: its rim, or a crease."""
+    """n places on a surface.
+
+    Attributes
+    ----------
+    point : (n, 3) array
+        Position, wall frame, m.
+    normal : (n, 3) array
+        Unit normal, pointing out of the rock.
+    roughness : (n,) array
+        Standard deviation of the neighbours from their plane, m.
+    convexity : (n,) array
+        Height above the centre of the neighbours, m.
+    edge_distance : (n,) array
+        Distance to the nearest edge of the mesh (its border or a crease), m.
+    """
 
     point: FloatArray
     normal: FloatArray
@@ -42,12 +56,12 @@ class SurfacePlaces:
         return len(self.point)
 
     def part(self, rows: Any) -> Self:
-        """Some of the places."""
+        """Return some of the places."""
         return replace(self, **{each.name: getattr(self, each.name)[rows] for each in fields(self)})
 
     @property
     def covariates(self) -> dict[str, FloatArray]:
-        """(n,) each: place (m), slope against the wall's plane (rad), and the rest (m)."""
+        """The properties by name, (n,) each: position (m), slope against the wall's plane (rad), the others in m."""
         along, up, out = self.point.T
         return {
             "along": along,
@@ -61,49 +75,50 @@ class SurfacePlaces:
 
 
 class ShapedSurface:
-    """A mesh, wall frame, with what its vertices' neighbourhoods tell."""
+    """A mesh in the wall frame, with the properties of its vertices' neighbourhoods."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         self.mesh = mesh
         self._normal, self._roughness, self._convexity = self._planes()
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-        """(n,) distance (m) and number of the vertex nearest to each of some points (n, 3)."""
+        """Return distance (m) and number, (n,) each, of the vertex nearest to each of the points (n, 3)."""
         distance, number = self._tree.query(points, workers=-1)
         return distance, number.astype(np.int64)
 
     def normals(self, vertices: NDArray[np.int64]) -> FloatArray:
-        """(n, 3) unit normals, out of the rock, at vertices (n,)."""
+        """Return unit normals (n, 3), pointing out of the rock, at vertices (n,)."""
         return np.asarray(self._normal[vertices])
 
     def at(self, point: FloatArray, vertices: NDArray[np.int64]) -> SurfacePlaces:
-        """Places (n, 3), m, each with the values of the mean of some vertices (n, k)."""
+        """Describe places (n, 3), m, by the mean properties of some vertices (n, k) each."""
         normal = self._normal[vertices].mean(axis=1)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         values = (each[vertices].mean(axis=1) for each in (self._roughness, self._convexity, self._edge_distance))
         return SurfacePlaces(point, normal, *values)
 
     def near(self, point: FloatArray) -> SurfacePlaces:
-        """Places (n, 3), m, each with the values of the nearest vertex; NaN where a point is."""
+        """Describe places (n, 3), m, by the properties of the nearest vertex. A NaN point keeps its NaN position."""
         known = np.isfinite(point).all(axis=1, keepdims=True)
         vertices = self.nearest(np.where(known, point, 0.0))[1]
         return self.at(point, vertices[:, None])
 
     @cached_property
     def _tree(self) -> cKDTree:
+        """Search tree of the vertices."""
         from scipy.spatial import cKDTree
 
         return cKDTree(self.mesh.vertices)
 
     @property
     def rim(self) -> NDArray[np.int64]:
-        """Numbers of the vertices at the mesh's open borders."""
+        """Numbers of the vertices on the mesh's open borders."""
         edges, uses = np.unique(self.mesh.edges, return_counts=True)
         return np.unique(np.concatenate(np.divmod(edges[uses == 1], len(self.mesh.vertices))))
 
     @cached_property
     def _edge_distance(self) -> FloatArray:
-        """(v,) m; as large as the mesh where it has no edge."""
+        """(v,) distance of each vertex to the nearest edge, m; the size of the mesh if it has no edge."""
         from scipy.spatial import cKDTree
 
         first, second = np.divmod(self.mesh.edges, len(self.mesh.vertices))
@@ -114,7 +129,7 @@ class ShapedSurface:
         return np.asarray(cKDTree(self.mesh.vertices[edge]).query(self.mesh.vertices, workers=-1)[0])
 
     def _planes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Normal (v, 3), roughness (v,) and convexity (v,) at the vertices."""
+        """Return normal (v, 3), roughness (v,) and convexity (v,) at the vertices."""
         vertices, outwards = self.mesh.vertices, self.mesh.vertex_normals()
         count = min(_NEIGHBOURS, len(vertices))
         normal = np.empty_like(outwards)
@@ -134,12 +149,19 @@ class ShapedSurface:
 
 @dataclass(frozen=True)
 class RecordedPoints:
-    """Points on their way into a cloud. places: on the true surface; above: (n,) m by which each is recorded above it, along its
-    normal."""
+    """Points on their way into a cloud.
+
+    Attributes
+    ----------
+    places : SurfacePlaces
+        Where the points lie on the true surface.
+    above : (n,) array
+        How far each is recorded above the surface, along its normal, m.
+    """
 
     places: SurfacePlaces
     above: FloatArray
 
-    def raised(self, by: FloatArray) -> RecordedPoints:
-        """The same with a further error (n,), m."""
+    def with_height_error(self, by: FloatArray) -> RecordedPoints:
+        """Return the points with a further error (n,) along the normals, m."""
         return replace(self, above=self.above + by)

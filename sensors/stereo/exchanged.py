@@ -1,8 +1,8 @@
-"""The right camera's depth map: the stereo sensor observes with its cameras turned upside down, which exchanges left and right.
+"""Make the right camera's depth map: the stereo sensor observes with both cameras upside down, which exchanges left and right.
 
-The errors of the cameras and of their exposures are those of the left depth map (`random` draws the same ones); the matching's
-errors are drawn anew. Two depth maps of one real pair of photographs have much of their matching errors in common: where both are
-fused, their mean is more precise here than it would be there.
+The errors of the cameras and their exposures are the same as for the left depth map (the same `random` draws them). The errors
+of the matching are drawn anew. Two depth maps of one real pair of photographs share much of their matching errors, so the mean
+of both is more precise here than it would be in reality.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ StereoSensor = StereoPair | MatchedStereoPair
 
 
 def pair_of(sensor: StereoSensor) -> StereoPair:
-    """The cameras, model and quality of a stereo sensor."""
+    """Return the pair (cameras, model and quality) of a stereo sensor."""
     return sensor.pair if isinstance(sensor, MatchedStereoPair) else sensor
 
 
 def observe_right(sensor: StereoSensor, scene: RayCaster, random: KeyedRandom) -> Observation:
-    """The right depth map of the look that `sensor.observe(scene, random)` takes; rows and columns are the right image's."""
+    """Make the right depth map that belongs to `sensor.observe(scene, random)`; rows and columns are the right image's."""
     pair = pair_of(sensor)
     exchanged = replace(pair, cameras=pair.cameras.exchanged(), model=_ExchangedModel.of(pair))
     turned: StereoSensor = replace(sensor, pair=exchanged) if isinstance(sensor, MatchedStereoPair) else exchanged
     seen = turned.observe(scene, random)
     return replace(
         seen,
-        points=_turned(seen.points),
-        depth=_turned(seen.depth),
-        block=_turned(seen.block),
-        truth={name: _turned(channel) for name, channel in seen.truth.items()},
-        offset=None if seen.offset is None else _turned(seen.offset),
+        points=_upside_down(seen.points),
+        depth=_upside_down(seen.depth),
+        block=_upside_down(seen.block),
+        truth={name: _upside_down(channel) for name, channel in seen.truth.items()},
+        offset=None if seen.offset is None else _upside_down(seen.offset),
     )
 
 
 def depth_cameras(pair: StereoPair) -> tuple[Camera, Camera]:
-    """The nominal cameras, wall frame, of the left and the right depth map's own pixels; their centres are the cells' centres."""
+    """Return the nominal cameras, wall frame, of the left and right depth maps: their pixels are the cells of the depth maps."""
     cameras, step = pair.cameras.in_wall_frame(pair.frame), REDUCTION[pair.quality]
     rows, columns = pair.shape
     rest = float(cameras.right.width - columns * step), float(cameras.right.height - rows * step)
@@ -55,22 +55,24 @@ def depth_cameras(pair: StereoPair) -> tuple[Camera, Camera]:
 
 
 class _ExchangedModel(StereoModel):
-    """A stereo model for the exchanged pair: every effect acts on the cameras as they stand."""
+    """A stereo model for the exchanged pair, in which every effect acts on the cameras in their original position."""
 
     frame_height_px: int
 
     @classmethod
     def of(cls, pair: StereoPair) -> _ExchangedModel:
+        """Make the model for the exchanged version of a pair."""
         return cls(noise=pair.model.noise, effects=pair.model.effects, frame_height_px=pair.cameras.left.height)
 
     def chain(self, random: KeyedRandom) -> tuple[Effect, ...]:
+        """Return the effects, wrapped for the exchanged pair."""
         effects = super().chain(random)
         return cast(tuple[Effect, ...], tuple(_ExchangedEffect(effect, self.frame_height_px) for effect in effects))
 
 
 @dataclass(frozen=True)
 class _ExchangedEffect:
-    """An effect as `apply_stage` calls it, in an exchanged pair."""
+    """Wraps an effect so that `apply_stage` can apply it in an exchanged pair."""
 
     effect: Effect
     height: int
@@ -92,6 +94,7 @@ class _ExchangedEffect:
         return self.effect.is_null
 
     def apply(self, state: Any, random: KeyedRandom) -> Any:
+        """Apply the effect to the original pair or exposure, and exchange the result."""
         if self.stage == Stage.CAMERA:
             return self.effect.apply(state.exchanged(), random).exchanged()
         if self.stage == Stage.EXPOSE:
@@ -101,7 +104,7 @@ class _ExchangedEffect:
         return self.effect.apply(state, random.child("exchanged"))
 
 
-def _turned(image: Any) -> Any:
-    """(h, w, ...) upside down."""
+def _upside_down(image: Any) -> Any:
+    """Turn an image (h, w, ...) upside down, rows and columns."""
     turned: FloatArray = np.ascontiguousarray(image[::-1, ::-1])
     return turned

@@ -1,8 +1,8 @@
-"""Photographs of the scene: rendered by ray casting in Mitsuba, exposed with noise, coded in 8 bits.
+"""Take photographs of the scene: render by ray casting in Mitsuba, expose with noise, code in 8 bits.
 
-A picture has one pixel per cell of the depth map (a matcher works on the reduced images), so that its noise is that of
-`step` x `step` pixels of the frame binned together.
-Limits: Lambertian rock, one bounce of light, sharp optics: samples on a fixed grid inside each pixel are averaged.
+A picture has one pixel per cell of the depth map, because a matcher works on reduced images. Its noise is that of `step` x
+`step` frame pixels binned together. Limits: Lambertian rock, one bounce of light, sharp optics (samples on a fixed grid within
+each pixel are averaged).
 """
 
 from __future__ import annotations
@@ -27,18 +27,20 @@ from sensors.numerics.device import bounded, opaque, rotated, vector
 Radiance = NDArray[np.float32]
 
 Displacement = Callable[[mi.Float64], mi.Float64]
-"""Recorded minus ideal column of the pixels in rows v, px of the frame."""
+"""Function that returns recorded minus ideal column of pixels in rows v, px of the frame."""
 
 WHITE_PERCENTILE = 99.0
 WHITE_LEVEL = 0.85
-"""Automatic exposure puts this percentile of the pair's radiance at this share of full scale."""
+"""Automatic exposure maps this percentile of the pair's radiance to this share of full scale."""
 
 
 class ExposureConfig(Config):
-    """How light becomes grey values."""
+    """How light is converted to grey values."""
 
     samples_per_side: int = Field(2, ge=1, le=8, description="rays per pixel along a row or a column, averaged")
-    compensation_ev: float = Field(0.0, ge=-10, le=10, description="exposure against the automatic one, powers of two [EV]")
+    compensation_ev: float = Field(
+        0.0, ge=-10, le=10, description="exposure relative to the automatic one, in powers of two [EV]"
+    )
     gamma: float = Field(2.2, gt=0, le=4, description="grey value = 255 signal^(1/gamma)")
     full_well_e: float = Field(78_000.0, gt=0, description="electrons of a full pixel of the frame (Nikon D810 at ISO 64) [e]")
     read_noise_e: float = Field(5.0, ge=0, description="standard deviation of the read noise of a pixel of the frame [e]")
@@ -46,19 +48,32 @@ class ExposureConfig(Config):
 
 @dataclass(frozen=True)
 class Photograph:
-    """image: (rows, columns) uint8; clipped_share: of the pixels, at full scale."""
+    """A photograph: image (rows, columns), uint8, and clipped_share, the share of pixels at full scale."""
 
     image: NDArray[np.uint8]
     clipped_share: float
 
 
 def _still(v: mi.Float64) -> mi.Float64:
+    """Displacement of a camera whose rows do not move."""
     return mi.Float64(0.0)
 
 
 @dataclass(frozen=True)
 class Studio:
-    """What a picture of the rock depends on beside the camera. footprint_m: size of a picture's pixel on the rock."""
+    """What a picture of the rock depends on besides the camera.
+
+    Attributes
+    ----------
+    scene : RayCaster
+        The wall, wall frame.
+    light : Illumination
+        Sun and sky.
+    texture : RockTexture
+        Texture of the rock beyond the mesh's albedo.
+    footprint_m : float
+        Size of a picture's pixel on the rock, m.
+    """
 
     scene: RayCaster
     light: Illumination
@@ -66,10 +81,21 @@ class Studio:
     footprint_m: float
 
     def radiance(self, camera: Camera, step: int, samples_per_side: int, displaced: Displacement = _still) -> Radiance:
-        """(rows, columns) radiance times pi, relative to an open white face turned to the sun; the sky where nothing is hit.
+        """Render the radiance (rows, columns) times pi, relative to an unshadowed white face that points at the sun.
 
-        camera: wall frame; step: pixels of the frame per pixel of the picture; displaced: see Displacement. The samples'
-        positions are the same in every pixel: random ones would add noise that differs between the views.
+        Pixels without rock show the sky. The positions of the samples are the same in every pixel, because random ones would
+        add noise that differs between the views.
+
+        Parameters
+        ----------
+        camera : Camera
+            Wall frame.
+        step : int
+            Frame pixels per pixel of the picture.
+        samples_per_side : int
+            Rays per pixel along a row or a column.
+        displaced : Displacement
+            Sideways displacement of the rows.
         """
         rows, columns = camera.height // step, camera.width // step
         index = dr.arange(mi.UInt32, rows * columns)
@@ -83,7 +109,7 @@ class Studio:
         return np.array(total / samples_per_side**2).reshape(rows, columns)
 
     def _seen(self, camera: Camera, u: mi.Float64, v: mi.Float64) -> mi.Float32:
-        """(n,) radiance along the rays through the pixels (u, v)."""
+        """Return the radiance (n,) along the rays through the pixels (u, v)."""
         x, y = camera.on_device().tangents(u, v)
         origin, direction = vector(camera.position), rotated(camera.rotation, mi.Array3f64(x, y, 1.0))
         hits = self.scene.intersect(origin, direction)
@@ -94,16 +120,31 @@ class Studio:
 
 
 def full_scale(*pictures: Radiance) -> float:
-    """The radiance at which automatic exposure saturates: one for all `pictures`, as both cameras of a pair are set alike."""
+    """Return the radiance at which automatic exposure saturates, one value for all pictures: both cameras have the same
+    settings.
+    """
     bright = np.percentile(np.concatenate([picture.ravel() for picture in pictures]), WHITE_PERCENTILE)
     return max(float(bright) / WHITE_LEVEL, 1e-6)
 
 
 def expose(radiance: Radiance, white: float, step: int, config: ExposureConfig, random: KeyedRandom) -> Photograph:
-    """Expose a picture whose radiance `white` saturates at 0 EV.
+    """Expose a picture.
 
-    Electrons N = N_full L / white 2^EV with N_full = step^2 full wells (binning); their noise is Gaussian with variance
-    N + step^2 read^2 (shot noise, near enough above a hundred electrons); beyond N_full a pixel is clipped.
+    The number of electrons is N = N_full L / white 2^EV with N_full = step^2 full wells (binning). Their noise is Gaussian
+    with variance N + step^2 read^2; shot noise is nearly Gaussian above a hundred electrons. Beyond N_full a pixel is clipped.
+
+    Parameters
+    ----------
+    radiance : (rows, columns) array
+        The rendered picture.
+    white : float
+        Radiance that saturates at 0 EV.
+    step : int
+        Frame pixels per pixel of the picture.
+    config : ExposureConfig
+        The camera's sensor.
+    random : KeyedRandom
+        Source of the noise.
     """
     level = on_device(mi.Float32, radiance) * dr.opaque(mi.Float32, 2.0**config.compensation_ev / white)
     full, read = (dr.opaque(mi.Float32, value) for value in (config.full_well_e * step**2, config.read_noise_e * step))

@@ -1,6 +1,6 @@
-"""Matching of a rectified pair of pictures by OpenCV's semi-global block matching, in tiles.
+"""Match a rectified pair of pictures with OpenCV's semi-global block matching, tile by tile.
 
-Disparities here are in cells of the pictures, column in the left one minus column in the right one.
+Disparities here are in cells of the pictures: column in the left one minus column in the right one.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ from sensors.stereo.rectified import Disparity, Picture
 from sensors.stereo.refinement import RefinementConfig
 
 MODES = {"sgbm": cv2.STEREO_SGBM_MODE_SGBM, "hh": cv2.STEREO_SGBM_MODE_HH, "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY}
+"""OpenCV's name of each mode."""
 SUBPIXELS = 16
 """OpenCV's disparities are integers, in sixteenths of a pixel."""
 MOST_DISPARITIES = 2048
+"""Largest search range, cells."""
 SPECKLE_STEP_PX = 1.0
-"""Neighbours whose disparities differ by more belong to different regions."""
+"""Neighbouring cells whose disparities differ by more than this belong to different regions."""
 
 
 class MatchingConfig(Config):
-    """The real matcher; its pixels are those of the pictures it matches, which are the depth map's cells."""
+    """The real matcher; its pixels are those of the pictures it matches, that is the depth map's cells."""
 
     block_size_px: int = Field(5, ge=1, le=21, description="side of the window whose costs are summed, odd [px]")
     p1: float = Field(8.0, ge=0, description="penalty of a disparity step of one, per pixel of the window")
@@ -36,11 +38,13 @@ class MatchingConfig(Config):
     uniqueness_percent: int = Field(5, ge=0, le=100, description="by how much the best match must beat the second best [%]")
     mode: Literal["sgbm", "hh", "3way"] = Field("sgbm", description="paths of the aggregation: 5 (sgbm), 8 (hh), 3 (3way)")
     left_right_tolerance_px: int = Field(1, ge=1, description="largest disagreement of the two directions of matching [px]")
-    speckle_px: int = Field(60, ge=0, description="smooth regions with at most so many pixels are dropped")
+    speckle_px: int = Field(60, ge=0, description="smooth regions of at most this many pixels are dropped")
     depth_margin_m: float = Field(1.0, ge=0, description="how far the search goes before and behind the visible surface [m]")
     tile_px: int = Field(1024, ge=64, description="side of the tiles that are matched one by one [px]")
     overlap_px: int = Field(64, ge=0, le=1024, description="how far a tile looks beyond its own pixels [px]")
-    refinement: RefinementConfig | None = Field(RefinementConfig(), description="least-squares matching; none: left out")
+    refinement: RefinementConfig | None = Field(
+        RefinementConfig(), description="least-squares matching after the semi-global one; none: no refinement"
+    )
 
     @field_validator("block_size_px")
     @classmethod
@@ -59,14 +63,14 @@ class MatchingConfig(Config):
 
 @dataclass(frozen=True)
 class SearchRange:
-    """The disparities that are tried: `count` (a multiple of 16) from `least` on, cells."""
+    """The disparities that are searched: `count` (a multiple of 16) from `least` on, cells."""
 
     least: int
     count: int
 
     @classmethod
     def between(cls, smallest: float, largest: float) -> SearchRange:
-        """The range that holds both disparities. Raises InputError where it is too wide to be matched."""
+        """Return the range that contains both disparities. Raises InputError if it is too wide to be matched."""
         least = int(np.floor(smallest)) - 1
         count = 16 * int(np.ceil((largest + 2 - least) / 16))
         if count > MOST_DISPARITIES:
@@ -80,10 +84,24 @@ class SearchRange:
 
 
 def match(left: Picture, right: Picture, search: SearchRange, config: MatchingConfig) -> Disparity:
-    """(h, w) disparities of the left picture's cells in steps of 1/16, NaN where there is no match.
+    """Match two pictures.
 
-    left: (h, w), right: (h, any) grey values, NaN outside the images. The left-right check is OpenCV's: from the same costs, the
-    best left cell of every right cell must agree. Tiles run in OpenCV's number of threads; the result does not depend on it.
+    The left-right check is OpenCV's: from the same costs, the best left cell of every right cell must agree. Tiles run in
+    OpenCV's number of threads; the result does not depend on it.
+
+    Parameters
+    ----------
+    left, right : (h, w) and (h, any) arrays
+        Grey values, NaN outside the images.
+    search : SearchRange
+        The disparities that are searched.
+    config : MatchingConfig
+        The matcher.
+
+    Returns
+    -------
+    (h, w) array
+        Disparities of the left picture's cells in steps of 1/16, NaN without a match.
     """
     canvas_left, canvas_right = _aligned(left, right, search)
     raw = np.full(left.shape, -SUBPIXELS, dtype=np.int16)
@@ -98,7 +116,7 @@ def match(left: Picture, right: Picture, search: SearchRange, config: MatchingCo
 
 
 def without_speckles(disparity: Disparity, speckle_px: int) -> Disparity:
-    """The disparities without connected smooth regions of at most `speckle_px` cells: stray matches, as the sky gives them."""
+    """Remove connected smooth regions of at most `speckle_px` cells: stray matches, such as those in the sky."""
     known = ~np.isnan(disparity)
     least = np.float32(np.floor(disparity[known].min())) if known.any() else np.float32(0)
     steps = np.where(known, np.rint((disparity - least) * SUBPIXELS), -SUBPIXELS).astype(np.int16)
@@ -107,14 +125,16 @@ def without_speckles(disparity: Disparity, speckle_px: int) -> Disparity:
 
 
 def _aligned(left: Picture, right: Picture, search: SearchRange) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Both pictures in 8 bits on canvases of one size, where disparity `search.least` is 0 and no left cell lacks room.
+    """Copy both pictures in 8 bits to canvases of the same size, so that disparity `search.least` becomes 0 and no left cell
+    lacks room.
 
-    Left cell j is at column j + count of its canvas; the right cell that matches it with the least disparity is at the same.
+    Left cell j is at column j + count of its canvas; the right cell that matches it at the least disparity is at the same
+    column.
     """
     rows, columns = left.shape
     canvases = np.zeros((2, rows, columns + search.count), dtype=np.uint8)
     canvases[0, :, search.count :] = _grey(left)
-    shift = search.count + search.least  # of right cells
+    shift = search.count + search.least  # column of right cell 0 on its canvas
     start, stop = max(0, -shift), min(right.shape[1], canvases.shape[2] - shift)
     if stop > start:
         canvases[1, :, start + shift : stop + shift] = _grey(right[:, start:stop])
@@ -122,10 +142,12 @@ def _aligned(left: Picture, right: Picture, search: SearchRange) -> tuple[NDArra
 
 
 def _grey(picture: Picture) -> NDArray[np.uint8]:
+    """Convert a picture to 8 bits; unknown pixels become 0."""
     return np.clip(np.rint(np.nan_to_num(picture)), 0, 255).astype(np.uint8)
 
 
 def _tiles(shape: tuple[int, int], side: int) -> list[tuple[slice, slice]]:
+    """Divide a picture into tiles."""
     starts = [range(0, length, side) for length in shape]
     return [
         (slice(row, min(row + side, shape[0])), slice(column, min(column + side, shape[1])))
@@ -137,7 +159,7 @@ def _tiles(shape: tuple[int, int], side: int) -> list[tuple[slice, slice]]:
 def _matched_tile(
     left: NDArray[np.uint8], right: NDArray[np.uint8], tile: tuple[slice, slice], search: SearchRange, config: MatchingConfig
 ) -> NDArray[np.int16]:
-    """The raw disparities of one tile (columns as in the left picture), matched together with its surroundings."""
+    """Match one tile together with its surroundings; return its raw disparities, with columns as in the left picture."""
     rows, columns = tile
     top, first = max(0, rows.start - config.overlap_px), max(0, columns.start - config.overlap_px)
     around = (
@@ -150,6 +172,7 @@ def _matched_tile(
 
 
 def _matcher(count: int, config: MatchingConfig) -> Any:
+    """Make OpenCV's matcher for `count` disparities from 0 on."""
     area = config.block_size_px**2
     return cv2.StereoSGBM_create(
         minDisparity=0,

@@ -1,4 +1,4 @@
-"""The rectified pair of pictures: resampled with the nominal calibration onto grids whose rows are epipolar lines."""
+"""Resample a pair of pictures, with the nominal calibration, to grids whose rows are epipolar lines."""
 
 from __future__ import annotations
 
@@ -19,14 +19,25 @@ Picture = NDArray[np.float32]
 Disparity = NDArray[np.float32]
 
 LARGEST_STRETCH = 3
-"""A rectified picture may be this many times wider or higher than the camera's."""
+"""Largest ratio of a rectified picture's width to the camera's."""
 
 
 @dataclass(frozen=True)
 class RectifiedGrid:
-    """Grids of cells that cover the rectified images; cell (i, j) of a grid is at u = step (j + first), v = step (i + top), px.
+    """Grids of cells that cover the rectified images. Cell (i, j) of a grid is at u = step (j + first), v = step (i + top), px.
 
-    step: px of the frame per cell; left_first, right_first, top: in cells; left_width, right_width, height: in cells.
+    Attributes
+    ----------
+    pair : CameraPair
+        The nominal cameras.
+    geometry : Rectification
+        Their rectification.
+    step : int
+        Frame px per cell.
+    left_first, right_first, top : int
+        Start of the grids, cells.
+    left_width, right_width, height : int
+        Size of the grids, cells.
     """
 
     pair: CameraPair
@@ -41,9 +52,9 @@ class RectifiedGrid:
 
     @classmethod
     def cover(cls, pair: CameraPair, geometry: Rectification, step: int) -> RectifiedGrid:
-        """The grids that hold the whole of both frames in the rows that both have; pair: nominal.
+        """Make the grids that contain the whole width of both frames in the rows that both have.
 
-        Raises InputError for cameras that converge so much that rectification tears the images apart.
+        Raises InputError if the cameras converge so much that rectification tears the images apart.
         """
         left_u, left_v = _outline(pair.left, geometry.left, geometry, geometry.u_left)
         right_u, right_v = _outline(pair.right, geometry.right, geometry, geometry.u_right)
@@ -61,28 +72,30 @@ class RectifiedGrid:
 
     @property
     def disparity_offset(self) -> int:
-        """Cells to add to a difference of columns, left minus right, to get a disparity in cells."""
+        """Number of cells to add to a difference of grid columns, left minus right, to get a disparity."""
         return self.left_first - self.right_first
 
     def left(self, image: NDArray[np.uint8]) -> Picture:
-        """(height, left_width) grey values of the left picture, NaN outside it; image: one pixel per `step` px of the frame."""
+        """Resample the left picture: grey values (height, left_width), NaN outside. image: one pixel per `step` px of the
+        frame.
+        """
         geometry = self.geometry
         return self._resampled(image, self.pair.left, geometry.left, geometry.u_left, self.left_first, self.left_width)
 
     def right(self, image: NDArray[np.uint8]) -> Picture:
-        """(height, right_width) grey values of the right picture, NaN outside it."""
+        """Resample the right picture: grey values (height, right_width), NaN outside."""
         geometry = self.geometry
         return self._resampled(image, self.pair.right, geometry.right, geometry.u_right, self.right_first, self.right_width)
 
     def cells(self, u: mi.Float64, v: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
-        """Column and row in the left grid of rectified left pixels (u, v), px."""
+        """Convert rectified left pixels (u, v) to column and row in the left grid."""
         step, first, top = opaque(self.step, self.left_first, self.top)
         return u / step - first, v / step - top
 
     def _resampled(
         self, image: NDArray[np.uint8], camera: Camera, rotation: FloatArray, u_0: float, first: int, width: int
     ) -> Picture:
-        """Lanczos interpolation at where each cell's ray meets the camera's image."""
+        """Interpolate (Lanczos) where each cell's ray meets the camera's image."""
         index, columns = dr.arange(mi.UInt32, self.height * width), dr.opaque(mi.UInt32, width)
         left, top, step, f, centre_u, centre_v = opaque(first, self.top, self.step, self.geometry.f, u_0, self.geometry.v)
         x = ((mi.Float64(index % columns) + left) * step - centre_u) / f
@@ -99,7 +112,9 @@ class RectifiedGrid:
 
 
 def _outline(camera: Camera, rotation: FloatArray, geometry: Rectification, u_0: float) -> tuple[FloatArray, FloatArray]:
-    """Rectified pixels (u, v) of the frame's border. Raises InputError where a border ray runs along the rectified plane."""
+    """Return rectified pixels (u, v) of the frame's border. Raises InputError if a border ray is parallel to the rectified
+    plane.
+    """
     along = np.linspace(0, 1, 65)
     zero, one = np.zeros_like(along), np.ones_like(along)
     u = np.concatenate([along, along, zero, one]) * camera.width

@@ -1,4 +1,4 @@
-"""Least-squares matching: it takes out the pixel locking that semi-global matching leaves in its disparities."""
+"""Refine disparities by least-squares matching, which removes the pixel locking that semi-global matching leaves."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ from sensors.numerics.device import bounded
 from sensors.stereo.rectified import Disparity, Picture
 
 PREFILTER_PX = 0.7
-"""Standard deviation of the Gaussian that both pictures are filtered with first: what is too fine to be interpolated would bias
-the match towards whole pixels (Pan 2013, Optics and Lasers in Engineering 51)."""
+"""Standard deviation of the Gaussian with which both pictures are filtered first. Texture too fine for interpolation would bias
+the match towards whole pixels (Pan 2013, Optics and Lasers in Engineering 51).
+"""
 SLOPE_SCALE_PX = 4.0
-"""Standard deviation of the Gaussian window over which the disparity's slope is taken."""
+"""Standard deviation of the Gaussian window from which the disparity's slope is taken."""
 STEEPEST = 1.0
 """Largest slope of the disparity, px/px, that a window follows."""
 EDGE_PX = 0.75
-"""Scatter of the disparities about the local plane beyond which a window holds a depth step and stays upright."""
+"""Scatter of the disparities about the local plane beyond which a window contains a depth step and is not tilted."""
 OWN_SURFACE_PX = 1.0
-"""A pixel of the window counts where the matcher's disparity there is within this of the window's slope: over a depth step the
-other surface would pull the match."""
+"""Largest difference between the matcher's disparity at a pixel and the window's plane. Pixels beyond a depth step are so
+excluded, because the other surface would bias the match.
+"""
 LEAST_SHARE = 0.4
-"""Of a window's pixels that must count."""
+"""Smallest share of a window's pixels that must be used."""
 MATCHER_SIGMA_PX = 0.2
-"""Standard deviation of the matcher's own disparity: its weight against the window's."""
+"""Standard deviation of the matcher's own disparity, for its weight relative to the window's."""
 LARGEST_STEP_PX = 0.5
+"""Largest change of the disparity in one iteration."""
 LARGEST_SHIFT_PX = 1.5
-"""A match that moves farther from where the matcher had it has lost its way."""
+"""A match that moves farther than this from the matcher's disparity is dropped as wrong."""
 
 
 class RefinementConfig(Config):
@@ -53,15 +56,28 @@ class RefinementConfig(Config):
 
 
 def refine(left: Picture, right: Picture, disparity: Disparity, config: RefinementConfig) -> Disparity:
-    """(h, w) disparities refined by least-squares matching of windows along the row, NaN where there is no match.
+    """Refine disparities by least-squares matching of windows along the row.
 
-    Over the pixels of a window x window neighbourhood that show the same surface, L(x) = a R(x - d - s . dx) + b is solved for
-    gain a, offset b and disparity d by Gauss-Newton steps (Lucas & Kanade 1981; Gruen 1985); s is the slope of the disparity near
-    by, so that windows lie on slanted rock. R is interpolated by cubic convolution (Keys 1981). The standard deviation s_d of d
-    follows from the residuals. The result is the weighted mean (d / s_d^2 + d_0 / s_0^2) / (1 / s_d^2 + 1 / s_0^2) with the
-    matcher's d_0 and its s_0, so that a window without texture leaves d_0 as it is.
-    left, right: (h, any) grey values, NaN outside; disparity: (h, w) cells. Matches are dropped that end less certain or less
-    alike than the config wants, or more than 1.5 cells from where they were.
+    Over the pixels of a window that show the same surface, L(x) = a R(x - d - s . dx) + b is solved for gain a, offset b and
+    disparity d by Gauss-Newton steps (Lucas & Kanade 1981; Gruen 1985). s is the local slope of the disparity, so that windows
+    follow slanted rock. R is interpolated by cubic convolution (Keys 1981). The standard deviation s_d of d follows from the
+    residuals. The result is the weighted mean (d / s_d^2 + d_0 / s_0^2) / (1 / s_d^2 + 1 / s_0^2) with the matcher's d_0 and
+    its s_0, so that a window without texture leaves d_0 unchanged. Matches are dropped if they end less certain or less
+    similar than the config requires, or more than 1.5 cells from where they started.
+
+    Parameters
+    ----------
+    left, right : (h, any) arrays
+        Grey values, NaN outside the images.
+    disparity : (h, w) array
+        The matcher's disparities, cells; NaN without a match.
+    config : RefinementConfig
+        Window and thresholds.
+
+    Returns
+    -------
+    (h, w) array
+        Refined disparities, NaN without a match.
     """
     cell = np.flatnonzero(~np.isnan(disparity))
     slopes = [on_device(mi.Float32, slope.ravel()[cell]) for slope in _slopes(disparity)]
@@ -83,8 +99,17 @@ def refine(left: Picture, right: Picture, disparity: Disparity, config: Refineme
 
 @dataclass(frozen=True)
 class _Fit:
-    """(n,) each: the step of the disparity, its standard deviation (px; infinite where the fit fails), and how alike the windows
-    are with it: the coefficient of correlation."""
+    """Result of one Gauss-Newton step, (n,) each.
+
+    Attributes
+    ----------
+    step : mi.Float32
+        Change of the disparity, px.
+    sigma : mi.Float32
+        Standard deviation of the disparity, px; infinite if the fit fails.
+    correlation : mi.Float32
+        Coefficient of correlation of the two windows.
+    """
 
     step: mi.Float32
     sigma: mi.Float32
@@ -104,13 +129,28 @@ class _Pictures:
 
     @classmethod
     def on_device(cls, left: Picture, right: Picture, disparity: Disparity) -> _Pictures:
+        """Copy pictures and disparities to the device."""
         sizes = (dr.opaque(mi.Int32, size) for size in (left.shape[0], left.shape[1], right.shape[1]))
         return cls(*(on_device(mi.Float32, raster) for raster in (left, right, disparity)), *sizes)
 
     def fit(
         self, row: mi.Int32, column: mi.Int32, disparity: mi.Float32, start: mi.Float32, slopes: list[mi.Float32], half: int
     ) -> _Fit:
-        """One Gauss-Newton step at each of n cells from `disparity`; start: the matcher's, which tells what is one surface."""
+        """Take one Gauss-Newton step at each of n cells.
+
+        Parameters
+        ----------
+        row, column : mi.Int32, (n,)
+            The cells.
+        disparity : mi.Float32, (n,)
+            Present disparities.
+        start : mi.Float32, (n,)
+            The matcher's disparities, which tell the window's surface from others.
+        slopes : list of two mi.Float32, (n,)
+            Slopes of the disparity along row and column.
+        half : int
+            Half the side of the window, rounded down.
+        """
         side = 2 * half + 1
         reference = dr.gather(mi.Float32, self.left, row * self.left_width + column)  # keeps the sums small
 
@@ -138,16 +178,18 @@ class _Pictures:
         return _solution(sums, inside & (sums[0] >= LEAST_SHARE * side * side))
 
     def _cubic(self, first: mi.Int32, t: mi.Float32, active: mi.Bool) -> tuple[mi.Float32, mi.Float32]:
-        """Value and slope of the right picture at fraction t behind the second of four cells from `first` on (Keys, a = -1/2)."""
+        """Return value and slope of the right picture at fraction t after the second of four cells from `first` on (Keys, a =
+        -1/2).
+        """
         a, b, c, d = (dr.gather(mi.Float32, self.right, first + k, active) for k in range(4))
         linear, square, cube = (c - a) / 2, a - 2.5 * b + 2 * c - 0.5 * d, (d - a) / 2 + 1.5 * (b - c)
         return b + t * (linear + t * (square + t * cube)), linear + t * (2 * square + 3 * t * cube)
 
 
 def _solution(sums: tuple[mi.Float32, ...], enough: mi.Bool) -> _Fit:
-    """The fit from the sums over the window's pixels that count: 1, L, R, G, LL, RR, GG, LR, LG, RG with G = dR/dx.
+    """Solve the fit from the sums over the window's pixels: 1, L, R, G, LL, RR, GG, LR, LG, RG, where G = dR/dx.
 
-    With the means taken off, L = a R + c G has the normal equations [RR RG; RG GG] [a c] = [LR LG]; the step is -c / a.
+    After subtracting the means, L = a R + c G has the normal equations [RR RG; RG GG] [a c] = [LR LG]; the step is -c / a.
     """
     n = sums[0]
     mean_l, mean_r, mean_g = (total / n for total in sums[1:4])
@@ -163,7 +205,7 @@ def _solution(sums: tuple[mi.Float32, ...], enough: mi.Bool) -> _Fit:
 
 
 def _slopes(disparity: Disparity) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(h, w) slopes of the disparity along the row and along the column, from Gaussian means over the matched cells."""
+    """Return the slopes (h, w) of the disparity along row and column, from Gaussian means over the matched cells."""
     known = ~np.isnan(disparity)
     weight = _blurred(known.astype(np.float32))
     centre = np.float32(np.mean(disparity[known])) if known.any() else np.float32(0)  # keeps the squares small
@@ -179,4 +221,5 @@ def _slopes(disparity: Disparity) -> tuple[NDArray[np.float32], NDArray[np.float
 
 
 def _blurred(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Filter an array with the Gaussian of SLOPE_SCALE_PX."""
     return cv2.GaussianBlur(values, (0, 0), SLOPE_SCALE_PX)

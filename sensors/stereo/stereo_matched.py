@@ -1,13 +1,14 @@
-"""The stereo sensor with real matching: photographs of the rock, matched by OpenCV, in place of simulated disparities.
+"""Simulate a stereo pair with a real matcher: photographs of the rock are rendered and matched by OpenCV.
 
 1  The real pair (nominal calibration plus camera effects) photographs the scene, rendered by ray casting in Mitsuba: textured
    rock, sun and shadows, sky, sensor noise, 8 bits, one pixel per cell of the depth map. Effects on image rows displace them.
 2  Both pictures are resampled with the nominal calibration to rows that are epipolar lines.
-3  Semi-global matching in tiles with a left-right check, then least-squares matching against the pixel locking.
-4  The disparities are read at the depth map's cells and reprojected with the nominal calibration, as simulated ones are.
-Effects on the matching do not apply: the matcher makes its own errors. The depth range that is searched is that of the visible
-surface and a margin, as a photogrammetric package knows it from its tie points. A vertical parallax, where real and nominal
-calibration differ, disturbs the matching as it would in reality.
+3  They are matched semi-globally in tiles, with a left-right check; least-squares matching then removes the pixel locking.
+4  The disparities are interpolated at the depth map's cells and reprojected with the nominal calibration, like simulated ones.
+
+Effects on the matching do not apply, because the matcher makes its own errors. The depth range that is searched is that of the
+visible surface plus a margin, as a photogrammetric package knows it from its tie points. A vertical parallax, where real and
+nominal calibration differ, disturbs the matching as it would in reality.
 """
 
 from __future__ import annotations
@@ -35,17 +36,30 @@ from sensors.stereo.exposure import ExposureConfig, Photograph, Radiance, Studio
 from sensors.stereo.matching import MatchingConfig, SearchRange, match, without_speckles
 from sensors.stereo.rectified import Disparity, RectifiedGrid
 from sensors.stereo.refinement import refine
-from sensors.stereo.stereo_pair import REDUCTION, StereoPair, exposed, rectified_pixel, reproject, row_tangent, view
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair, rectified_pixel, reproject, row_displacement, row_tangent, view
 
 STEP_PX = 1.0
-"""Difference of neighbouring disparities beyond which a cell between them takes the nearest one instead of a mean."""
+"""If neighbouring disparities differ by more than this, a cell between them takes the nearest one instead of a mean."""
 
 
 @dataclass(frozen=True)
 class MatchedStereoPair:
-    """A calibrated pair whose photographs are matched. pair: cameras, wall frame, model and quality; texture: the rock's.
+    """A calibrated pair whose photographs are matched.
 
-    Raises InputError at once where the model names an effect on the matching.
+    Raises InputError at construction if the model names an effect on the matching.
+
+    Attributes
+    ----------
+    pair : StereoPair
+        Cameras, wall frame, model and quality.
+    texture : RockTexture
+        Texture of the rock beyond the mesh's albedo.
+    illumination : IlluminationConfig
+        Sun and sky.
+    exposure : ExposureConfig
+        The cameras' sensors.
+    matching : MatchingConfig
+        The matcher.
     """
 
     pair: StereoPair
@@ -55,6 +69,7 @@ class MatchedStereoPair:
     matching: MatchingConfig
 
     def __post_init__(self) -> None:
+        """Refuse a model with effects on the matching."""
         named = [effect.name for effect in self.pair.model.effects if effect.stage == Stage.MATCH and not effect.is_null]
         if named:
             raise InputError(
@@ -64,13 +79,13 @@ class MatchedStereoPair:
             )
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """One depth map, as `StereoPair.observe` returns it; `block` and the truth are what the left pixel really sees."""
+        """Make one depth map, like `StereoPair.observe`; `block` and the truth are what the left pixel really sees."""
         effects = self.pair.model.chain(random)
         nominal = self.pair.cameras.in_wall_frame(self.pair.frame)
         real = self.pair.real_pair(effects, random).in_wall_frame(self.pair.frame)
         geometry, step = rectify(nominal), REDUCTION[self.pair.quality]
         index, u, v = self.pair.cells()
-        hits, point = view(scene, real.left, u - exposed(effects, "left", v, random), v)
+        hits, point = view(scene, real.left, u - row_displacement(effects, "left", v, random), v)
         true_z = _depth(point, nominal.left, geometry)
         dr.eval(hits, true_z)
         search_m = _range(true_z, hits.valid)
@@ -90,14 +105,16 @@ class MatchedStereoPair:
     def photograph(
         self, scene: RayCaster, real: CameraPair, effects: tuple[Effect, ...], random: KeyedRandom
     ) -> tuple[Photograph, Photograph]:
-        """The left and the right photograph by the real cameras (wall frame), exposed alike."""
+        """Take the left and the right photograph with the real cameras (wall frame) and the same exposure."""
         step = REDUCTION[self.pair.quality]
         distance = np.linalg.norm(scene.mesh.bounds.mean(axis=0) - real.left.position)
         light = self.illumination.in_wall_frame(self.pair.frame)
         studio = Studio(scene, light, self.texture, float(distance * step / self.pair.cameras.left.f_px))
 
         def picture(side: Literal["left", "right"], camera: Camera) -> Radiance:
-            return studio.radiance(camera, step, self.exposure.samples_per_side, lambda v: exposed(effects, side, v, random))
+            return studio.radiance(
+                camera, step, self.exposure.samples_per_side, lambda v: row_displacement(effects, side, v, random)
+            )
 
         pictures = picture("left", real.left), picture("right", real.right)
         white = full_scale(*pictures)
@@ -110,7 +127,22 @@ class MatchedStereoPair:
     def matched(
         self, photographs: tuple[Photograph, Photograph], grid: RectifiedGrid, depths_m: tuple[float, float]
     ) -> Disparity:
-        """(h, w) disparities of the left rectified grid, cells, without the grid's offset; depths_m: nearest and farthest."""
+        """Match the photographs.
+
+        Parameters
+        ----------
+        photographs : (left, right)
+            One pixel per cell of the depth map.
+        grid : RectifiedGrid
+            The rectified grids.
+        depths_m : (float, float)
+            Nearest and farthest depth of the surface, m.
+
+        Returns
+        -------
+        (h, w) array
+            Disparities of the left rectified grid, cells, without the grid's offset; NaN without a match.
+        """
         margin, geometry, config = self.matching.depth_margin_m, grid.geometry, self.matching
         reach = max(depths_m[0] - margin, depths_m[0] / 2), depths_m[1] + margin
         far, near = (
@@ -123,13 +155,13 @@ class MatchedStereoPair:
 
 
 def _depth(point: mi.Array3f64, left: Camera, geometry: Rectification) -> mi.Float64:
-    """(n,) depth of 3 x (n,) points (wall frame) along the rectified left camera's axis, m."""
+    """Return the depth (n,), m, of points 3 x (n,), wall frame, along the rectified left camera's axis."""
     axis: FloatArray = left.rotation @ geometry.left.T[:, 2]
     return dr.dot(vector(axis), point - vector(left.position))
 
 
 def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
-    """Nearest and farthest depth, m. Raises InputError where nothing is seen."""
+    """Return nearest and farthest depth, m. Raises InputError if nothing is seen."""
     values = depth.numpy()[valid.numpy()]
     values = values[values > 0]
     if values.size == 0:
@@ -142,7 +174,9 @@ def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
 
 
 def sampled_disparity(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
-    """(n,) disparities at fractional columns and rows: bilinear on one surface, the nearest cell's at a depth step."""
+    """Interpolate disparities (n,) at fractional columns and rows: bilinearly on one surface, the nearest cell's at a depth
+    step.
+    """
     height, width = disparity.shape
     values = on_device(mi.Float32, disparity)
     columns, rows = dr.opaque(mi.Int32, width), dr.opaque(mi.Int32, height)

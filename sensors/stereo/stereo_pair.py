@@ -1,13 +1,14 @@
-"""The stereo sensor: a fixed pair of cameras, its matching simulated by ray tracing.
+"""Simulate a stereo pair of fixed cameras whose matching is simulated by ray tracing.
 
 1  The real pair is the calibrated (nominal) one with the camera effects added.
-2  A ray goes through the centre of each cell of the left depth map, in the real left camera; what it hits is projected into the
-   real right camera and must be visible from there. Where an exposure displaces image rows, the ray of a left pixel is that of
-   the undisplaced one, and the right pixel is recorded displaced.
-3  Both pixels are undistorted and rectified with the nominal calibration: their disparity, plus the matching's effects, is what
-   a matcher would report.
-4  The disparity is reprojected with the nominal calibration: the recorded point, which errors that are given in metres move
-   along the normal of the surface.
+2  A ray is cast through the centre of each cell of the left depth map, with the real left camera. The point that it hits is
+   projected into the real right camera and must be visible from there. If an exposure displaces image rows, the ray of a left
+   pixel is that of the undisplaced one, and the right pixel is recorded displaced.
+3  Both pixels are undistorted and rectified with the nominal calibration. Their disparity plus the matching effects is what a
+   matcher would report.
+4  The disparity is reprojected with the nominal calibration to the recorded point. Effects that are given in metres then move
+   the point along the surface's normal.
+
 Limits: the matcher follows the row; a vertical parallax, where real and nominal calibration differ, does not disturb it.
 """
 
@@ -32,19 +33,33 @@ from sensors.models.sensor_model import StereoModel
 from sensors.numerics.device import opaque, rotated, vector
 from sensors.signal_chain.matches import ImageRows, Matches
 from sensors.signal_chain.observation import Observation, offset_of, packed
-from sensors.stereo.raised_points import in_metres, shifts
+from sensors.stereo.point_errors import active_point_effects, point_shifts
 
 Quality = Literal["high", "medium", "low"]
 REDUCTION: dict[Quality, int] = {"high": 2, "medium": 4, "low": 8}
-"""Depth map cells per frame pixel, along a row or a column."""
+"""Frame pixels per cell of the depth map, along a row or a column."""
 
 SHADOW_MARGIN = 3e-5
-"""Share of the ray from the right camera that is not tested for occlusion: 3 mm at 100 m, where float32 has 0.01 mm."""
+"""Share of the ray from the right camera that is not tested for occlusion: 3 mm at 100 m, where float32 resolves 0.01 mm."""
 
 
 @dataclass(frozen=True)
 class StereoPair:
-    """A calibrated pair and its model. cameras: nominal calibration, world frame; frame: the wall frame that scenes are in."""
+    """A calibrated pair of cameras and its sensor model.
+
+    Attributes
+    ----------
+    cameras : CameraPair
+        Nominal calibration, world frame.
+    frame : WallFrame
+        The wall frame, in which scenes are given.
+    model : StereoModel
+        Noise and effects.
+    quality : str
+        Reduction of the depth map: "high", "medium" or "low".
+    truth : bool
+        Whether to keep error-free channels.
+    """
 
     cameras: CameraPair
     frame: WallFrame
@@ -53,28 +68,34 @@ class StereoPair:
     truth: bool = False
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """One depth map, reprojected with the nominal calibration; rows and columns are those of the left image, reduced."""
+        """Make one depth map, reprojected with the nominal calibration; rows and columns are those of the reduced left image."""
         effects = self.model.chain(random)
         matches, left_u, left_v, point = self.traced(scene, effects, random)
         for stage in (Stage.MATCH, Stage.FILL):
             matches = apply_stage(effects, stage, matches, random)
         nominal = self.cameras.in_wall_frame(self.frame)
         found = reproject(rectify(nominal), left_u, left_v, matches.disparity)
-        if moving := in_metres(effects):
+        if moving := active_point_effects(effects):
             seen = packed(dr.select(matches.matched, point, np.nan)).numpy().reshape(-1, 3)
-            found += rotated(nominal.left.rotation.T, vectors_on_device(shifts(scene.mesh, moving, seen, random)))
+            found += rotated(nominal.left.rotation.T, vectors_on_device(point_shifts(scene.mesh, moving, seen, random)))
         return self.recorded(matches, found, nominal.left, point)
 
     def traced(
         self, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom
     ) -> tuple[Matches, mi.Float64, mi.Float64, mi.Array3f64]:
-        """What the real pair sees, before the matching: matches, rectified left pixels (u, v), px, and the points, wall frame."""
+        """Trace what the real pair sees, before the matching effects.
+
+        Returns
+        -------
+        Matches, u, v, points
+            The matches, the rectified left pixels (u, v), px, and the true points 3 x (n,), wall frame, m.
+        """
         nominal = self.cameras.in_wall_frame(self.frame)
         real = self.real_pair(effects, random).in_wall_frame(self.frame)
         index, u, v = self.cells()
-        hits, point = view(scene, real.left, u - exposed(effects, "left", v, random), v)
+        hits, point = view(scene, real.left, u - row_displacement(effects, "left", v, random), v)
         matched, right_u, right_v = _visible(scene, real.right, hits, point)
-        right_u += exposed(effects, "right", right_v, random)
+        right_u += row_displacement(effects, "right", right_v, random)
         geometry = rectify(nominal)
         left_u, left_v, disparity = rectified_disparity(nominal, geometry, (u, v), (right_u, right_v))
         seen = hits.block, hits.distance, None if scene.mesh.vertex_albedo is None else hits.albedo
@@ -89,26 +110,40 @@ class StereoPair:
         return self.cameras.left.height // step, self.cameras.left.width // step
 
     def real_pair(self, effects: tuple[Effect, ...], random: KeyedRandom) -> CameraPair:
-        """The pair as it really is, world frame: the calibrated one with the camera effects added."""
+        """Return the pair as it really is, world frame: the calibrated one with the camera effects added."""
         return apply_stage(effects, Stage.CAMERA, self.cameras, random)
 
     def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
-        """Number of each cell and its centre (u, v) in the left image, px of the full-resolution frame."""
+        """Return number and centre (u, v) of each cell in the left image, px of the full-resolution frame."""
         rows, columns = self.shape
         index = dr.arange(mi.UInt32, rows * columns)
         return index, *self.centres(index)
 
     def centres(self, index: mi.UInt32) -> tuple[mi.Float64, mi.Float64]:
-        """Centre (u, v), px of the full-resolution frame, of the cells of these numbers, which count by row over the frame."""
+        """Return the centres (u, v), px of the full-resolution frame, of cells by their numbers, which count row by row."""
         step = REDUCTION[self.quality]
         columns = self.cameras.left.width // step
         row, column = index // columns, index % columns
         return (mi.Float64(column) + 0.5) * float(step), (mi.Float64(row) + 0.5) * float(step)
 
     def recorded(self, matches: Matches, camera_point: mi.Array3f64, left: Camera, true_point: mi.Array3f64) -> Observation:
-        """The observation of matches whose points, 3 x (n,) m, are given in the frame of the nominal left camera.
+        """Make the observation.
 
-        true_point: 3 x (n,) what the pixels really see, wall frame, m.
+        Parameters
+        ----------
+        matches : Matches
+            The matches after all effects.
+        camera_point : 3 x (n,)
+            Recorded points in the nominal left camera's frame, m.
+        left : Camera
+            The nominal left camera, wall frame.
+        true_point : 3 x (n,)
+            Points that the pixels really see, wall frame, m.
+
+        Raises
+        ------
+        InputError
+            If both cameras see no part of the wall in common.
         """
         valid = matches.matched & (camera_point.z > 0)
         depth = dr.select(valid, camera_point.z, np.nan)
@@ -136,23 +171,34 @@ class StereoPair:
 
 
 def reproject(geometry: Rectification, u: Any, v: Any, disparity: Any) -> mi.Array3f64:
-    """3 x (n,) points in the left camera's frame, m, from rectified left pixels and their disparity, px.
+    """Compute points 3 x (n,) in the left camera's frame, m, from rectified left pixels and their disparity, px.
 
-    The inverse of OpenCV's Q: Z = f B / (d - d_inf), X = (u - u_left) Z / f, Y = (v - v_0) Z / f, then turned back by the
-    rectification.
+    This is the inverse of OpenCV's Q: Z = f B / (d - d_inf), X = (u - u_left) Z / f, Y = (v - v_0) Z / f, then rotated back
+    from the rectified frame.
+
+    Parameters
+    ----------
+    geometry : Rectification
+        The nominal rectification.
+    u, v : (n,)
+        Rectified left pixels, px.
+    disparity : (n,)
+        Disparity, px.
     """
     f, u_left, v_0, infinity, base = opaque(geometry.f, geometry.u_left, geometry.v, geometry.offset, geometry.base_m)
     z = f * base / (disparity - infinity)
     return rotated(geometry.left.T, mi.Array3f64((u - u_left) / f * z, (v - v_0) / f * z, z))
 
 
-def exposed(effects: tuple[Effect, ...], camera: Literal["left", "right"], v: mi.Float64, random: KeyedRandom) -> mi.Float64:
-    """Recorded minus ideal column of pixels in the rows `v` of one camera, px."""
+def row_displacement(
+    effects: tuple[Effect, ...], camera: Literal["left", "right"], v: mi.Float64, random: KeyedRandom
+) -> mi.Float64:
+    """Return recorded minus ideal column (n,), px, of pixels in rows `v` of one camera."""
     return apply_stage(effects, Stage.EXPOSE, ImageRows(camera, v, mi.Float64(0.0)), random).du
 
 
 def view(scene: RayCaster, camera: Camera, u: mi.Float64, v: mi.Float64) -> tuple[Hits, mi.Array3f64]:
-    """What the pixels (u, v) of `camera` see: hits, whose distance is the depth along the camera's axis, and points."""
+    """Trace the pixels (u, v) of a camera. Returns hits, whose distance is the depth along the camera's axis, and points."""
     x, y = camera.on_device().tangents(u, v)
     origin, direction = vector(camera.position), rotated(camera.rotation, mi.Array3f64(x, y, 1.0))
     hits = scene.intersect(origin, direction, exact=True)
@@ -160,7 +206,7 @@ def view(scene: RayCaster, camera: Camera, u: mi.Float64, v: mi.Float64) -> tupl
 
 
 def _visible(scene: RayCaster, camera: Camera, hits: Hits, point: mi.Array3f64) -> tuple[mi.Bool, mi.Float64, mi.Float64]:
-    """Whether `camera` sees each point that was hit from its front, and at which pixel (u, v)."""
+    """Return whether `camera` sees each point that was hit, on its front side, and at which pixel (u, v)."""
     centre = vector(camera.position)
     sight = point - centre
     local = rotated(camera.rotation.T, sight)
@@ -173,14 +219,24 @@ def _visible(scene: RayCaster, camera: Camera, hits: Hits, point: mi.Array3f64) 
 def rectified_disparity(
     nominal: CameraPair, geometry: Rectification, left: tuple[mi.Float64, mi.Float64], right: tuple[mi.Float64, mi.Float64]
 ) -> tuple[mi.Float64, mi.Float64, mi.Float64]:
-    """Rectified left pixels (u, v) and disparities, px, of corresponding pixels (u, v) of both images."""
+    """Compute rectified left pixels (u, v) and disparities, px, of corresponding pixels.
+
+    Parameters
+    ----------
+    nominal : CameraPair
+        The nominal cameras.
+    geometry : Rectification
+        Their rectification.
+    left, right : (u, v)
+        Corresponding pixels of both images, px.
+    """
     left_u, left_v = rectified_pixel(nominal.left, geometry.left, *left, geometry.f, geometry.u_left, geometry.v)
     right_u, _ = rectified_pixel(nominal.right, geometry.right, *right, geometry.f, geometry.u_right, geometry.v)
     return left_u, left_v, left_u - right_u
 
 
 def row_tangent(geometry: Rectification, v: mi.Float64) -> mi.Float64:
-    """(n,) tangent of the angle between rectified rows, px, and the rectified axis."""
+    """Return the tangent (n,) of the angle between rectified rows `v`, px, and the rectified axis."""
     scale, centre = opaque(geometry.f, geometry.v)
     return (v - centre) / scale
 
@@ -188,14 +244,26 @@ def row_tangent(geometry: Rectification, v: mi.Float64) -> mi.Float64:
 def rectified_pixel(
     camera: Camera, rotation: FloatArray, u: mi.Float64, v: mi.Float64, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
-    """Rectified pixel of the image pixel (u, v)."""
+    """Convert an image pixel (u, v) to a rectified pixel.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera of the image.
+    rotation : (3, 3) array
+        Camera frame to rectified frame.
+    u, v : (n,)
+        Image pixel, px.
+    f, u_0, v_0 : float
+        Principal distance and principal point of the rectified image, px.
+    """
     return rectified_tangents(*camera.on_device().tangents(u, v), rotation, f, u_0, v_0)
 
 
 def rectified_tangents(
     x: mi.Float64, y: mi.Float64, rotation: FloatArray, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
-    """Rectified pixel of ideal image coordinates (tangents X/Z, Y/Z)."""
+    """Convert ideal image coordinates (X/Z, Y/Z) to a rectified pixel. Arguments as in `rectified_pixel`."""
     ray = rotated(rotation, mi.Array3f64(x, y, 1.0))
     scale, centre_u, centre_v = opaque(f, u_0, v_0)
     return scale * ray.x / ray.z + centre_u, scale * ray.y / ray.z + centre_v

@@ -1,11 +1,12 @@
-"""The stereo sensor vertex by vertex: the reference's own reconstruction (thesis 3.4, method 2).
+"""Simulate a stereo pair vertex by vertex: the reconstruction of the reference implementation (thesis 3.4, method 2).
 
 1  Every vertex of the wall is projected into the real pair (nominal calibration plus camera effects); image rows are displaced.
-2  Both pixels are undistorted and rectified with the nominal calibration: their disparity, plus the matching's effects.
-3  The disparity is reprojected with the nominal calibration. The triangles stay: rims and floors of niches are where they are.
-Effects that look at neighbouring pixels act on the ray-traced depth map; a vertex takes what they change at its place.
-Limits: what one camera does not see of the other's is not left out, as in the reference. Each vertex has white noise of its own,
-however dense the vertices: a surface of fine triangles is averaged over more of them than one of coarse triangles.
+2  Both pixels are undistorted and rectified with the nominal calibration, which gives a disparity; matching effects are added.
+3  The disparity is reprojected with the nominal calibration. The triangles stay the same, so rims and floors of niches do too.
+
+Effects that depend on neighbouring pixels act on the ray-traced depth map; a vertex takes their change at its position.
+Limits: parts that only one camera sees are not left out, as in the reference implementation. Each vertex has its own white noise,
+however dense the vertices are, so a surface of fine triangles averages over more noise values than one of coarse triangles.
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ from sensors.cameras.camera import Camera
 from sensors.cameras.rectification import rectify
 from sensors.effects.base import Effect, Stage, apply_stage
 from sensors.numerics.device import cell_index, rotated, vector
-from sensors.signal_chain.matches import Matches, bridged
+from sensors.signal_chain.matches import Matches, fill_gaps
 from sensors.signal_chain.observation import packed
-from sensors.stereo.raised_points import in_metres, shifts
-from sensors.stereo.stereo_pair import REDUCTION, StereoPair, exposed, rectified_disparity, reproject, row_tangent
+from sensors.stereo.point_errors import active_point_effects, point_shifts
+from sensors.stereo.stereo_pair import REDUCTION, StereoPair, rectified_disparity, reproject, row_displacement, row_tangent
 
 
 def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) -> TriangleMesh:
-    """The wall as the pair reconstructs it: its vertices where they are recorded (wall frame), its triangles and their labels.
+    """Return the wall as the pair reconstructs it: its vertices at their recorded positions (wall frame), its triangles and
+    labels.
 
-    What is not in both images, or behind a camera, is left out. The same `random` draws the orientation and the displacement
-    of rows that `pair.observe` draws; matching noise is keyed by the vertex. Raises InputError where nothing is left.
+    Vertices outside one of the images or behind a camera are left out. The same `random` draws the same orientation and row
+    displacement as `pair.observe`; matching noise is keyed by the vertex. Raises InputError if nothing is left.
     """
     mesh = scene.mesh
     effects = pair.model.chain(random)
@@ -44,8 +46,8 @@ def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) ->
     point = vectors_on_device(mesh.vertices)
     u, v, depth, in_left = _projected(real.left, point)
     right_u, right_v, _, in_right = _projected(real.right, point)
-    u += exposed(effects, "left", v, random)
-    right_u += exposed(effects, "right", right_v, random)
+    u += row_displacement(effects, "left", v, random)
+    right_u += row_displacement(effects, "right", right_v, random)
     geometry = rectify(nominal)
     left_u, left_v, disparity = rectified_disparity(nominal, geometry, (u, v), (right_u, right_v))
     albedo = None if mesh.vertex_albedo is None else on_device(mi.Float32, mesh.vertex_albedo)
@@ -72,20 +74,20 @@ def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) ->
     kept = matches.matched & (local.z > 0)
     dr.eval(recorded, kept)
     vertices = recorded.numpy().reshape(-1, 3)
-    if moving := in_metres(effects):
-        vertices = vertices + shifts(mesh, moving, mesh.vertices, random)
+    if moving := active_point_effects(effects):
+        vertices = vertices + point_shifts(mesh, moving, mesh.vertices, random)
     return _kept(mesh.with_vertices(vertices), kept.numpy().astype(bool))
 
 
 def _projected(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64, mi.Float64, mi.Bool]:
-    """Pixel (u, v), depth along the axis, m, of 3 x (n,) points, wall frame, and whether they are in the image."""
+    """Project points 3 x (n,), wall frame: return pixel (u, v), depth along the axis, m, and whether they are in the image."""
     local = rotated(camera.rotation.T, point - vector(camera.position))
     u, v = camera.on_device().pixel(local.x / local.z, local.y / local.z)
     return u, v, local.z, (local.z > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
 
 
 def _kept(mesh: TriangleMesh, kept: np.ndarray) -> TriangleMesh:
-    """The mesh of the triangles all of whose vertices are kept."""
+    """Return the mesh of the triangles whose vertices are all kept."""
     chosen = kept[mesh.faces].all(axis=1)
     if not chosen.any():
         raise InputError(
@@ -108,41 +110,53 @@ def _kept(mesh: TriangleMesh, kept: np.ndarray) -> TriangleMesh:
 
 
 class _TracedCells:
-    """The ray-traced matches of the same look, made where an effect asks for them."""
+    """The ray-traced depth map of the same observation, computed only if an effect needs it."""
 
     def __init__(self, pair: StereoPair, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom) -> None:
         self._look = pair, scene, effects, random
 
     @cached_property
     def matches(self) -> Matches:
+        """The matches of the depth map's cells."""
         pair, scene, effects, random = self._look
         return pair.traced(scene, effects, random)[0]
 
 
 @dataclass(frozen=True)
 class VertexMatches(Matches):
-    """Matches of n vertices instead of cells: index is the vertex, (u, v) its place in the left image.
+    """Matches of n vertices instead of cells: `index` is the vertex, (u, v) its position in the left image.
 
-    cells: the depth map that effects look at which need neighbours; before: its disparities as they are by now.
+    Attributes
+    ----------
+    cells : _TracedCells
+        The depth map for effects that depend on neighbours.
+    before : (rows, columns) array, optional
+        Its disparities after the effects so far; None before the first.
     """
 
     cells: _TracedCells
     before: FloatArray | None = None
 
     def raster(self) -> FloatArray:
+        """Return the disparities of the depth map after the effects so far."""
         return self.cells.matches.raster() if self.before is None else self.before
 
     def albedo_raster(self) -> FloatArray | None:
+        """Return the albedo of the depth map."""
         return self.cells.matches.albedo_raster()
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
+        """Return the values (n,) of a raster (rows, columns) at the vertices."""
         columns, rows = (cell_index(place / self.reduction, count) for place, count in self._axes())
         return dr.gather(mi.Float64, on_device(mi.Float64, raster), rows * dr.opaque(mi.UInt32, self.shape[1]) + columns)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
-        """The vertices with the change of the cells around them: their mean (bilinear) where all are of the vertex's surface,
-        else that of the cell whose disparity was most like the vertex's. Half-occluded cells count as background."""
-        was = bridged(self.raster(), np.inf)
+        """Add the change of the surrounding cells' disparities to the vertices.
+
+        A vertex takes the bilinear mean of the change if all four cells are on its surface, else that of the cell whose
+        disparity is closest to the vertex's. Half-occluded cells count as background.
+        """
+        was = fill_gaps(self.raster(), np.inf)
         change = on_device(mi.Float64, np.nan_to_num(disparity - was))
         old = on_device(mi.Float64, np.where(np.isnan(was), np.inf, was))
         stride, step = dr.opaque(mi.UInt32, self.shape[1]), dr.opaque(mi.Float64, self.reduction)
@@ -163,11 +177,14 @@ class VertexMatches(Matches):
         return replace(self, disparity=self.disparity + dr.select(one_surface, mean, nearest), before=disparity)
 
     def _beside(self, place: mi.Float64, count: int, side: int) -> tuple[mi.UInt32, mi.Float64]:
-        """The cell whose centre is before (side 0) or behind (1) `place`, in cells, and its weight in a linear interpolation."""
+        """Return the cell whose centre is before (side 0) or after (1) `place`, in cells, and its weight in a linear
+        interpolation.
+        """
         first = dr.floor(place - 0.5)
         share = place - 0.5 - first
         return cell_index(first + side, count), share if side else 1 - share
 
     def _axes(self) -> tuple[tuple[mi.Float64, int], tuple[mi.Float64, int]]:
+        """Return the position in the left image and the number of cells, for each axis."""
         u, v = (dr.select(self.matched, place, 0.0) for place in (self.u, self.v))
         return (u, self.shape[1]), (v, self.shape[0])

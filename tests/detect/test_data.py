@@ -28,7 +28,7 @@ from pipeline.detection.products.run import detect, find_inputs
 from pipeline.detection.training.schedule import has_converged, learning_rate
 from pipeline.formats.rasters.geotiff import write_geotiff
 from scene.common.errors import InputError
-from scene.common.native_output import stderr_dropped
+from scene.common.native_output import suppress_stderr
 from scene.geometry.grid import Grid
 
 
@@ -267,10 +267,10 @@ def test_what_libraries_write_is_dropped_unless_they_fail(capfd):
         os.write(2, b"the reason")
         raise ImportError
 
-    with stderr_dropped():
+    with suppress_stderr():
         os.write(2, b"chatter")
     os.write(2, b"between ")
-    with pytest.raises(ImportError), stderr_dropped():
+    with pytest.raises(ImportError), suppress_stderr():
         failing()
     assert capfd.readouterr().err == "between the reason"
 

@@ -76,6 +76,9 @@ def test_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     config.write_text(TRAINING.model_dump_json())
     benchmark = script("detector", monkeypatch, "--config", config)
     monkeypatch.setattr(benchmark, "ROUNDS", 1)
+    tensorflow = pytest.importorskip("tensorflow")
+    for name in ("set_intra_op_parallelism_threads", "set_inter_op_parallelism_threads"):  # TensorFlow runs by now
+        monkeypatch.setattr(tensorflow.config.threading, name, lambda _: None)
     benchmark.main()
     assert "images/s" in capsys.readouterr().out
 

@@ -253,7 +253,8 @@ def test_the_loaders_leave_the_simulation_alone() -> None:
 
 
 def test_tf_data(made: Path) -> None:
-    """In a process of its own: TensorFlow and the ray tracer bring LLVM each."""
+    """In a process of its own: TensorFlow and the ray tracer bring LLVM each. Tiles are read in threads of TensorFlow's, several
+    of them, in which PROJ would crash."""
     pytest.importorskip("tensorflow")
     program = f"""
 import numpy as np

@@ -23,8 +23,8 @@ from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh
-from scene.meshes.cleaning import flipped
-from scene.meshes.winding import facing
+from scene.meshes.cleaning import flip_faces
+from scene.meshes.winding import orient_to_sensors
 from scene.ray_casting.raycast import RayCaster
 from sensors.models.placement import look_at
 
@@ -57,7 +57,7 @@ def seen(path: Path, sensor: SensorName, **changes: Any) -> tuple[TriangleMesh, 
 def wound(mesh: TriangleMesh, which: Any = slice(None)) -> TriangleMesh:
     turned = np.zeros(len(mesh.faces), bool)
     turned[which] = True
-    return flipped(mesh, turned)
+    return flip_faces(mesh, turned)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -79,7 +79,7 @@ def test_a_piece_is_turned_by_itself_and_vertices_stay() -> None:
     vertices = np.concatenate([near.vertices, far.vertices])
     right = np.concatenate([near.faces, far.faces + len(near.vertices)])
     both = replace(near, vertices=vertices, faces=np.concatenate([near.faces, far.faces[:, ::-1] + len(near.vertices)]))
-    turned, words = facing(both, [EYE], "wall")
+    turned, words = orient_to_sensors(both, [EYE], "wall")
     np.testing.assert_array_equal(turned.faces, right)
     assert turned.vertices is both.vertices
     assert words == "a piece of 70 triangles turned, as they were wound away from the sensor"
@@ -88,7 +88,7 @@ def test_a_piece_is_turned_by_itself_and_vertices_stay() -> None:
 def test_triangles_without_common_vertices_are_one_surface() -> None:
     mesh = sheet()
     soup = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3))
-    turned, words = facing(wound(soup), [EYE], "wall")
+    turned, words = orient_to_sensors(wound(soup), [EYE], "wall")
     np.testing.assert_array_equal(turned.faces, soup.faces)
     assert words.startswith("all 70 triangles turned")
 
@@ -96,11 +96,11 @@ def test_triangles_without_common_vertices_are_one_surface() -> None:
 def test_a_closed_surface_is_turned_only_where_it_is_wound_inwards() -> None:
     ball = sphere(CENTRE, 2.0, 3)
     inside = TriangleMesh(ball.vertices, ball.faces[:, ::-1])
-    assert facing(ball, [EYE], "ball")[1] == ""
-    np.testing.assert_array_equal(facing(inside, [EYE], "ball")[0].faces, ball.faces)
-    assert facing(inside, [CENTRE], "tunnel")[1] == ""  # a tunnel, seen from within
+    assert orient_to_sensors(ball, [EYE], "ball")[1] == ""
+    np.testing.assert_array_equal(orient_to_sensors(inside, [EYE], "ball")[0].faces, ball.faces)
+    assert orient_to_sensors(inside, [CENTRE], "tunnel")[1] == ""  # a tunnel, seen from within
     with pytest.raises(InputError, match="stands inside a closed solid"):
-        facing(ball, [CENTRE], "ball")
+        orient_to_sensors(ball, [CENTRE], "ball")
 
 
 def turned_reference(folder: Path, which: Any = slice(None)) -> Measurement:
@@ -150,8 +150,8 @@ BAD = {
     "points alone": (replace(sheet(), faces=np.empty((0, 3), np.int32)), "holds no triangles"),
     "nan": (changed(v7=np.nan), r"1 of 48 vertices are not finite, the first is vertex 7 at \(nan, nan, nan\)"),
     "infinite": (changed(v7=np.inf), "1 of 48 vertices are not finite"),
-    "1e300": (changed(v7=1e300), r"1 of 48 vertices are no place on earth, the first is vertex 7 at \(1e\+300"),
-    "1e9": (sheet().with_vertices(sheet().vertices * 1e9), r"are no place on earth.*allowed: coordinates of up to 1e\+08 m"),
+    "1e300": (changed(v7=1e300), r"1 of 48 vertices are not on earth, the first is vertex 7 at \(1e\+300"),
+    "1e9": (sheet().with_vertices(sheet().vertices * 1e9), r"are not on earth.*allowed: coordinates of up to 1e\+08 m"),
     "1e7": (sheet().with_vertices(sheet().vertices * 1e6), r"7e\+06 m in size"),
     "far away": (sheet().with_vertices(sheet().vertices + UTM), r"stands 5,0\d\d km from the surface.*one coordinate system"),
     "rounded": (rock().with_vertices((rock().vertices + UTM).astype(np.float32).astype(float)), "were rounded"),

@@ -22,7 +22,7 @@ from pipeline.gap.report.in_words import paragraph
 from pipeline.gap.report.report import summary, to_dict
 from scene.common import threads
 from scene.common.backend import dr
-from sensors.numerics.curve import Axis, surface_on_host
+from sensors.numerics.curve import Axis, interpolate_on_host
 
 ROOT = Path(__file__).parents[2]
 
@@ -101,7 +101,7 @@ def test_a_range_error_that_jumps_is_folded_with_its_high_overtones(tmp_path: Pa
     assert (found.verdict, effect.name, effect.entry["covariate"]) == ("unknown", "tls.range_empirical", "range")
     assert effect.entry["along"]["period"] == pytest.approx(length, rel=0.01)
     range_m = found.residuals.covariates["range"]
-    curve = surface_on_host(range_m, range_m, Axis(**effect.entry["along"]), Axis(), effect.entry["values_m"])
+    curve = interpolate_on_host(range_m, range_m, Axis(**effect.entry["along"]), Axis(), effect.entry["values_m"])
     assert np.corrcoef(curve, square(range_m))[0, 1] > 0.975
 
 

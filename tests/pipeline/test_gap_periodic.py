@@ -26,7 +26,7 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.effects.row_jitter import RowJitter
-from sensors.numerics.curve import surface_on_host
+from sensors.numerics.curve import interpolate_on_host
 
 SIDE, STRIDE, SIGMA, PERIOD = 100, 4.0, 0.2, 64.0
 PIXELS = STRIDE * np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
@@ -88,7 +88,7 @@ def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least:
     entry = from_mean(estimate, found).entry
     assert entry["along"]["period"] == pytest.approx(period, rel=0.01)
     effect = DisparityEmpirical.model_validate(entry)
-    curve = surface_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
+    curve = interpolate_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
     assert np.corrcoef(curve, square(PIXELS[:, 0], period))[0, 1] > least
 
 
@@ -109,7 +109,7 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
     entry = from_mean(estimate, found).entry
     assert entry["along"]["period"] == lines * STRIDE
     effect = DisparityEmpirical.model_validate(entry)
-    curve = surface_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
+    curve = interpolate_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
     assert np.std(curve - curve.mean() - (error - error.mean())) < 0.25 * np.std(error)
 
 
@@ -126,7 +126,7 @@ def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: flo
     assert entry["covariate"] == "disparity"
     assert entry["along"]["period"] == pytest.approx(0.5 / scale, rel=1e-3)
     effect = DisparityEmpirical.model_validate(entry)
-    curve = surface_on_host(disparity, disparity, effect.along, effect.across, effect.values_px)
+    curve = interpolate_on_host(disparity, disparity, effect.along, effect.across, effect.values_px)
     assert curve @ error / (error @ error) == pytest.approx(1.0, abs=0.12)
 
 

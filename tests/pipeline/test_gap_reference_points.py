@@ -20,7 +20,7 @@ from pipeline.measurement.build import Request, build
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.point_planes import own_noise
+from scene.geometry.point_planes import estimate_point_noise
 
 MODEL = {"sensor": "tls", "noise": {"range_sigma_m": 0.001, "angle_sigma_rad": 5e-5}}
 SCANNER = np.zeros(3)
@@ -61,11 +61,13 @@ def test_noise_of_points_is_told_from_relief() -> None:
     """3 mm on a part of a ball of 5 m, 2 cm apart, to 5 % (10,000 points tell it to 1 %); none on waves of 1 m without noise."""
     rng = np.random.default_rng(2)
     radial = workshop.rays(*rng.uniform([[0.0], [1.3]], [[0.6], [1.9]], (2, 20_000)))
-    noise = own_noise((5 + 0.003 * rng.standard_normal((len(radial), 1))) * radial, SCANNER)
+    noise = estimate_point_noise((5 + 0.003 * rng.standard_normal((len(radial), 1))) * radial, SCANNER)
     assert noise is not None
     assert abs(noise - 0.003) < 0.00015
     x, y = rng.uniform(0, 10, (2, 20_000))
-    assert own_noise(np.stack([x, y, -5 + 0.1 * np.sin(2 * np.pi * x) * np.cos(2 * np.pi * y)], axis=1), SCANNER) is None
+    assert (
+        estimate_point_noise(np.stack([x, y, -5 + 0.1 * np.sin(2 * np.pi * x) * np.cos(2 * np.pi * y)], axis=1), SCANNER) is None
+    )
 
 
 def test_chords_across_a_ball_are_bent_back(tmp_path: Path) -> None:

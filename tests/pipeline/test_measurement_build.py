@@ -33,7 +33,7 @@ from pipeline.measurement.build import build
 from pipeline.measurement.origin import from_order
 from pipeline.measurement.request import Request
 from pipeline.measurement.scans import read_scans
-from pipeline.surface.triangulation import triangulated
+from pipeline.surface.triangulation import triangulate_seen_points
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 from sensors.cameras.camera import Camera, CameraPair
@@ -210,7 +210,7 @@ def test_the_noise_of_a_surface_is_that_of_its_points() -> None:
     azimuth, zenith = (grid.ravel() for grid in np.meshgrid(np.arange(-0.3, 0.3, 0.01), np.arange(1.3, 1.8, 0.01)))
     ray = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
     points = ray * (30 / ray[:, :1] + 0.004 * rng.standard_normal((len(ray), 1)))
-    seen = triangulated(points, np.zeros(3), np.eye(3), "a")
+    seen = triangulate_seen_points(points, np.zeros(3), np.eye(3), "a")
     assert seen.roughness_m == pytest.approx(0.004, rel=0.1)
     assert len(seen.mesh.faces) == pytest.approx(2 * 59 * 49, rel=0.02)
     assert np.all(seen.mesh.face_normals()[:, 0] < 0)
@@ -220,7 +220,7 @@ def test_a_step_of_depth_cuts_the_surface() -> None:
     azimuth, zenith = (grid.ravel() for grid in np.meshgrid(np.arange(-0.3, 0.3, 0.01), np.arange(1.3, 1.8, 0.01)))
     ray = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
     points = ray * np.where(azimuth < 0, 20.0, 30.0)[:, None]
-    mesh = triangulated(points, np.zeros(3), np.eye(3), "a").mesh
+    mesh = triangulate_seen_points(points, np.zeros(3), np.eye(3), "a").mesh
     ranges = np.linalg.norm(mesh.vertices[mesh.faces], axis=2)
     assert np.ptp(ranges, axis=1).max() < 0.1
 

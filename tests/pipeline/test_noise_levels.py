@@ -20,7 +20,7 @@ from sensors.models.sensor_model import StereoModel, StereoNoise
 GLENDALE = bundled_config("sites", "glendale")
 FAST = ["depth_map=low", "wall.resolution_m=0.2", "difference.gsd_m=0.2", "icp.subsample_points=true", "icp.subsample_ratio=0.95"]
 DOCUMENTED_MM = {"high": 22.5, "medium": 15.1, "low": 7.7}
-"""Mean StD over 45 maps of the independent levels (docs/explanation/noise.md)."""
+"""Mean StD over 45 maps of the independent levels (docs/validation/noise.md)."""
 MAPS = 4
 TOLERANCE = 0.25
 """Share of the documented value. Means of 4 of the 45 maps at high noise (bootstrap) leave it with probability 6e-4; the levels
@@ -116,7 +116,7 @@ def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConf
 def test_by_vertices_and_against_a_silent_reference_the_printed_numbers_give_the_theses_noise(
     stage: tuple[SimulationConfig, SensorSite, RayCaster],
 ) -> None:
-    """Matching alone 17 mm (docs/explanation/noise.md), to which each map's draw of the orientation adds; the seeds are fixed."""
+    """Matching alone 17 mm (docs/validation/noise.md), to which each map's draw of the orientation adds; the seeds are fixed."""
     config, site, caster = stage
     config = config.model_copy(update={"reconstruction": "vertices", "noisy_reference": False})
     silent, noisy = reference_sensor(config, with_model(site, model("high"))), with_model(site, model("high"))

@@ -238,7 +238,7 @@ def test_xyz_layouts(tmp_path: Path, text: str, names: list[str]) -> None:
     [
         ("", "no line of numbers"),
         ("1 2\n3 4\n", "no line of numbers"),
-        ("1 2 3\n4 five 6\n", "line 2, column 2: 'five' is no number"),
+        ("1 2 3\n4 five 6\n", "line 2, column 2: 'five' is not a number"),
         ("1 2 3\n4 5\n", "line 2: has 2 values"),
         ("a rock wall\n", "no line of numbers"),
     ],

@@ -391,7 +391,7 @@ def test_ptx_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
             {"place": "10 20 5", "matrix": "10 20 7"},
             "two poses of the scanner: its place is 10 20 5 .* and 10 20 7",
         ),
-        ({"rows": CELLS.replace("5.0", "five")}, r"line 13, column 2: 'five' is no number"),
+        ({"rows": CELLS.replace("5.0", "five")}, r"line 13, column 2: 'five' is not a number"),
         ({"rows": "1.0 2.0 3.0\n" * 6}, "have 3 values; allowed: x y z intensity"),
     ],
 )

@@ -167,7 +167,7 @@ def test_whole_numbers_beside_commas_before_three_digits_are_grouped(tmp_path: P
 @pytest.mark.parametrize(
     ("text", "line", "problem"),
     [
-        (rows() + "4 five 6\n" + rows(), 4, "'five' is no number"),
+        (rows() + "4 five 6\n" + rows(), 4, "'five' is not a number"),
         (rows() + "4 5\n" + rows(), 4, r"has 2 values \('4 5'\).*allowed: 3"),
         (rows() + "345217.0 63894", 4, "the file was cut off"),
         ("# a\n\n" + rows(";") + "4,5;5;6\n", 6, "decimal comma, where other numbers"),
@@ -249,7 +249,7 @@ def test_a_column_of_words_is_left_out_by_name(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_points(written(tmp_path, labels, name="a.csv")).points, POINTS)
     with pytest.raises(InputError, match="column 1, called x, holds words"):
         read_points(written(tmp_path, "X,Y,Z,W\n" + labels, name="a.csv"))
-    with pytest.raises(InputError, match=r"line 3, column 4: 'rock' is no number"):
+    with pytest.raises(InputError, match=r"line 3, column 4: 'rock' is not a number"):
         read_points(written(tmp_path, "X,Y,Z,Class\n" + rows(",", tail=",7").replace(",7", ",rock", 2).replace(",rock", ",7", 1)))
 
 

@@ -18,7 +18,7 @@ from pipeline.registration.register import IcpConfig
 from pipeline.registration.rigid import RigidTransform
 from pipeline.run.simulation import simulate
 from pipeline.surface.mesh import SurfaceConfig, mesh_observation
-from pipeline.surface.stations import Joined, StationsConfig, join, merged
+from pipeline.surface.stations import JoinedStations, StationsConfig, join_stations, merge_stations
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
@@ -48,10 +48,10 @@ def station(position: tuple[float, float, float], pose_sigma: PoseSigma = EXACT_
     return LaserScanner.aimed(pose, WallFrame.identity(), WALL.vertices, settings, model, pose_sigma=pose_sigma)
 
 
-def joined(scanners: list[LaserScanner], seed: int, icp: IcpConfig | None = TO_THE_END) -> Joined:
+def joined(scanners: list[LaserScanner], seed: int, icp: IcpConfig | None = TO_THE_END) -> JoinedStations:
     random = KeyedRandom(seed)
     seen = [scanner.observe(CASTER, random.child(number)) for number, scanner in enumerate(scanners)]
-    return join(scanners, seen, StationsConfig(icp=icp), SurfaceConfig(), RASTER, random.child("stations"))
+    return join_stations(scanners, seen, StationsConfig(icp=icp), SurfaceConfig(), RASTER, random.child("stations"))
 
 
 def pose_error(scanner: LaserScanner, random: KeyedRandom) -> RigidTransform:
@@ -112,7 +112,7 @@ def test_the_merged_surface_covers_what_either_station_sees_and_is_the_better_on
                 replace(seen, points=points, depth=np.where(np.isnan(points[..., 0]), np.nan, seen.depth)), SurfaceConfig()
             )
         )
-    surface = merged(scanners, meshes, RASTER)
+    surface = merge_stations(scanners, meshes, RASTER)
     bounds = np.stack([np.min([m.bounds[0] for m in meshes], axis=0), np.max([m.bounds[1] for m in meshes], axis=0)])
     grid = raster_grid(bounds, RASTER)
     heights = surface_raster(surface, grid).heights
@@ -131,7 +131,7 @@ def test_the_merged_surface_covers_what_either_station_sees_and_is_the_better_on
 def test_a_dense_station_wins_over_a_coarse_one_in_the_same_place() -> None:
     coarse, dense = station(LEFT, step_rad=0.004), station(LEFT)
     meshes = [mesh_observation(scanner.observe(CASTER, KeyedRandom(1)), SurfaceConfig()) for scanner in (coarse, dense)]
-    surface = merged([coarse, dense], meshes, RASTER)
+    surface = merge_stations([coarse, dense], meshes, RASTER)
     assert len(meshes[1].faces) <= len(surface.faces) < 1.05 * len(meshes[1].faces)
 
 

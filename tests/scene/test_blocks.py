@@ -16,7 +16,7 @@ from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh
-from scene.geometry.under_boxes import faces_under
+from scene.geometry.under_boxes import faces_under_boxes
 from scene.ray_casting.raycast import RayCaster
 from scene.walls.contour import highest_under
 
@@ -173,7 +173,7 @@ def test_faces_under_boxes_are_all_found_however_large() -> None:
     boxes = np.stack([low, low + random.uniform(0.1, 0.5, (12, 3))], axis=1)
     under = [any(clipped(t[:, :2], *box[:, :2]) for box in boxes) for t in corners]
     assert 20 < sum(under) < 380
-    assert set(np.flatnonzero(under)) <= set(faces_under(mesh, boxes).tolist())
+    assert set(np.flatnonzero(under)) <= set(faces_under_boxes(mesh, boxes).tolist())
 
 
 def test_holes_are_outside_the_safe_zone() -> None:
@@ -225,7 +225,7 @@ def test_a_coarse_wall_of_two_triangles() -> None:
         ({"count": 500}, "500 blocks take [0-9,]+ m2, the safe zone of the wall has [0-9,]+ m2.*lower count"),
         ({"count": 100, "maximum_attempts": 8}, "no room for a block of .* blocks are placed.*lower count"),
         ({"size_m": 30.0}, "40 of 40 blocks are larger than the wall.*allowed: below 11.9"),
-        ({"safe_zone_offset_m": 5.0}, "leave nothing of a wall"),
+        ({"safe_zone_offset_m": 5.0}, "leaves no room on a wall"),
         ({"size_m": -0.1}, "drew a length of -0.1 m"),
         ({"count": 0}, "count"),
         ({"maximum_attempt": 3}, "did you mean 'maximum_attempts'"),

@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from walls import closed, grid_wall, plane_wall, rough_wall
 
 from scene.blocks.block import Blocks, RockfallConfig, place_blocks
-from scene.blocks.carve import FRESH_ALBEDO, Carved, block_meshes, carve, carved_records
-from scene.blocks.slivers import SLIVER_M, Mended, smallest_height
+from scene.blocks.carve import FRESH_ALBEDO, Carved, block_meshes, block_records, carve
+from scene.blocks.slivers import SLIVER_M, MendedSurface, smallest_height
 from scene.blocks.solid import boundary
 from scene.common.config import parse
 from scene.common.errors import InputError
@@ -209,7 +209,9 @@ def test_slivers_that_resist_the_simplest_collapse(seed: int, cell_m: float, sig
 
 
 def test_the_mending_has_something_to_mend(rough: TriangleMesh, rough_blocks: Blocks, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scene.blocks.carve.mend", lambda vertices, faces, tag, rank: Mended(faces, tag, np.zeros(301)))
+    monkeypatch.setattr(
+        "scene.blocks.carve.remove_slivers", lambda vertices, faces, tag, rank: MendedSurface(faces, tag, np.zeros(301))
+    )
     mesh = carve(rough, rough_blocks).mesh
     at_rim = rim(mesh)[mesh.faces].any(axis=1)
     assert (smallest_height(mesh.vertices[mesh.faces[at_rim]]) < SLIVER_M).sum() > 20
@@ -272,7 +274,7 @@ def test_the_same_blocks_give_the_same_bytes(rough: TriangleMesh, rough_blocks: 
 def test_records_are_json(rough: TriangleMesh) -> None:
     blocks = blocks_on(rough, count=3)
     carved = carve(rough, blocks)
-    records = json.loads(json.dumps(carved_records(blocks, carved.removed_volume_m3)))
+    records = json.loads(json.dumps(block_records(blocks, carved.removed_volume_m3)))
     assert [record["label"] for record in records] == [1, 2, 3]
     assert records[1]["volume_m3"] == carved.removed_volume_m3[1]
     assert records[2]["bbox_m"] == blocks.bbox[2].ravel().tolist()

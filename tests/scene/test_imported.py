@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh
-from scene.meshes.cleaning import clean, groups, unique_rows, weld
+from scene.meshes.cleaning import clean, connected_groups, unique_rows, weld
 from scene.walls.imported import ImportedWall
 from scene.walls.wall import build_wall
 
@@ -289,8 +289,8 @@ def test_each_wrong_mesh_is_answered_in_one_line(tmp_path, name):
     ("name", "content", "words"),
     [
         ("missing.ply", None, "there is no such file"),
-        ("wall.plx", b"", "'.plx' is no mesh format that can be read; allowed: .*did you mean 'ply'"),
-        ("wall.pkl", b"cos\nsystem\n", "'.pkl' is no mesh format"),
+        ("wall.plx", b"", "'.plx' is not a mesh format that can be read; allowed: .*did you mean 'ply'"),
+        ("wall.pkl", b"cos\nsystem\n", "'.pkl' is not a mesh format"),
         ("wall.ply", b"this is no mesh", "is not a valid ply file"),
         ("empty.ply", b"", "is not a valid ply file"),
         ("cut.off", b"OFF\n3 1 0\n0 0 0\n", "is not a valid off file"),
@@ -368,4 +368,4 @@ def test_the_pieces_of_a_surface_are_those_that_scipy_finds():
     for pairs, count in cases:
         graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
         expected = connected_components(graph, directed=False)[1]
-        np.testing.assert_array_equal(groups(pairs, count), expected)
+        np.testing.assert_array_equal(connected_groups(pairs, count), expected)

@@ -10,7 +10,7 @@ from scene.common.config import Config, parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
-from scene.meshes.cleaning import areas, clean
+from scene.meshes.cleaning import clean, triangle_areas
 from scene.walls.imported import ImportedWall
 from scene.walls.procedural import SITES, ProceduralWall
 from scene.walls.rock import SplineNoise
@@ -78,7 +78,7 @@ def test_faces_look_towards_the_sensors():
     normals = np.cross(b - a, c - a)
     towards_sensors = np.array([0.0, -np.sin(np.radians(70)), np.cos(np.radians(70))])
     assert (np.einsum("ni,i->n", normals, towards_sensors) > 0).all()
-    np.testing.assert_allclose(np.sum(areas(mesh)), np.linalg.norm(normals, axis=1).sum() / 2)
+    np.testing.assert_allclose(np.sum(triangle_areas(mesh)), np.linalg.norm(normals, axis=1).sum() / 2)
 
 
 @pytest.mark.parametrize("style", STYLES)

@@ -7,7 +7,7 @@ from scene_files import UTM, rock, sheet, written
 
 from scene.common.errors import InputError
 from scene.geometry.mesh import TriangleMesh
-from scene.meshes.rounding import rounded_axes, step_of
+from scene.meshes.rounding import rounded_axes, rounding_step
 from scene.walls.imported import read_mesh, read_reference
 
 
@@ -24,13 +24,13 @@ def refused(path, words, **keys):
 def test_the_step_of_continuous_values_is_their_last_bit(values, offset):
     numbers = (offset + np.random.default_rng(1).uniform(0, 50, 4000)).astype(values)
     expected = {(np.float32, 5e6): 0.5, (np.float32, 0.0): 0.0}.get((values, offset), 0.0)
-    assert step_of(numbers.astype(float)) == pytest.approx(expected, abs=1e-5)
+    assert rounding_step(numbers.astype(float)) == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("step", [0.5, 0.03125, 0.1, 0.01, 1.0])
 def test_the_step_of_rounded_values_is_that_of_the_rounding(step):
     numbers = 123_456.789 + step * np.rint(np.random.default_rng(1).uniform(0, 50, 4000) / step)
-    assert step_of(numbers) == step
+    assert rounding_step(numbers) == step
 
 
 @pytest.mark.parametrize("form", ["ply", "stl", "glb", "double ply", "obj", "off", "subtracted"])

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from surfaces import sphere
 
-from scene.geometry.mesh import TriangleMesh, renumbered, signed_volumes
+from scene.geometry.mesh import TriangleMesh, compact_vertices, signed_volumes
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_faces_are_numbered_by_the_vertices_that_they_use(seed: int) -> None:
     faces = np.random.default_rng(seed).integers(100, 160, (12, 3)).astype(np.int32)
-    used, numbered = renumbered(faces)
+    used, numbered = compact_vertices(faces)
     expected, inverse = np.unique(faces, return_inverse=True)
     np.testing.assert_array_equal(used, expected)
     np.testing.assert_array_equal(numbered, inverse.reshape(-1, 3))
@@ -20,7 +20,7 @@ def test_faces_are_numbered_by_the_vertices_that_they_use(seed: int) -> None:
 
 
 def test_no_faces_use_no_vertices() -> None:
-    used, numbered = renumbered(np.empty((0, 3), dtype=np.int32))
+    used, numbered = compact_vertices(np.empty((0, 3), dtype=np.int32))
     assert len(used) == 0
     assert numbered.shape == (0, 3)
 

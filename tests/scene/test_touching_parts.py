@@ -11,7 +11,7 @@ from scene.common.errors import InputError
 from scene.geometry.frame import FrameConfig
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.meshes.cleaning import clean
-from scene.meshes.winding import facing
+from scene.meshes.winding import orient_to_sensors
 from scene.ray_casting.raycast import RayCaster
 
 EYE = np.array([0.0, 0.0, 20.0])
@@ -45,7 +45,7 @@ def test_rays_meet_a_rock_that_stands_on_the_wall_however_it_is_wound(inside_out
     mesh, repairs = clean(_wall_with_cube(inside_out), "scene")
     assert len(mesh.faces) == 2 * int(2 * WALL_M) ** 2 + 48
     assert any("kept apart" in words for words in repairs)
-    mesh = facing(mesh, [EYE], "scene", cleaned=True)[0]
+    mesh = orient_to_sensors(mesh, [EYE], "scene", cleaned=True)[0]
     random = np.random.default_rng(5)
     target = np.column_stack([random.uniform(-6, 6, (5000, 2)), np.zeros(5000)])
     rays = (target - EYE) / np.linalg.norm(target - EYE, axis=1)[:, None]
@@ -75,8 +75,8 @@ def test_a_sensor_inside_a_closed_solid_is_an_error() -> None:
     ball = trimesh.creation.icosphere(3, radius=30.0)
     mesh = TriangleMesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int32))
     with pytest.raises(InputError, match="stands inside a closed solid"):
-        facing(mesh, [np.array([1.0, 2.0, 3.0])], "ball")
-    assert facing(mesh, [np.array([0.0, 0.0, 60.0])], "ball")[1] == ""
+        orient_to_sensors(mesh, [np.array([1.0, 2.0, 3.0])], "ball")
+    assert orient_to_sensors(mesh, [np.array([0.0, 0.0, 60.0])], "ball")[1] == ""
 
 
 def test_the_frame_can_look_along_the_line_of_sight() -> None:

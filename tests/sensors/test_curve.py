@@ -14,7 +14,7 @@ from scene.common.backend import mi
 from scene.common.config import parse
 from scene.common.errors import InputError
 from sensors.effects.range_empirical import RangeEmpirical
-from sensors.numerics.curve import Axis, surface, surface_on_host
+from sensors.numerics.curve import Axis, interpolate, interpolate_on_host
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ def test_values_between_nodes_and_beyond(name: str) -> None:
     rng = np.random.default_rng(2)
     x, y = rng.uniform(-3, 3, 500), rng.uniform(-1.5, 1.5, 500)
     case = cases(x, y)[name]
-    on_device = surface(mi.Float64(x), mi.Float64(y), case.along, case.across, case.values)
+    on_device = interpolate(mi.Float64(x), mi.Float64(y), case.along, case.across, case.values)
     np.testing.assert_allclose(np.array(on_device), case.expected, atol=1e-12)
-    np.testing.assert_allclose(surface_on_host(x, y, case.along, case.across, case.values), case.expected, atol=1e-12)
+    np.testing.assert_allclose(interpolate_on_host(x, y, case.along, case.across, case.values), case.expected, atol=1e-12)
 
 
 def test_rows_of_different_length_are_an_error_that_says_so() -> None:
@@ -67,4 +67,4 @@ def test_what_is_not_known_stays_unknown_on_the_host():
     """A ray that misses the reference has no covariate; its neighbours keep their values."""
     axis = Axis(low=0.0, high=1.0)
     x = np.array([0.25, np.nan, 0.75])
-    assert_allclose(surface_on_host(x, x, axis, Axis(), [[0.0, 1.0]]), x)
+    assert_allclose(interpolate_on_host(x, x, axis, Axis(), [[0.0, 1.0]]), x)

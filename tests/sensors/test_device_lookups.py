@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from scene.ray_casting.upload import on_device
-from sensors.numerics.curve import Axis, surface, surface_on_host
+from sensors.numerics.curve import Axis, interpolate, interpolate_on_host
 from sensors.numerics.device import cell_index
 from sensors.signal_chain.matches import Matches
 from sensors.signal_chain.node_grid import smooth_field
@@ -40,9 +40,9 @@ def test_a_curve_is_held_beyond_its_ends_and_nan_stays_nan(count: int, period: f
     values = (tuple(np.sin(np.arange(count))),)
     odd = ODD if not period else ODD[np.abs(np.nan_to_num(ODD)) < 1e9]
     x = np.concatenate([odd, [-1.0, 0.3, 2.9, 3.0]])
-    on_the_device = surface(on_device(mi.Float64, x), mi.Float64(0.0), axis, Axis(), values).numpy()
+    on_the_device = interpolate(on_device(mi.Float64, x), mi.Float64(0.0), axis, Axis(), values).numpy()
     with np.errstate(invalid="ignore"):
-        on_the_host = surface_on_host(x, np.zeros(len(x)), axis, Axis(), values)
+        on_the_host = interpolate_on_host(x, np.zeros(len(x)), axis, Axis(), values)
     np.testing.assert_allclose(on_the_device, on_the_host, atol=1e-12)
     assert np.isnan(on_the_device[0])
 
@@ -50,7 +50,7 @@ def test_a_curve_is_held_beyond_its_ends_and_nan_stays_nan(count: int, period: f
 def test_a_surface_is_held_beyond_its_corners() -> None:
     rows = ((0.0, 1.0, 2.0), (10.0, 11.0, 12.0))
     pairs = np.array([(x, y) for x in ODD for y in ODD])
-    found = surface(*(on_device(mi.Float64, column) for column in pairs.T), Axis(high=2.0), Axis(), rows).numpy()
+    found = interpolate(*(on_device(mi.Float64, column) for column in pairs.T), Axis(high=2.0), Axis(), rows).numpy()
     held = np.clip(pairs, 0.0, [2.0, 1.0])  # NaN stays NaN
     np.testing.assert_allclose(found, held[:, 0] + 10 * held[:, 1], atol=1e-12)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from surfaces import plane, step
 
-from scene.appearance.illumination import J2000, Illumination, IlluminationConfig, equatorial, sun_position
+from scene.appearance.illumination import J2000, Illumination, IlluminationConfig, sun_coordinates, sun_position
 from scene.appearance.texture import TextureConfig, solid_noise
 from scene.common.backend import dr, mi
 from scene.common.errors import InputError
@@ -21,7 +21,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 def test_equatorial_position_is_the_almanac_s_within_a_hundredth_of_a_degree() -> None:
     """Meeus, Astronomical Algorithms, example 25.a: 1992 October 13, 0h: apparent 198.38083 and -7.78507 deg."""
-    ascension, declination = np.degrees(equatorial((datetime(1992, 10, 13, tzinfo=UTC) - J2000).total_seconds() / 86400))
+    ascension, declination = np.degrees(sun_coordinates((datetime(1992, 10, 13, tzinfo=UTC) - J2000).total_seconds() / 86400))
     assert ascension == pytest.approx(198.38083, abs=0.01)
     assert declination == pytest.approx(-7.78507, abs=0.01)
 

@@ -78,7 +78,7 @@ def cloud(count: int = 200_000, reach_m: float = 4000.0) -> FloatArray:
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.5, 0.9])
 def test_the_share_of_wet_rock_is_the_configs(share: float) -> None:
     """Points in many patches: within 5 standard errors of a binomial count, at most 6e-7 false failures; hems are half wet."""
-    wet = WetnessConfig(share=share, patch_m=0.5).wet(cloud())
+    wet = WetnessConfig(share=share, patch_m=0.5).wetness(cloud())
     assert np.mean(wet > 0.5) == pytest.approx(share, abs=5 * np.sqrt(share * (1 - share) / 2e5) + 5 * 0.5 / np.sqrt(2**18))
 
 
@@ -86,11 +86,11 @@ def test_wet_rock_is_darker_by_the_factor_and_dry_rock_as_it_was() -> None:
     wall = heightfield(40.0, 30.0, 0.1)
     albedo = np.random.default_rng(2).uniform(0.2, 0.8, len(wall.vertices)).astype(np.float32)
     config = WetnessConfig(share=0.4, albedo_factor=0.35)
-    wet, after = config.wet(wall.vertices), config.wetted(replace(wall, vertex_albedo=albedo)).vertex_albedo
+    wet, after = config.wetness(wall.vertices), config.with_wet_patches(replace(wall, vertex_albedo=albedo)).vertex_albedo
     np.testing.assert_array_equal(after[wet == 0], albedo[wet == 0])
     np.testing.assert_allclose(after[wet == 1], 0.35 * albedo[wet == 1], rtol=1e-6)
     assert min((wet == 0).mean(), (wet == 1).mean()) > 0.1
-    np.testing.assert_allclose(config.wetted(wall).vertex_albedo[wet == 1], 0.35 * DEFAULT_ALBEDO, rtol=1e-6)
+    np.testing.assert_allclose(config.with_wet_patches(wall).vertex_albedo[wet == 1], 0.35 * DEFAULT_ALBEDO, rtol=1e-6)
 
 
 def test_patches_are_smooth_and_fixed_in_space() -> None:
@@ -100,20 +100,20 @@ def test_patches_are_smooth_and_fixed_in_space() -> None:
     deviation.
     """
     config, points = WetnessConfig(), cloud(20_000, 30.0)
-    wet = config.wet(points)
-    np.testing.assert_array_equal(config.wet(points[::-7]), wet[::-7])
-    assert np.abs(config.wet(np.add(points, [0.01, 0, 0])) - wet).max() < 0.01 / 4 * 1.5 * 2 / 0.37 * 1.5 / 0.2
-    assert np.mean((WetnessConfig(seed=2).wet(points) > 0.5) != (wet > 0.5)) > 0.2
+    wet = config.wetness(points)
+    np.testing.assert_array_equal(config.wetness(points[::-7]), wet[::-7])
+    assert np.abs(config.wetness(np.add(points, [0.01, 0, 0])) - wet).max() < 0.01 / 4 * 1.5 * 2 / 0.37 * 1.5 / 0.2
+    assert np.mean((WetnessConfig(seed=2).wetness(points) > 0.5) != (wet > 0.5)) > 0.2
 
 
 def test_intensity_falls_with_the_albedo_and_the_points_stay() -> None:
     mesh = heightfield(40.0, 30.0, 0.25, roughness=0.0)
     mesh = mesh.with_vertices(mesh.vertices - [20.0, 15.0, 0.0])
-    dry, wet = seen(mesh), seen(WetnessConfig(share=1.0, albedo_factor=0.5).wetted(mesh))
+    dry, wet = seen(mesh), seen(WetnessConfig(share=1.0, albedo_factor=0.5).with_wet_patches(mesh))
     assert wet.points.tobytes() == dry.points.tobytes()
     np.testing.assert_allclose(wet.intensity, 0.5 * dry.intensity, rtol=1e-6)
 
 
 @pytest.mark.parametrize("config", [WetnessConfig(share=0.0), WetnessConfig(albedo_factor=1.0)])
 def test_without_water_the_mesh_is_the_same_object(config: WetnessConfig) -> None:
-    assert config.wetted(TILTED) is TILTED
+    assert config.with_wet_patches(TILTED) is TILTED

@@ -32,7 +32,7 @@ from sensors.effects.smoothing import smoothed
 from sensors.effects.texture_noise import LARGEST_SIGMA_PX, WINDOW, TextureNoise, texture
 from sensors.models.placement import RigConfig, Target
 from sensors.models.sensor_model import StereoModel
-from sensors.signal_chain.matches import Matches, bridged
+from sensors.signal_chain.matches import Matches, fill_gaps
 from sensors.signal_chain.observation import Observation
 from sensors.stereo.stereo_pair import REDUCTION, Quality, StereoPair
 
@@ -291,7 +291,7 @@ def test_matching_effects_act_in_the_chains_order_whatever_the_configs(turn: lis
         {"name": "smoothing", "sigma_px": 3.0},
         {"name": "edge_fattening", "radius_px": 4.0},
     ]
-    expected = bridged(locked(smoothed(fattened(disparity(observe(mesh, []), pair), 2, 2.0), 1.5), 0.4, 2), np.inf)
+    expected = fill_gaps(locked(smoothed(fattened(disparity(observe(mesh, []), pair), 2, 2.0), 1.5), 0.4, 2), np.inf)
     for order in (effects, effects[::-1]):
         np.testing.assert_allclose(disparity(observe(mesh, order), pair), expected, rtol=0, atol=1e-6)
     noise = {"name": "parallax_noise", "sigma_px": 0.3}
@@ -372,7 +372,7 @@ def texture_slowly(image: FloatArray, reduction: int) -> FloatArray:
 def test_fast_rasters_agree_with_their_slow_twins(seed: int) -> None:
     relief = random_relief(seed)
     for reach in (1, 2, np.inf):
-        np.testing.assert_array_equal(bridged(relief, reach), bridged_slowly(relief, reach))
+        np.testing.assert_array_equal(fill_gaps(relief, reach), bridged_slowly(relief, reach))
     for radius in (0, 1, 3):
         np.testing.assert_array_equal(fattened(relief, radius, 2.0), fattened_slowly(relief, radius, 2.0))
     np.testing.assert_allclose(texture(relief, 4), texture_slowly(relief, 4), rtol=1e-12, atol=1e-15)

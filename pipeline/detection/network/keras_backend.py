@@ -11,7 +11,7 @@ from typing import Literal
 
 from scene.common.errors import InputError
 from scene.common.extras import how_to_install
-from scene.common.native_output import stderr_dropped
+from scene.common.native_output import suppress_stderr
 
 _MODULES = {"tensorflow": "tensorflow", "jax": "jax", "torch": "torch"}
 """Python module of each backend."""
@@ -29,7 +29,7 @@ def import_keras() -> None:
     check_installed()
     os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "1")
     if os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3") != "0":
-        with stderr_dropped():
+        with suppress_stderr():
             importlib.import_module("keras")
 
 

@@ -44,7 +44,7 @@ from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.geometry.point_planes import PointPlanes
 from scene.meshes.cleaning import weld
-from scene.meshes.winding import check_near, facing
+from scene.meshes.winding import check_distances, orient_to_sensors
 from scene.ray_casting.raycast import RayCaster
 from scene.walls.imported import read_reference
 from sensors.cameras.camera import Camera, CameraPair
@@ -345,10 +345,10 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     mesh, model, cameras = material.reference, material.model, material.cameras
     _check_sensor(config, model, where)
     viewpoints = _viewpoints(config, material, where)
-    check_near(mesh.vertices, viewpoints, reference)
+    check_distances(mesh.vertices, viewpoints, reference)
     frame = WallFrame.fit(mesh.vertices, np.mean([*viewpoints.values()], axis=0))
     local = mesh.with_vertices(frame.to_wall(mesh.vertices))
-    local, words = facing(local, [frame.to_wall(position) for position in viewpoints.values()], reference)
+    local, words = orient_to_sensors(local, [frame.to_wall(position) for position in viewpoints.values()], reference)
     clouds = [check_power(finite(cloud, name), name) for name, cloud in material.points.items()]
     check_different(dict(zip(material.points, clouds, strict=True)))
     if cameras is not None:

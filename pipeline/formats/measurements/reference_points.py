@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pipeline.formats.measurements.config import MeasurementConfig
 from scene.geometry.mesh import FloatArray
-from scene.geometry.point_planes import PointPlanes, own_noise
+from scene.geometry.point_planes import PointPlanes, estimate_point_noise
 
 _NOTICED = 0.3
 """Noise of the vertices over that of the ranges from which on it is carried along."""
@@ -27,7 +27,7 @@ class ReferencePoints:
         if config.incidence is not None or config.reference_error_m is not None:
             planes = PointPlanes.of(vertices, viewpoint) if config.incidence == "planes" else None
             return cls(planes, config.reference_error_m or 0.0)
-        noise = own_noise(vertices, viewpoint)
+        noise = estimate_point_noise(vertices, viewpoint)
         if noise is None or noise < _NOTICED * range_sigma_m:
             return cls()
         words = (

@@ -16,7 +16,7 @@ from pipeline.formats.points.ptx import orthonormal, read_ptx
 from pipeline.formats.points.xyz import read_xyz
 from pipeline.formats.units import AxisUnits, agreed_units
 from scene.common.errors import InputError
-from scene.common.plug_ins import plugged
+from scene.common.plug_ins import load_plug_ins
 from scene.common.regular_file import check_file
 from scene.geometry.mesh import FloatArray
 
@@ -119,7 +119,7 @@ def _read(path: Path, columns: Sequence[str]) -> list[PlacedScan]:
 
 def _read_plugged(path: Path) -> PointCloud:
     """A cloud of a format that another package reads."""
-    further = plugged(PLUG_INS, "a function of a path that returns a PointCloud", callable, [each[1:] for each in SUFFIXES])
+    further = load_plug_ins(PLUG_INS, "a function of a path that returns a PointCloud", callable, [each[1:] for each in SUFFIXES])
     reader = further.get(path.suffix.lower()[1:])
     if reader is None:
         allowed = " ".join([*SUFFIXES, *(f".{name}" for name in further)])

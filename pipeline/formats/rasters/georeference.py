@@ -33,16 +33,13 @@ class Georeference:
     """What a file says of its pixels.
 
     grid: in metres, None where the file has no place; flipped: the first row of the file is the southernmost; linear_m,
-    vertical_m: metres of the stated units of coordinates and heights, None where the file states none; scale, offset: by
-    which stored values become true ones.
+    vertical_m: metres of the stated units of coordinates and heights, None where the file states none.
     """
 
     grid: Grid | None
     flipped: bool
     linear_m: float | None
     vertical_m: float | None
-    scale: float
-    offset: float
 
 
 def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Georeference:
@@ -69,10 +66,9 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
     keys = _geo_keys(tags, path)
     linear, vertical = (_unit(keys, key, path) for key in (LINEAR_UNITS, VERTICAL_UNITS))
     linear = _unit_of_code(keys, path) if linear is None else linear
-    scale, offset = _scale_and_offset(tags, path)
     corner = _affine(tags, path)
     if corner is None:
-        return Georeference(None, False, linear, vertical, scale, offset)
+        return Georeference(None, False, linear, vertical)
     if keys.get(MODEL_TYPE) == _GEOGRAPHIC:
         remedy = "reproject it to the projected coordinates of the points, in metres"
         raise InputError("is in geographic coordinates, degrees", where=str(path), allowed="metres or feet", remedy=remedy)
@@ -85,7 +81,7 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
         x, y = x - gsd / 2, y - step_y / 2
     flipped = step_y > 0
     y_max = y + shape[0] * step_y if flipped else y
-    return Georeference(Grid(x, y_max, gsd, shape[1], shape[0]), flipped, linear, vertical, scale, offset)
+    return Georeference(Grid(x, y_max, gsd, shape[1], shape[0]), flipped, linear, vertical)
 
 
 def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, float] | None:
@@ -162,7 +158,7 @@ def _unit_of_code(keys: dict[int, int], path: Path) -> float | None:
     return None if units is None else units.metres[0]
 
 
-def _scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
+def scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
     """Scale and offset of the stored values, from GDAL's metadata."""
     found = {"scale": 1.0, "offset": 0.0}
     text = tags.get(GDAL_METADATA)

@@ -29,9 +29,10 @@ from pipeline.formats.rasters.georeference import (
     TIEPOINT,
     Georeference,
     georeference,
+    scale_and_offset,
 )
 from scene.common.errors import InputError
-from scene.common.regular_file import READ_LIMIT, check_file, raised_gb
+from scene.common.regular_file import READ_LIMIT, check_file, read_limit_gb
 from scene.geometry.grid import Grid
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # its complaints come as exceptions too
@@ -107,16 +108,8 @@ def read_raster(path: Path) -> Raster:
 
     Raises InputError for a damaged file, one beyond `most_pixels`, and a place or unit that cannot be used.
     """
-    values, tags, masked = _read(path)
+    values, tags, notes = _measured(path)
     place = georeference(tags, (values.shape[0], values.shape[1]), path)
-    stated = _nodata(tags, path)
-    absent = values == stated if not np.isnan(stated) else np.zeros(values.shape, dtype=bool)
-    absent |= masked
-    usual, notes = _unstated_nodata(values, absent | np.isnan(values))
-    values = np.where(absent | usual, np.float32(np.nan), values)
-    if (place.scale, place.offset) != (1.0, 0.0):
-        values = (values * np.float64(place.scale) + place.offset).astype(np.float32)
-    _check_values(values, path)
     return Raster(values[::-1] if place.flipped else values, place, notes)
 
 
@@ -133,8 +126,27 @@ def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
 
 
 def read_tiff(path: Path) -> NDArray[np.float32]:
-    """Read an image of one band as float32, NaN where there is no data; raises InputError for a damaged or too large file."""
-    return read_raster(path).values
+    """Read an image of one band, (h, w) float32, NaN where there is no data, rows as in the file.
+
+    Where the pixels lie in the world is not looked at. TensorFlow reads images in threads of its own, in which PROJ, which knows
+    the coordinate systems, crashes. Raises InputError for a damaged or too large file.
+    """
+    return _measured(path)[0]
+
+
+def _measured(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], tuple[str, ...]]:
+    """Read the values (h, w) in the file's unit, NaN where there is no data, the first page's tags, and notes."""
+    values, tags, masked = _read(path)
+    stated = _nodata(tags, path)
+    absent = values == stated if not np.isnan(stated) else np.zeros(values.shape, dtype=bool)
+    absent |= masked
+    usual, notes = _unstated_nodata(values, absent | np.isnan(values))
+    values = np.where(absent | usual, np.float32(np.nan), values)
+    scale, offset = scale_and_offset(tags, path)
+    if (scale, offset) != (1.0, 0.0):
+        values = (values * np.float64(scale) + offset).astype(np.float32)
+    _check_values(values, path)
+    return values, tags, notes
 
 
 def _georeference(grid: Grid) -> list[tuple[int, int, int, Any, bool]]:
@@ -255,7 +267,7 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
 
 def most_pixels() -> int:
     """Of an image: MOST_PIXELS, or as many as the variable READ_LIMIT allows, of four bytes each."""
-    return max(MOST_PIXELS, int(raised_gb() * 1e9 / 4))
+    return max(MOST_PIXELS, int(read_limit_gb() * 1e9 / 4))
 
 
 def _check_size(page: tifffile.TiffPage, path: Path) -> None:

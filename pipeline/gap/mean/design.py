@@ -16,7 +16,7 @@ from pipeline.gap.mean.normal_equations import Equations, NoiseDraws, Waves, ass
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.residuals import Residuals
 from scene.common.keyed_random import KeyedRandom
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 DRAWS = 499
@@ -288,7 +288,7 @@ def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: 
         columns = slice(place[candidate][0], place[candidate][-1] + 1)
         np.multiply(candidate.columns[model.rows], model.root[:, None], out=found[:, columns])
 
-    side_by_side(fill, plain)
+    map_in_threads(fill, plain)
     _take_off(pose, found[:, count:])
     return found
 
@@ -306,7 +306,7 @@ def _take_off(pose: FloatArray, columns: FloatArray) -> None:
     def take(some: slice) -> None:
         columns[:, some] -= pose @ (pose.T @ columns[:, some])
 
-    side_by_side(take, column_blocks(columns.shape[1]))
+    map_in_threads(take, column_blocks(columns.shape[1]))
 
 
 def _places(plain: list[Candidate], start: int) -> dict[Candidate, list[int]]:

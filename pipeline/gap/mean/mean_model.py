@@ -29,7 +29,7 @@ from pipeline.gap.mean.within_noise import WithinNoise
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
 from scene.common.keyed_random import KeyedRandom
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _ROUGH, _SMOOTH, _WAVY = (0.7, 1.5, 3.0), (1.0, 2.0), (1.7, 2.5, 3.5, 5.0)
@@ -99,7 +99,7 @@ class MeanModel:
             values, vectors = eigh(self._whitened(half.T), driver="evd", overwrite_a=True)
             return np.maximum(values, 0.0), vectors
 
-        self._bases: list[tuple[FloatArray, FloatArray]] = side_by_side(basis, _CORRELATIONS)
+        self._bases: list[tuple[FloatArray, FloatArray]] = map_in_threads(basis, _CORRELATIONS)
         self._white = Covariance(0, 0.0, np.ones(len(self._total)))
 
     def __len__(self) -> int:
@@ -127,7 +127,7 @@ class MeanModel:
             return _highest([partial(normal.log_likelihood, self._at(basis, ratio)) for ratio in ratios])
 
         shape = len(designs), len(self._bases)
-        found = side_by_side(highest, product(normals, range(len(self._bases))))
+        found = map_in_threads(highest, product(normals, range(len(self._bases))))
         tops, heights = (np.reshape(part, shape) for part in zip(*found, strict=True))
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
         narrower = copy(self)
@@ -194,7 +194,7 @@ class MeanModel:
             for basis, means in zip(between, self.between(planes[: self.cells]), strict=True):
                 basis[:, some] = means
 
-        side_by_side(project, column_blocks(weighted.shape[1]))
+        map_in_threads(project, column_blocks(weighted.shape[1]))
         return Projected(within, weighed, between)
 
     def _weighed(self, within: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.gap.mean.candidates import SineGrid
 from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
 from scene.common.keyed_random import KeyedRandom
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _SMALLEST = 1e-9
@@ -52,7 +52,7 @@ class Waves:
             drawn = noise.products(model.within(columns, planes, noise.rows), on_nodes)
             return columns.T @ beside, own, drawn, means.T
 
-        parts = side_by_side(some, [part for grid in grids for part in grid.chunks])
+        parts = map_in_threads(some, [part for grid in grids for part in grid.chunks])
         count = fixed.shape[1]
         if not parts:
             empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
@@ -119,7 +119,7 @@ def _squares(columns: FloatArray) -> FloatArray:
 
 def wave_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
     """(2 w, k) of all sines with further columns (n, k), which are within cells and weighed."""
-    found = side_by_side(lambda part: part.columns(root).T @ weighed, [part for grid in grids for part in grid.chunks])
+    found = map_in_threads(lambda part: part.columns(root).T @ weighed, [part for grid in grids for part in grid.chunks])
     return np.concatenate(found) if found else np.zeros((0, weighed.shape[1]))
 
 
@@ -176,7 +176,7 @@ class Equations:
         """Largest log-likelihoods over the covariances: (v,) of `base`, all of which are held, (f, v) with each list of columns
         added, (w, v) with each sine added."""
         parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.at), _AT_ONCE)]
-        found = side_by_side(lambda part: part._profile(base, fixed), parts)
+        found = map_in_threads(lambda part: part._profile(base, fixed), parts)
         plain, gains, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
         return plain, gains, waves
 
@@ -232,7 +232,7 @@ def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: P
         constant = 0.5 * (np.log(each.weight).sum() - np.sum(y**2, axis=0) - square)
         return gram + basis.T @ basis, right + basis.T @ y, constant
 
-    products, sides, constant = (np.stack(part) for part in zip(*side_by_side(at_one, at), strict=True))
+    products, sides, constant = (np.stack(part) for part in zip(*map_in_threads(at_one, at), strict=True))
     nothing = np.empty((len(at), len(waves.right), 0))
     return Equations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
 

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.gap.mean.design import DRAWS, Design
 from pipeline.gap.mean.mean_model import Covariance
 from scene.common.keyed_random import KeyedRandom
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _NEAR_NULL = 8
@@ -35,7 +35,7 @@ class NullGains:
             right = design.drawn + design.fixed.between[at.length].T @ weighted
             return right, constant, design.waves.noise + design.waves.between[at.length].T @ weighted
 
-        right, constant, waves = (np.stack(part) for part in zip(*side_by_side(values, near.at), strict=True))
+        right, constant, waves = (np.stack(part) for part in zip(*map_in_threads(values, near.at), strict=True))
         drawn = near.of_values(right, constant, waves)
         plain, fixed, searched = drawn.profile(design.base, design.plain_columns)
         return cls(

@@ -31,7 +31,7 @@ from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.models.sensor_model import StereoModel, TlsModel
-from sensors.numerics.curve import Axis, surface_on_host
+from sensors.numerics.curve import Axis, interpolate_on_host
 
 _NODES, _GRID, _JOINED, _MOST_POINTS = 65, 17, 257, 20_000
 """Of the curve of an empirical term, of each side of a surface, and of a sum of curves."""
@@ -264,7 +264,7 @@ def _joined(term: Named, later: list[Named], part: Residuals) -> Named:
     low, high = float(x.min()), float(x.max())
     nodes = np.linspace(low, high, _JOINED)
     curves = ((Axis(**item.entry["along"]), item.entry["values_rad"]) for item in (term, *later))
-    total = sum(surface_on_host(nodes, nodes, along, Axis(), values) for along, values in curves)
+    total = sum(interpolate_on_host(nodes, nodes, along, Axis(), values) for along, values in curves)
     return replace(term, entry={**term.entry, "along": {"low": low, "high": high}, "values_rad": _rows([total])})
 
 

@@ -21,7 +21,7 @@ from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 from sensors.effects.edge_fattening import EdgeFattening
@@ -153,7 +153,7 @@ def find_shapes(
         del trials[name]
     while trials:
         there = replace(witnesses, beside=[*believed, *(each.effect for each in found)])
-        shapes = zip(trials, side_by_side(partial(_asked, there), trials.values()), strict=True)
+        shapes = zip(trials, map_in_threads(partial(_asked, there), trials.values()), strict=True)
         tried = {name: each for name, each in shapes if each is not None}
         if not tried:
             break
@@ -205,11 +205,11 @@ def _fattening(witnesses: _Witnesses) -> ShapeFound | None:
 
     there = witnesses
     outlines = [(radius, height) for height in _STEPS for radius in _RADII]
-    found = dict(zip(outlines, side_by_side(gain_of, outlines), strict=True))
+    found = dict(zip(outlines, map_in_threads(gain_of, outlines), strict=True))
     radius, height = max(outlines, key=lambda each: found[each])
     if witnesses.times_predicted > decided().shapes.wide:
         # outlines that grow far spoil the registration and the spread by which points would bear witness of them
-        settled = side_by_side(lambda each: witnesses.registered_with(_grown(*each, raster)), outlines)
+        settled = map_in_threads(lambda each: witnesses.registered_with(_grown(*each, raster)), outlines)
         far, best = min(zip(outlines, settled, strict=True), key=lambda each: each[1].times_predicted)
         if best.times_predicted < witnesses.times_predicted / decided().shapes.wide:
             (radius, height), there = far, best

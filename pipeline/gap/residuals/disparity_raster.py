@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, project, rays, real_pair
 from pipeline.gap.residuals.residuals import BoolArray
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera
 from sensors.effects.base import Effect
@@ -154,7 +154,7 @@ def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatAr
             raster = low_pass.of(raster)
         return raster[row, column]
 
-    return np.stack(side_by_side(passed, columns.T), axis=1)
+    return np.stack(map_in_threads(passed, columns.T), axis=1)
 
 
 def cells_over(u: FloatArray, v: FloatArray, step: float) -> int:

@@ -18,7 +18,7 @@ from sensors.effects.base import Stage
 from sensors.effects.raster_effect import RasterEffect
 from sensors.models.sensor_model import StereoModel
 from sensors.stereo.stereo_pair import REDUCTION, StereoPair
-from sensors.subset import asked_for, looking_around
+from sensors.subset import effects_needing_neighbours, restrict_to
 
 _SAME_STEP = 0.5
 """px by which two rasters' steps may differ: registrations move pixels a little."""
@@ -71,8 +71,8 @@ def _points(
 ) -> list[FloatArray]:
     """(n, 3) of each source of random numbers: what is recorded in these cells (n,), of which those alone are traced where no
     effect looks at others."""
-    if looking_around(pair.model):
+    if effects_needing_neighbours(pair.model):
         return [pair.observe(measurement.scene, random).points.reshape(-1, 3)[cells] for random in randoms]
     chosen, place = np.unique(cells, return_inverse=True)
-    some = asked_for(pair, chosen.astype(np.uint32))
+    some = restrict_to(pair, chosen.astype(np.uint32))
     return [some.observe(measurement.scene, random).points.reshape(-1, 3)[place] for random in randoms]

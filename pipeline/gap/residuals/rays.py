@@ -111,9 +111,9 @@ def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, triangles:
     mean = normal.mean(axis=1)
     mean /= np.linalg.norm(mean, axis=1, keepdims=True)
     cosine = np.abs(np.einsum("ni,ni->n", ray, mean))
-    scatter = planes.along(ray, corner).max(axis=1) / planes.typical_m
+    scatter = planes.along(ray, corner).max(axis=1) / planes.median_scatter_m
     found = replace(found, cos_incidence=cosine, scatter=scatter)
-    if not planes.of_noise:
+    if not planes.noise_dominates:
         return found
     towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
     bulge = towards * _height(normal, triangles) / np.maximum(cosine, _LEAST_COSINE)

@@ -16,7 +16,7 @@ from pipeline.gap.residuals.several_scans import scans_residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _ROUNDS = 6
@@ -72,7 +72,7 @@ def _triangle(design: FloatArray) -> FloatArray:
     while len(design) > _AT_ONCE:
         whole = len(design) // _AT_ONCE * _AT_ONCE
         blocks = design[:whole].reshape(-1, _AT_ONCE, design.shape[1])
-        triangles = side_by_side(_factors, [blocks[start : start + _BLOCKS] for start in range(0, len(blocks), _BLOCKS)])
+        triangles = map_in_threads(_factors, [blocks[start : start + _BLOCKS] for start in range(0, len(blocks), _BLOCKS)])
         design = np.concatenate([*triangles, design[whole:]])
     return design
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects, catalogue
 from sensors.effects.base import Effect, Sensor
@@ -119,7 +119,7 @@ class Residuals(ABC):
     @cached_property
     def orders(self) -> dict[str, NDArray[np.int32]]:
         """(n,) rows by the value of each covariate, rising, and where that is the same as they are."""
-        return dict(zip(self.covariates, side_by_side(_order, self.covariates.values()), strict=True))
+        return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
 
     def of_points(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
         """(m,) values (n,) of these residuals at the measurement's points `index` (m,); NaN where there is no residual."""

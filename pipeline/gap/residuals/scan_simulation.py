@@ -57,7 +57,7 @@ class DirectedScanner(LaserScanner):
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
         """(n,) recorded ranges, m; NaN without a return."""
         pulses, beam = self.emitted(self.emit(), random)
-        return self._recorded_ranges(pulses, self.echo(scene, self._straight(pulses), beam, beam.received), random)
+        return self._recorded_ranges(pulses, self.echo(scene, self._straight(pulses), beam, beam.combine_echoes), random)
 
     def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
         """(n,) ranges as recorded by the beam in each of the modes, m; its sub-rays are traced once."""
@@ -66,7 +66,7 @@ class DirectedScanner(LaserScanner):
 
         def merge(rays: SubRays) -> Echo:
             for mode in modes:
-                echo = replace(beam, mode=mode).received(rays)
+                echo = replace(beam, mode=mode).combine_echoes(rays)
                 dr.eval(echo)
                 parts[mode].append(echo)
             return echo

@@ -15,7 +15,7 @@ from pipeline.gap.residuals.residuals import Residuals, Rows
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray, area_normals
 
 NEIGHBOURS = 8
@@ -138,7 +138,7 @@ class Sight:
         for group, near in self._rings:
             own = z[group]
             parts = [near[start : start + _AT_ONCE] for start in range(0, len(near), _AT_ONCE)]
-            found[group] = np.concatenate(side_by_side(partial(_medians_of, own), parts))
+            found[group] = np.concatenate(map_in_threads(partial(_medians_of, own), parts))
         return found
 
     @cached_property

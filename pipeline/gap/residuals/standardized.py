@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from pipeline.change.robust import nmad
 from pipeline.gap.residuals.residuals import Residuals
-from scene.common.threads import side_by_side
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _CELLS, _WINDOW = 36, 9
@@ -41,7 +41,7 @@ def spread(residuals: Residuals, z: FloatArray, quiet: NDArray[np.bool_]) -> Flo
         return _spread_along(residuals.covariates[name], z, order[quiet[order]])
 
     whole = np.full(len(z), nmad(z[quiet], 0.0))
-    return reduce(np.maximum, side_by_side(along, residuals.orders), whole)
+    return reduce(np.maximum, map_in_threads(along, residuals.orders), whole)
 
 
 def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:

@@ -30,7 +30,7 @@ from sensors.effects.disparity_empirical import DisparityEmpirical
 from sensors.effects.parallax_noise import ParallaxNoise
 from sensors.effects.raster_effect import RasterEffect
 from sensors.models.sensor_model import StereoModel
-from sensors.numerics.curve import surface_on_host
+from sensors.numerics.curve import interpolate_on_host
 
 _PROBE_PX = 3.0
 _EDGE_PX, _MOST_EDGE_PX = 1.0, 10.0
@@ -244,7 +244,7 @@ def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatAr
     for effect in model.effects:
         if isinstance(effect, DisparityEmpirical):
             x, y = (covariates[name] for name in (effect.covariate, effect.second or effect.covariate))
-            total += surface_on_host(x, y, effect.along, effect.across, effect.values_px)
+            total += interpolate_on_host(x, y, effect.along, effect.across, effect.values_px)
     return total
 
 

@@ -95,7 +95,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     if any(effect.stage == Stage.AIM for effect in model.effects):
         real = aimed(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
-    along_planes = measurement.planes is not None and measurement.planes.of_noise
+    along_planes = measurement.planes is not None and measurement.planes.noise_dominates
     if along_planes:
         nominal = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
         seen = turned(met(measurement, nominal), nominal[0], axes[0])

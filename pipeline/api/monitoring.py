@@ -1,0 +1,146 @@
+"""`monitor`: what fell between real epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.api.configs import Show
+from pipeline.api.extras import library
+from pipeline.api.maps import DIFFERENCE, data_array
+from pipeline.api.pictures import Picture, html_table
+from pipeline.api.tables import frame
+from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.monitor.options import MonitorOptions
+from pipeline.monitor.outlines import in_survey
+from pipeline.monitor.products import COLUMNS, Result
+from pipeline.monitor.report import headline
+from pipeline.monitor.run import monitor_paths
+from pipeline.report.notebook_progress import python_progress
+from scene.common.errors import InputError
+
+if TYPE_CHECKING:
+    import geopandas
+    import xarray
+
+_VECTORS = ("position", "direction")
+
+
+def monitor(
+    epochs: Sequence[Path | str],
+    out: Path | str,
+    *,
+    times: Sequence[str] = (),
+    workers: int = 1,
+    resume: bool = False,
+    progress: Show = "auto",
+    **options: Any,
+) -> Monitoring:
+    """Compare real epochs of a wall with the first one; the same as `scarpsim monitor`.
+
+    Parameters
+    ----------
+    epochs : sequence of paths
+        Scans, clouds, meshes, elevation models, folders of scans, or a run of `simulate`.
+    out : path
+        New folder for the products.
+    times : sequence of str
+        Time of each epoch, ISO 8601; none: as the files say.
+    workers : int
+        Processes.
+    resume : bool
+        Go on with what is finished in `out`.
+    progress : "auto", True or False
+    **options
+        Those of `MonitorOptions`: position, direction, gsd_m, stable, unit, columns, scanner, model, photographs, detector, seed.
+
+    Returns
+    -------
+    Monitoring
+
+    Raises
+    ------
+    InputError
+        For whatever is wrong in the files, for epochs that do not meet, and for unknown options.
+    """
+    unknown = sorted(set(options) - set(MonitorOptions.__dataclass_fields__))
+    if unknown:
+        allowed = ", ".join(MonitorOptions.__dataclass_fields__)
+        raise InputError(f"unknown option '{unknown[0]}'", where="monitor", allowed=allowed)
+    values: dict[str, Any] = dict(options)
+    for name in _VECTORS:
+        if values.get(name) is not None:
+            values[name] = np.asarray(values[name], dtype=np.float64)
+    with python_progress(progress) as shown:
+        found = monitor_paths(
+            [Path(each) for each in epochs],
+            Path(out),
+            MonitorOptions(**values),
+            times=times,
+            workers=workers,
+            resume=resume,
+            progress=shown,
+        )
+    return Monitoring(found)
+
+
+@dataclass(frozen=True, repr=False)
+class Monitoring:
+    """A finished monitoring. result: folder, sources, site and epochs."""
+
+    result: Result
+
+    @property
+    def folder(self) -> Path:
+        """Where the products lie."""
+        return self.result.folder
+
+    @property
+    def differences(self) -> xarray.DataArray:
+        """(epoch, y, x) reference minus epoch along the wall's normal, m, missing rock positive, NaN without data."""
+        xarray = library("xarray")
+        maps = [self._map("difference", epoch.number) for epoch in self.result.epochs]
+        return xarray.concat(maps, dim=xarray.IndexVariable("epoch", [epoch.number for epoch in self.result.epochs]))
+
+    @property
+    def events(self) -> geopandas.GeoDataFrame:
+        """A row for each event and epoch, as events.csv has them; geometry: the outline in survey coordinates."""
+        geopandas, shapely = library("geopandas"), library("shapely")
+        site = self.result.site
+        heights = site.reference.raster.height
+        regions = [region for epoch in self.result.epochs for region in epoch.regions]
+        rings = [in_survey(region, site.grid, heights, site.frame) for region in regions]
+        outlines = [shapely.MultiPolygon([shapely.Polygon(ring) for ring in each]) for each in rings]
+        return geopandas.GeoDataFrame(frame(self.result.rows(), list(COLUMNS)), geometry=outlines, crs=site.crs or None)
+
+    @property
+    def registration(self) -> dict[int, dict[str, Any]]:
+        """How each epoch was registered on the reference, wall frame, as monitor.json has it."""
+        return {epoch.number: epoch.record.registration for epoch in self.result.epochs}
+
+    def plot(self, epoch: int | None = None) -> Picture:
+        """The map of an epoch with the outlines of its events; none: the last one."""
+        number = self.result.epochs[-1].number if epoch is None else epoch
+        path = self.folder / f"map_{number:03d}.png"
+        if not path.is_file():
+            raise InputError(f"there is no epoch {number}", where="plot", allowed=f"1 to {len(self.result.epochs)}")
+        return Picture(path.read_bytes())
+
+    def summary(self) -> str:
+        """One line an epoch."""
+        return "\n".join(headline(self.result))
+
+    def __repr__(self) -> str:
+        return f"<Monitoring: {self.summary()}>"
+
+    def _repr_html_(self) -> str:
+        rows = {f"epoch {epoch.number}": f"{len(epoch.regions)} events" for epoch in self.result.epochs}
+        return html_table(self.summary(), rows, self.plot())
+
+    def _map(self, kind: str, number: int) -> xarray.DataArray:
+        values, grid = read_geotiff(self.folder / f"{kind}_{number:03d}.tif")
+        return data_array(values, grid, kind, DIFFERENCE)

@@ -1,0 +1,111 @@
+"""`scarpsim monitor`: what fell between real epochs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.measurement import numbers, words
+from pipeline.cli.parser import add_output_options, at_least, between, one_of
+from scene.common.errors import InputError
+from scene.common.lengths import METRES
+
+if TYPE_CHECKING:
+    from pipeline.monitor.options import MonitorOptions
+
+SUMMARY = "compare real epochs of a wall: registered maps, level of detection, a list of what fell"
+EXAMPLE = """  scarpsim monitor march.laz april.laz --out april
+  scarpsim monitor scans/2026-*.laz --stable stable.yaml --scanner riegl_vz400i --workers 2 --out year
+  scarpsim monitor reference.laz --follow incoming --out live"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "epochs",
+        nargs="+",
+        type=Path,
+        metavar="EPOCH",
+        help="a scan, cloud, mesh or DEM, a folder of scans of one epoch, or a run of simulate; the first is the reference",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for maps, events and report")
+    parser.add_argument("--reference", type=Path, metavar="FILE", help="compare with this instead of the first epoch")
+    parser.add_argument(
+        "--position",
+        type=numbers(3),
+        metavar="X,Y,Z",
+        help="where the sensor stood, or any place before the wall, in the points' coordinates, m, if no header says",
+    )
+    parser.add_argument(
+        "--direction", type=numbers(3), metavar="X,Y,Z", help="measure change along it, towards the sensor (default: mean plane)"
+    )
+    parser.add_argument("--scanner", metavar="PRESET", help="say what level of detection this scanner promises, too")
+    parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
+    parser.add_argument("--photographs", action="store_true", help="the epochs are from photographs")
+    parser.add_argument("--stable", type=Path, metavar="FILE", help="stable rock: YAML list of boxes or polygons, wall frame, m")
+    parser.add_argument("--times", type=words, default=[], metavar="T,T,...", help="time of each epoch, ISO 8601")
+    parser.add_argument(
+        "--gsd", type=between(1e-4, 100.0), metavar="M", help="side of a pixel, m (default: by the points' density)"
+    )
+    parser.add_argument(
+        "--unit", type=one_of(*METRES), metavar="|".join(METRES), help="of the epochs (default: as the files state, else m)"
+    )
+    parser.add_argument(
+        "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
+    )
+    parser.add_argument(
+        "--detector",
+        default="none",
+        metavar="default|baseline|none|FOLDER",
+        help="find events with a detector instead of the level of detection (default: none)",
+    )
+    parser.add_argument("--workers", type=at_least(1), default=1, metavar="N", help="processes (default: 1)")
+    parser.add_argument("--follow", type=Path, metavar="FOLDER", help="go on with each new file in a folder, until interrupted")
+    parser.add_argument("--resume", action="store_true", help="go on with an interrupted monitoring in --out")
+    parser.add_argument("--write-site", type=Path, metavar="FILE", help="write a config that simulates this site")
+    add_output_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    from pipeline.monitor.follow import follow
+    from pipeline.monitor.report import headline
+    from pipeline.monitor.run import monitor_paths
+    from pipeline.monitor.write_site import write_site
+    from pipeline.report.progress import shown_progress
+
+    options = _options(arguments)
+    paths = [arguments.reference, *arguments.epochs] if arguments.reference else arguments.epochs
+    keys = {"times": [each.upper() for each in arguments.times], "workers": arguments.workers, "resume": arguments.resume}
+    with shown_progress(quiet=arguments.quiet) as progress:
+        if arguments.follow:
+            result = follow(paths, arguments.follow, arguments.out, options, **keys)
+        else:
+            result = monitor_paths(paths, arguments.out, options, **keys, progress=progress)
+    lines = headline(result)
+    if arguments.write_site:
+        write_site(result, arguments.write_site)
+        lines.append(f"a config of this site: {arguments.write_site}")
+    report = arguments.out / "report.html"
+    return Answer("\n".join([*lines, f"report: {report}"]), recorded(report, "monitor.json"))
+
+
+def _options(arguments: argparse.Namespace) -> MonitorOptions:
+    import numpy as np
+
+    from pipeline.monitor.options import MonitorOptions, read_areas
+
+    if arguments.scanner and arguments.model:
+        raise InputError("goes without --model: both say what the scanner does", where="--scanner", remedy="give one of them")
+    return MonitorOptions(
+        position=None if arguments.position is None else np.array(arguments.position),
+        direction=None if arguments.direction is None else np.array(arguments.direction),
+        gsd_m=arguments.gsd,
+        stable=() if arguments.stable is None else read_areas(arguments.stable),
+        unit=arguments.unit,
+        columns=tuple(arguments.columns),
+        scanner=arguments.scanner,
+        model=arguments.model,
+        photographs=arguments.photographs,
+        detector=arguments.detector,
+    )

@@ -1,0 +1,141 @@
+"""Turn points into a raster of heights with a standard deviation for each pixel, without triangles.
+
+A plane is fitted by least squares to the points in 3 x 3 pixels about each pixel,
+
+    z = h + a u + b v,
+
+u and v the offsets from the pixel's centre in x and y, wall frame, m. The height h at the centre has the variance s^2 q, where s
+is the standard deviation of the points about the plane and q the first diagonal element of the inverse normal matrix. Sums over
+the points of each pixel are all that is kept, so that memory depends on the raster and not on the number of points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+
+_REACH = 1
+"""Pixels to each side from which points are taken."""
+_FEWEST = 4
+"""Points that a plane needs, one more than it has parameters."""
+_MOST_LEVERAGE = 1.0
+"""Largest q: a pixel whose height is known worse than from a single point at its centre has no data."""
+_PRIOR_POINTS = 4.0
+"""Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
+_CHUNK = 2_000_000
+"""Points of which sums are taken at a time."""
+
+
+@dataclass(frozen=True)
+class HeightRaster:
+    """Heights of one epoch over the wall.
+
+    Attributes
+    ----------
+    grid : Grid
+        Where the pixels lie, wall frame.
+    height, sigma, scatter : (h, w) float32, m
+        Height at the pixel's centre, its standard deviation, and the standard deviation of the points about the plane. NaN where
+        there are too few points.
+    slope_x, slope_y : (h, w) float32
+        Change of height with x and y.
+    count : (h, w) int32
+        Points in the pixel itself.
+    """
+
+    grid: Grid
+    height: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    scatter: NDArray[np.float32]
+    slope_x: NDArray[np.float32]
+    slope_y: NDArray[np.float32]
+    count: NDArray[np.int32]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(h, w) where there is a height."""
+        return np.isfinite(self.height)
+
+    @property
+    def steepness(self) -> NDArray[np.float32]:
+        """(h, w) tangent of the angle between the surface's normal and the wall's."""
+        return np.asarray(np.hypot(self.slope_x, self.slope_y))
+
+
+def gridded(points: FloatArray, grid: Grid) -> HeightRaster:
+    """Fit a plane about each pixel to points (n, 3), wall frame, m; points outside the grid are left out."""
+    return _fitted(_moments(points, grid), grid)
+
+
+def _moments(points: FloatArray, grid: Grid) -> FloatArray:
+    """(10, h, w) sums over the points of each pixel: 1, u, v, z, uu, uv, vv, uz, vz, zz; u and v in pixels from its centre."""
+    sums = np.zeros((10, grid.height * grid.width))
+    for start in range(0, len(points), _CHUNK):
+        x, y, z = points[start : start + _CHUNK].T
+        column, row = (x - grid.x_min) / grid.gsd, (grid.y_max - y) / grid.gsd
+        inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+        column, row, z = column[inside], row[inside], z[inside]
+        pixel = np.floor(row).astype(np.int64) * grid.width + np.floor(column).astype(np.int64)
+        u, v = column - np.floor(column) - 0.5, 0.5 - (row - np.floor(row))
+        for place, value in enumerate((None, u, v, z, u * u, u * v, v * v, u * z, v * z, z * z)):
+            sums[place] += np.bincount(pixel, value, minlength=sums.shape[1])
+    return sums.reshape(10, grid.height, grid.width)
+
+
+def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
+    count = sums[0].astype(np.int32)
+    around = _about_each_pixel(sums)
+    n, su, sv, sz, suu, suv, svv, suz, svz, szz = around
+    # Cofactors of the symmetric normal matrix [[n, su, sv], [su, suu, suv], [sv, suv, svv]].
+    c00, c01, c02 = suu * svv - suv**2, sv * suv - su * svv, su * suv - sv * suu
+    c11, c12, c22 = n * svv - sv**2, su * sv - n * suv, n * suu - su**2
+    determinant = n * c00 + su * c01 + sv * c02
+    with np.errstate(invalid="ignore", divide="ignore"):
+        height = (c00 * sz + c01 * suz + c02 * svz) / determinant
+        slope_u = (c01 * sz + c11 * suz + c12 * svz) / determinant
+        slope_v = (c02 * sz + c12 * suz + c22 * svz) / determinant
+        leverage = c00 / determinant
+        squares = np.maximum(szz - height * sz - slope_u * suz - slope_v * svz, 0.0)
+        known = (n >= _FEWEST) & (determinant > 0) & (leverage <= _MOST_LEVERAGE)
+        usual = float(np.median(squares[known] / (n[known] - 3))) if known.any() else 0.0
+        variance = (squares + _PRIOR_POINTS * usual) / (n - 3 + _PRIOR_POINTS)
+        sigma, scatter = np.sqrt(variance * leverage), np.sqrt(variance)
+    layers = (height, sigma, scatter, slope_u / grid.gsd, slope_v / grid.gsd)
+    height, sigma, scatter, slope_x, slope_y = (np.where(known, each, np.nan).astype(np.float32) for each in layers)
+    return HeightRaster(grid, height, sigma, scatter, slope_x, slope_y, count)
+
+
+def _about_each_pixel(sums: FloatArray) -> FloatArray:
+    """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one."""
+    height, width = sums.shape[1:]
+    total = np.zeros_like(sums)
+    for down in range(-_REACH, _REACH + 1):
+        for right in range(-_REACH, _REACH + 1):
+            here = np.s_[:, max(-down, 0) : height - max(down, 0), max(-right, 0) : width - max(right, 0)]
+            there = np.s_[:, max(down, 0) : height - max(-down, 0), max(right, 0) : width - max(-right, 0)]
+            total[here] += _shifted(sums[there], float(right), float(-down))
+    return total
+
+
+def _shifted(sums: FloatArray, u: float, v: float) -> FloatArray:
+    """Return the sums with every point's offsets larger by u and v pixels."""
+    n, su, sv, sz, suu, suv, svv, suz, svz, szz = sums
+    return np.stack(
+        [
+            n,
+            su + u * n,
+            sv + v * n,
+            sz,
+            suu + 2 * u * su + u * u * n,
+            suv + u * sv + v * su + u * v * n,
+            svv + 2 * v * sv + v * v * n,
+            suz + u * sz,
+            svz + v * sz,
+            szz,
+        ]
+    )

@@ -1,0 +1,50 @@
+"""Magnitude-frequency law of rockfalls: how many are larger than a volume."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+_FEWEST = 8
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """N(> V) = n (V / smallest)^-exponent for V >= smallest, with the 95 % interval of the exponent; n: events that large."""
+
+    exponent: float
+    low: float
+    high: float
+    smallest_m3: float
+    count: int
+
+
+def fit_power_law(volumes_m3: Sequence[float]) -> PowerLaw | None:
+    """Fit the law to volumes, from the smallest volume on for which it fits best; None for fewer than eight events.
+
+    The exponent is the maximum-likelihood estimate n / sum(log(V / smallest)). Its interval follows from 2 n b / estimate, which
+    has a chi-square distribution with 2 n degrees of freedom. The smallest volume is the one with the least Kolmogorov-Smirnov
+    distance (Clauset, Shalizi and Newman 2009, section 3.3).
+    """
+    ordered = np.sort(np.asarray(volumes_m3, dtype=np.float64))
+    ordered = ordered[ordered > 0]
+    best: tuple[float, float, int] | None = None
+    for start in range(len(ordered) - _FEWEST + 1):
+        part = ordered[start:]
+        total = float(np.log(part / part[0]).sum())
+        if total <= 0:
+            continue
+        exponent = len(part) / total
+        theory = 1 - (part / part[0]) ** -exponent
+        distance = float(np.abs(theory - (np.arange(len(part)) + 0.5) / len(part)).max())
+        if best is None or distance < best[0]:
+            best = (distance, exponent, start)
+    if best is None:
+        return None
+    _, exponent, start = best
+    count = len(ordered) - start
+    low, high = (float(chi2.ppf(share, 2 * count)) / (2 * count) * exponent for share in (0.025, 0.975))
+    return PowerLaw(exponent, low, high, float(ordered[start]), count)

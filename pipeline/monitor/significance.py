@@ -1,0 +1,127 @@
+"""Say which differences are larger than noise: a level of detection for each pixel, and the error of means over regions.
+
+The variance that a pixel's difference should have is that of the two heights and of the registration. How the differences on
+stable rock really scatter is set against it: the level of detection is the 95 % quantile of |difference| / predicted standard
+deviation on stable rock, in classes of the predicted one, times that prediction. So rough and smooth rock have levels of their
+own, and 5 % of the stable pixels exceed theirs.
+
+Neighbouring pixels share points and registration, so the error of a mean does not fall with the root of the number of pixels.
+It is measured on stable rock, as the scatter of means over squares of growing size (Hugonnet et al. 2022, "Uncertainty analysis
+of digital elevation models by spatial inference from stable terrain").
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from scene.geometry.mesh import FloatArray
+
+NORMAL_95 = 1.959964
+"""The 95 % quantile of the absolute value of a normal variable."""
+MEDIAN = 0.674490
+"""The median of the absolute value of a normal variable."""
+_LONGEST_TAIL = 1.6
+"""Times a normal distribution of the same median that a quantile of the noise may reach: what is farther out may have moved."""
+_LEAST_FACTOR = 0.1
+"""Least level of detection over the predicted standard deviation: copies of one scan do not differ at all."""
+_CLASSES = 8
+_FEWEST_IN_CLASS = 400
+_SIDES = (1, 2, 3, 5, 7, 11, 15, 23, 31, 47, 63)
+"""Sides of the squares, pixels, over which means are taken."""
+_FEWEST_SQUARES = 12
+_QUANTILES = (0.5, 0.9, 0.99, 0.999)
+_FILLED = 0.7
+"""Share of a square that needs data."""
+
+
+@dataclass(frozen=True)
+class Significance:
+    """How large differences are by chance.
+
+    Attributes
+    ----------
+    level : (h, w) float32, m
+        Level of detection at 95 % of each pixel; NaN without data.
+    side_px, sigma : (k,) arrays
+        Standard deviation, on stable rock, of means over squares of that side of differences in units of their pixel's.
+    """
+
+    level: NDArray[np.float32]
+    side_px: FloatArray
+    sigma: FloatArray
+
+    @property
+    def one_sigma(self) -> NDArray[np.float32]:
+        """(h, w) standard deviation of a pixel's difference, m."""
+        return np.asarray(self.level / np.float32(NORMAL_95))
+
+    def sigma_of_mean(self, pixels: float | NDArray[np.floating]) -> FloatArray:
+        """Standard deviation of a mean of standardised differences over so many pixels; beyond the largest square, that of it."""
+        side = np.sqrt(np.maximum(pixels, 1.0))
+        return np.asarray(np.exp(np.interp(np.log(side), np.log(self.side_px), np.log(self.sigma))))
+
+
+def significance(difference: NDArray[np.float32], predicted: NDArray[np.float32], stable: NDArray[np.bool_]) -> Significance:
+    """Compare the differences on stable rock with what was predicted.
+
+    Parameters
+    ----------
+    difference, predicted : (h, w) float32, m
+        Reference minus epoch, and the standard deviation that it should have; NaN without data.
+    stable : (h, w) bool
+        Where nothing moved.
+
+    Returns
+    -------
+    Significance
+    """
+    level = predicted * _factor(difference, predicted, stable)
+    standard = np.where(stable, difference / (level / NORMAL_95), np.nan)
+    sides: list[float] = []
+    sigmas: list[float] = []
+    for side in _SIDES:
+        means = _means_of_squares(standard, side)
+        if len(means) < _FEWEST_SQUARES and sides:
+            break
+        sides.append(float(side))
+        sigmas.append(_sigma_with_tails(means))
+    return Significance(level.astype(np.float32), np.array(sides), np.minimum.accumulate(np.array(sigmas)))
+
+
+def _sigma_with_tails(means: NDArray[np.float64]) -> float:
+    """Largest of the standard deviations that quantiles tell, from the median on outwards: noise has long tails at edges."""
+    apart = np.abs(means - np.median(means))
+    known = [quantile for quantile in _QUANTILES if (1 - quantile) * len(apart) >= 1]
+    found = [float(np.quantile(apart, quantile)) / float(ndtri((1 + quantile) / 2)) for quantile in known]
+    return max(min(max(found), _LONGEST_TAIL * found[0]), 1e-3)
+
+
+def _factor(difference: NDArray[np.float32], predicted: NDArray[np.float32], stable: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(h, w) by how much the level of detection exceeds the predicted standard deviation."""
+    ratio, of = np.abs(difference[stable]) / predicted[stable], predicted[stable]
+    classes = int(np.clip(len(ratio) // _FEWEST_IN_CLASS, 1, _CLASSES))
+    edges = np.quantile(of, np.linspace(0, 1, classes + 1))
+    middle, quantile = [], []
+    for low, high in itertools.pairwise(edges):
+        inside = (of >= low) & (of <= high)
+        if inside.any():
+            middle.append(float(np.median(of[inside])))
+            half, most = np.quantile(ratio[inside], [0.5, 0.95])
+            quantile.append(float(max(min(most, _LONGEST_TAIL * NORMAL_95 * half / MEDIAN), _LEAST_FACTOR)))
+    return np.interp(predicted, middle, quantile).astype(np.float32)
+
+
+def _means_of_squares(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
+    """Means over the squares of a grid that have data in most of their pixels."""
+    height, width = (size // side * side for size in values.shape)
+    if not height or not width:
+        return np.empty(0)
+    cells = values[:height, :width].reshape(height // side, side, width // side, side)
+    filled = np.isfinite(cells).mean(axis=(1, 3))
+    total = np.nansum(cells, axis=(1, 3)) / np.maximum(np.isfinite(cells).sum(axis=(1, 3)), 1)
+    return np.asarray(total[filled >= _FILLED], dtype=np.float64)

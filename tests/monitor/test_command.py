@@ -1,0 +1,221 @@
+"""`scarpsim monitor` from files to products: what a user with two scans gets."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from monitor_cases import NOISE_M, STATION, UTM, las, points
+from pycocotools.coco import COCO
+
+from pipeline import monitor
+from pipeline.cli import main as cli
+from pipeline.formats.meshes.ply import write_ply
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.monitor.follow import follow
+from pipeline.monitor.options import MonitorOptions
+from pipeline.surface.raster_mesh import mesh_of_raster
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+
+BLOCKS = ((4.0, 3.0, 0.7, 0.2), (11.0, 6.5, 0.9, 0.1))
+VOLUME = 0.7**2 * 0.2 + 0.9**2 * 0.1
+COUNT = 120_000
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scans")
+    las(folder / "site_2026-03-01_0600.las", points(COUNT, 1))
+    moved = points(COUNT, 2, BLOCKS) + np.array([0.02, -0.03, 0.01])
+    las(folder / "site_2026-04-01_0600.las", moved)
+    las(folder / "site_2026-05-01_0600.las", points(COUNT, 3, (*BLOCKS, (8.0, 8.0, 0.6, 0.3))))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("result") / "out"
+    words = [
+        "monitor",
+        *map(str, sorted(scans.glob("*.las"))),
+        "--position",
+        ",".join(STATION.split()),
+        "--out",
+        str(out),
+        "--quiet",
+    ]
+    assert cli.main(words) == 0
+    return out
+
+
+def test_the_table_says_what_fell_where_and_when(result: Path) -> None:
+    rows = list(csv.DictReader((result / "events.csv").open()))
+    first = [row for row in rows if row["epoch"] == "1"]
+    assert len(first) == 2
+    assert {row["kind"] for row in rows} == {"missing"}
+    assert sum(float(row["volume_m3"]) for row in first) == pytest.approx(VOLUME, rel=0.1)
+    for row, (x, z, _, _) in zip(sorted(first, key=lambda each: float(each["world_x_m"])), BLOCKS, strict=True):
+        assert float(row["world_x_m"]) == pytest.approx(UTM[0] + x, abs=0.1)
+        assert float(row["world_z_m"]) == pytest.approx(UTM[2] + z, abs=0.1)
+        assert row["first_seen_after"].startswith("2026-03-01T06:00")
+        assert row["first_seen_by"].startswith("2026-04-01T06:00")
+    later = {row["id"]: row for row in rows if row["epoch"] == "2"}
+    assert len(later) == 3
+    assert {row["id"] for row in first} < set(later)
+
+
+def test_the_promised_files_are_there_and_readable(result: Path, scans: Path) -> None:
+    document = json.loads((result / "monitor.json").read_text())
+    assert document["schema"] == 1
+    assert [each["time"] for each in document["inputs"]] == [
+        "2026-03-01T06:00:00Z", "2026-04-01T06:00:00Z", "2026-05-01T06:00:00Z"
+    ]  # fmt: skip
+    assert all(each["time_source"] == "from its name" and "UTM zone 32N" in each["crs"] for each in document["inputs"])
+    difference, grid = read_geotiff(result / "difference_001.tif")
+    level, same = read_geotiff(result / "lod_001.tif")
+    assert same == grid
+    assert np.nanmax(difference) == pytest.approx(0.2, abs=0.02)
+    noise = 1.96 * NOISE_M * np.sqrt(2 / 9)  # of two planes through nine points; relief between the points adds to it
+    assert noise / 2 < np.nanmedian(level) < 2 * noise
+    cloud = read_laz(result / "epoch_001.laz")
+    assert set(cloud.extra) == {"distance_m", "lod_m", "event"}
+    assert len(cloud.points) == COUNT
+    struck = cloud.extra["event"] > 0
+    assert 0.002 < struck.mean() < 0.03
+    assert np.nanmedian(cloud.extra["distance_m"][struck]) > 0.05
+    with laspy.open(result / "epoch_001.laz") as reader:
+        assert reader.header.parse_crs().to_epsg() == 32632
+    annotations = COCO(str(result / "annotations.json"))
+    assert len(annotations.getAnnIds(imgIds=[1])) == 2
+    assert "What fell from the wall" in (result / "report.html").read_text()
+
+
+def test_registered_points_lie_on_the_reference(result: Path) -> None:
+    """The second epoch was shifted by (20, -30, 10) mm: it comes back to within 2 mm."""
+    moved = read_laz(result / "epoch_001.laz").points - points(COUNT, 2, BLOCKS)
+    np.testing.assert_allclose(np.median(moved, axis=0), 0.0, atol=2e-3)
+
+
+def test_outlines_open_in_gis(result: Path) -> None:
+    geopandas = pytest.importorskip("geopandas")
+    table = geopandas.read_file(result / "events.gpkg", layer="events")
+    assert len(table) == 5
+    assert table.crs is not None
+    assert "UTM zone 32N" in table.crs.name
+    centre = table.geometry.iloc[0].centroid
+    assert abs(centre.x - table["world_x_m"].iloc[0]) < 0.2
+    assert table.geometry.has_z.all()
+
+
+def test_processes_and_resumption_give_the_same(result: Path, scans: Path, tmp_path: Path) -> None:
+    files = sorted(scans.glob("*.las"))
+    words = ["monitor", *map(str, files), "--position", ",".join(STATION.split()), "--out", str(tmp_path / "out"), "--quiet"]
+    assert cli.main([*words, "--workers", "2"]) == 0
+    for name in ("events.csv", "difference_002.tif", "lod_001.tif", "epoch_002.laz", "annotations.json", "events.gpkg"):
+        assert (tmp_path / "out" / name).read_bytes() == (result / name).read_bytes(), name
+    (tmp_path / "out" / "events.csv").unlink()
+    before = (tmp_path / "out" / "difference_001.tif").stat().st_mtime_ns
+    assert cli.main([*words, "--resume"]) == 0
+    assert (tmp_path / "out" / "events.csv").read_bytes() == (result / "events.csv").read_bytes()
+    assert (tmp_path / "out" / "difference_001.tif").stat().st_mtime_ns == before
+
+
+def test_from_python(scans: Path, tmp_path: Path) -> None:
+    pytest.importorskip("xarray")
+    found = monitor(sorted(scans.glob("*.las"))[:2], tmp_path / "out", position=[float(each) for each in STATION.split()])
+    assert found.differences.dims == ("epoch", "y", "x")
+    assert len(found.events) == 2
+    assert found.events["volume_m3"].sum() == pytest.approx(VOLUME, rel=0.1)
+    assert found.registration[1]["stable_pixels"] > 1000
+    assert "2 places" in found.summary()
+    with pytest.raises(InputError, match="unknown option"):
+        monitor([], tmp_path / "other", colour="red")
+
+
+def test_a_folder_is_followed_until_the_end(scans: Path, tmp_path: Path) -> None:
+    first, second, third = sorted(scans.glob("*.las"))
+    incoming = tmp_path / "incoming"
+    incoming.mkdir()
+    said: list[str] = []
+    looks = iter(range(100))
+
+    def ended() -> bool:
+        look = next(looks)
+        if look == 0:
+            (incoming / second.name).write_bytes(second.read_bytes())
+        if look == 3:
+            (incoming / "broken.las").write_bytes(b"LASF")
+            (incoming / third.name).write_bytes(third.read_bytes())
+        return look >= 7
+
+    options = MonitorOptions(position=np.array([float(each) for each in STATION.split()]))
+    found = follow([first], incoming, tmp_path / "out", options, every_s=0.0, ended=ended, told=said.append)
+    assert [len(epoch.regions) for epoch in found.epochs] == [2, 3]
+    assert any("left out" in line and "broken.las" in line for line in said)
+
+
+def test_meshes_are_epochs_too(tmp_path: Path) -> None:
+    grid = Grid(0.0, 10.0, 0.05, 320, 200)
+    x, y = np.meshgrid(0.05 * np.arange(320), 0.05 * np.arange(200)[::-1])
+    heights = 0.4 * np.sin(x) * np.cos(y)
+    write_ply(tmp_path / "before.ply", mesh_of_raster(heights, grid))
+    fallen = np.where((np.abs(x - 8) < 0.5) & (np.abs(y - 5) < 0.5), heights - 0.3, heights)
+    write_ply(tmp_path / "after.ply", mesh_of_raster(fallen, grid))
+    words = ["monitor", str(tmp_path / "before.ply"), str(tmp_path / "after.ply"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert cli.main(words) == 0
+    (row,) = csv.DictReader((tmp_path / "out" / "events.csv").open())
+    assert float(row["volume_m3"]) == pytest.approx(0.3, rel=0.1)
+
+
+def test_too_little_stable_rock_is_said_and_the_result_goes_on(scans: Path, tmp_path: Path) -> None:
+    (tmp_path / "stable.yaml").write_text("stable_areas:\n- [1, 1, 3, 3]\n")
+    first, second, _ = sorted(scans.glob("*.las"))
+    words = [str(first), str(second), "--position", ",".join(STATION.split()), "--stable", str(tmp_path / "stable.yaml")]
+    assert cli.main(["monitor", *words, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert "stable rock lies in" in (tmp_path / "out" / "report.html").read_text()
+
+
+def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
+    """Words after `monitor` that are wrong, and what the answer names."""
+    first, second, _ = map(str, sorted(scans.glob("*.las")))
+    station = ["--position", ",".join(STATION.split())]
+    las(folder / "elsewhere.las", points(2000, 4) + np.array([5000.0, 0, 0]))
+    las(folder / "feet.las", points(2000, 4) * np.array([3.28, 3.28, 3.28]), crs=None)
+    las(folder / "zone33.las", points(2000, 4), crs=32633)
+    (folder / "areas.yaml").write_text("- [1, 2]\n")
+    (folder / "empty").mkdir()
+    return {
+        "one epoch": ([first, *station], "1 epoch is given"),
+        "twice": ([first, first, *station], "is given twice"),
+        "not there": ([first, "nowhere.laz", *station], "no such file"),
+        "times backwards": ([second, first, *station], "is earlier than"),
+        "wrong number of times": ([first, second, *station, "--times", "2026-01-01"], "1 times for 2 epochs"),
+        "no time": ([first, second, *station, "--times", "soon,later"], "ISO 8601"),
+        "elsewhere": ([first, str(folder / "elsewhere.las"), *station], "lies elsewhere"),
+        "other unit": ([first, str(folder / "feet.las"), *station], "lies elsewhere"),
+        "other system": ([first, str(folder / "zone33.las"), *station], "another coordinate system"),
+        "no areas": ([first, second, *station, "--stable", str(folder / "areas.yaml")], "holds no areas"),
+        "empty folder": ([first, str(folder / "empty"), *station], "holds no scan"),
+        "two models": ([first, second, *station, "--scanner", "riegl_vz400i", "--model", "m.yaml"], "--scanner"),
+        "pixel too large": ([first, second, *station, "--gsd", "50"], "--gsd"),
+        "no detector": ([first, second, *station, "--detector", "nothing_here"], "nothing_here"),
+    }
+
+
+@pytest.mark.parametrize("name", [
+    "one epoch", "twice", "not there", "times backwards", "wrong number of times", "no time", "elsewhere", "other unit",
+    "other system", "no areas", "empty folder", "two models", "pixel too large", "no detector",
+])  # fmt: skip
+def test_mistakes(name: str, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words, problem = mistakes(scans, tmp_path)[name]
+    assert cli.main(["monitor", *words, "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    told = capsys.readouterr().err
+    assert problem in told
+    assert told.count("\n") == 1
+    assert "Traceback" not in told

@@ -1,0 +1,128 @@
+"""Registration, level of detection and regions on walls whose motion and missing rock are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from monitor_cases import HEIGHT_M, WIDTH_M, depth
+
+from pipeline.monitor.alignment import applied, refine
+from pipeline.monitor.comparison import ReferenceHeights, compare_epoch
+from pipeline.monitor.events import Catalogue
+from pipeline.monitor.gridding import gridded
+from pipeline.monitor.magnitude import fit_power_law
+from pipeline.monitor.significance import significance
+from pipeline.registration.rigid import RigidTransform
+from scene.common.errors import InputError
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+
+GRID = Grid(0.0, HEIGHT_M, 0.08, int(WIDTH_M / 0.08), int(HEIGHT_M / 0.08))
+COUNT = 200_000
+
+
+def wall(seed: int, noise_m: float = 0.003, missing: tuple[tuple[float, float, float, float], ...] = ()) -> FloatArray:
+    """Points in the wall frame, m; missing: x, y, side and depth of cuboids."""
+    random = np.random.default_rng(seed)
+    x, y = random.uniform([0, 0], [WIDTH_M, HEIGHT_M], (COUNT, 2)).T
+    z = depth(x, y)
+    for at_x, at_y, side, deep in missing:
+        z = np.where((np.abs(x - at_x) < side / 2) & (np.abs(y - at_y) < side / 2), z - deep, z)
+    return np.column_stack([x, y, z + noise_m * random.normal(size=COUNT)])
+
+
+def test_a_motion_is_found_within_its_own_uncertainty() -> None:
+    """What ICP leaves, 30 microradians and 1 mm, while a quarter of the wall moved by 0.2 m: errors below 4 sigma."""
+    centre = np.array([WIDTH_M / 2, HEIGHT_M / 2, 0.0])
+    motion = RigidTransform.about(centre, np.array([2e-5, -1e-5, 2e-5]), np.array([0.0004, -0.0006, 0.0010]))
+    reference = gridded(wall(1), GRID)
+    moved = wall(2)
+    moved[moved[:, 0] < 4.0, 2] += 0.2
+    found = refine(reference, gridded(motion.inverse().apply(moved), GRID), ())
+    sigma = np.sqrt(np.diag(found.covariance))
+    shift = found.transform.apply(found.centre) - motion.apply(found.centre)
+    turn = found.transform.rotation_vector - motion.rotation_vector
+    assert (np.abs(np.concatenate([shift, turn])) < 4 * sigma + 1e-5).all()
+    assert sigma[:3].max() < 1e-3
+    assert found.rms_m == pytest.approx(np.sqrt(2) * 0.003 / np.sqrt(7), rel=0.6)
+    assert not found.stable[:, :45].any()
+
+
+def test_heights_are_moved_as_their_points_are() -> None:
+    reference, points = gridded(wall(1), GRID), wall(2, 0.0)
+    motion = RigidTransform.about(np.array([8.0, 5.0, 0.0]), np.array([1e-4, 2e-4, -1e-4]), np.array([1e-3, 2e-3, -4e-3]))
+    epoch = gridded(points, GRID)
+    alignment = refine(reference, gridded(motion.apply(points), GRID), ())
+    np.testing.assert_allclose(
+        applied(alignment, gridded(motion.apply(points), GRID))[5:-5, 5:-5], epoch.height[5:-5, 5:-5], atol=2e-3
+    )
+
+
+def test_five_percent_of_stable_rock_exceed_the_level() -> None:
+    """Also where the noise is three times as large on one half: within 1.5 points on either."""
+    random = np.random.default_rng(5)
+    predicted = np.full((200, 300), 0.002, dtype=np.float32)
+    predicted[:, 150:] = 0.006
+    difference = (1.4 * predicted * random.normal(size=predicted.shape)).astype(np.float32)
+    found = significance(difference, predicted, np.ones(predicted.shape, dtype=bool))
+    beyond = np.abs(difference) > found.level
+    assert beyond[:, :150].mean() == pytest.approx(0.05, abs=0.015)
+    assert beyond[:, 150:].mean() == pytest.approx(0.05, abs=0.015)
+    assert found.sigma_of_mean(25) == pytest.approx(1 / 5, rel=0.25)
+
+
+def test_blocks_are_found_with_their_volumes_and_nothing_else() -> None:
+    blocks = ((3.0, 3.0, 0.6, 0.15), (10.0, 6.0, 0.8, 0.08), (13.0, 2.5, 0.4, 0.3))
+    found = compare_epoch(ReferenceHeights.of(wall(1), GRID), wall(2, missing=blocks), (), 1)
+    assert len(found.regions) == len(blocks)
+    for x, y, side, deep in blocks:
+        (region,) = (each for each in found.regions if np.hypot(each.x_m - x, each.y_m - y) < 0.15)
+        assert region.kind == "missing"
+        assert abs(region.volume_m3 - side**2 * deep) < 3 * region.volume_std_m3
+        assert region.depth_largest_m == pytest.approx(deep, rel=0.06)
+        assert region.depth_median_m == pytest.approx(deep, rel=0.1 if side > 0.5 else 0.35)
+        assert region.area_m2 == pytest.approx(side**2, rel=0.3)
+        assert not region.marks
+
+
+def test_added_rock_has_the_other_sign() -> None:
+    found = compare_epoch(ReferenceHeights.of(wall(1), GRID), wall(2, missing=((8.0, 5.0, 1.0, -0.1),)), (), 1)
+    (region,) = found.regions
+    assert region.kind == "added"
+    assert region.volume_m3 == pytest.approx(0.1, abs=3 * region.volume_std_m3)
+
+
+def test_nothing_is_found_where_nothing_fell() -> None:
+    """Five pairs of 160 m2; the aim is one false event in 1,000 m2."""
+    reference = ReferenceHeights.of(wall(1), GRID)
+    assert sum(len(compare_epoch(reference, wall(seed), (), 1).regions) for seed in range(2, 7)) <= 1
+
+
+def test_epochs_that_do_not_overlap_are_refused() -> None:
+    reference = ReferenceHeights.of(wall(1), GRID)
+    with pytest.raises(InputError):
+        compare_epoch(reference, wall(2) + np.array([200.0, 0.0, 0.0]), (), 1)
+
+
+def test_an_event_keeps_its_number_and_a_new_one_gets_the_next() -> None:
+    reference = ReferenceHeights.of(wall(1), GRID)
+    first = compare_epoch(reference, wall(2, missing=((3.0, 3.0, 0.6, 0.2),)), (), 1)
+    second = compare_epoch(reference, wall(3, missing=((3.0, 3.0, 0.7, 0.2), (10.0, 6.0, 1.2, 0.3))), (), 1)
+    catalogue = Catalogue()
+    assert [region.identity for region in catalogue.identified(first.regions)] == [1]
+    numbers = {round(region.x_m): region.identity for region in catalogue.identified(second.regions)}
+    assert numbers == {3: 1, 10: 2}
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.0])
+def test_the_exponent_of_a_power_law_comes_back(exponent: float) -> None:
+    """1,000 volumes: a standard error of 3 %; the 95 % interval is within 10 % of the exponent."""
+    volumes = 0.01 * (1 - np.random.default_rng(7).random(1000)) ** (-1 / exponent)
+    law = fit_power_law(volumes)
+    assert law is not None
+    assert law.low < exponent < law.high
+    assert law.exponent == pytest.approx(exponent, rel=0.12)
+
+
+def test_few_volumes_have_no_law() -> None:
+    assert fit_power_law([1.0, 2.0, 3.0]) is None
