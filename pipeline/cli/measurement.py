@@ -13,7 +13,7 @@ from scene.common.errors import InputError
 from scene.common.lengths import METRES
 
 if TYPE_CHECKING:
-    from pipeline.measurement.folder import Understood
+    from pipeline.measurement.folder import Interpretation
     from pipeline.measurement.request import Request
 
 FARTHEST_M = 1e8
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     return Answer(f"{found.summary()}\npicture: {found.folder / 'understood.png'}", found.to_dict)
 
 
-def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Understood:
+def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Interpretation:
     """Build the folder that the arguments ask for."""
     from pipeline.formats.files.atomic import empty_folder
     from pipeline.measurement.build import build, build_stereo
