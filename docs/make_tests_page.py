@@ -10,7 +10,7 @@ PAGE, LIST = FOLDER / "validation" / "tests.md", FOLDER.parent / "tests" / "vali
 _HEAD = """# What the tests cover, and when they run
 
 This page is for developers. `make test` runs lint, spelling, types and the tests that take seconds each. `make validate` runs
-the long tests below; run it before each release and after each larger change. Every behaviour that a long test covers as a whole has
+the long tests below; run it before each release and after each larger change. Whatever a long test covers as a whole has
 shorter tests of its parts in `make test`.
 """
 
