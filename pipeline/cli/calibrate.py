@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "measure the noise of real epochs and fit the simulation's noise to it"
@@ -15,6 +15,7 @@ EXAMPLE = """  scarpsim calibrate my_measurement --out calibration
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "measured",
         type=Path,
@@ -35,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Fit the noise and write the report."""
     from pipeline.calibration.calibrate import calibrate
     from pipeline.calibration.inputs import config_of, sensor_of
     from pipeline.calibration.report import summary
@@ -55,4 +57,4 @@ def run(arguments: argparse.Namespace) -> Answer:
         result = calibrate(config, sensor, arguments.measured, progress, with_greedy=not arguments.no_greedy)
         with progress.stage("report"):
             report = write(out, config, result, arguments.measured)
-    return Answer(f"{summary(result)}\nreport: {report}", recorded(report, RECORD_FILE))
+    return CommandOutput(f"{summary(result)}\nreport: {report}", record_document(report, RECORD_FILE))

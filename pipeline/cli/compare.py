@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 
 SUMMARY = "compare sensors on one wall and the same blocks: noise, level of detection, smallest block, completeness"
@@ -16,6 +16,7 @@ MOST_EPOCHS = 999
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "configs",
         nargs="+",
@@ -59,7 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Simulate and compare the sensors and write the report."""
     from pipeline.comparison.comparison import compare_sensors
     from pipeline.comparison.report import COMPARISON_FILE, summary, write_comparison
     from pipeline.comparison.sensor_setups import sensor_setups
@@ -74,4 +76,4 @@ def run(arguments: argparse.Namespace) -> Answer:
         comparison = compare_sensors(sensors, arguments.measured, arguments.epochs, sizes, progress)
         with progress.stage("report"):
             report = write_comparison(out, comparison)
-    return Answer(f"{summary(comparison)}\nreport: {report}", recorded(report, COMPARISON_FILE))
+    return CommandOutput(f"{summary(comparison)}\nreport: {report}", record_document(report, COMPARISON_FILE))

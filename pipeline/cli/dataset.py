@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, at_least
 from scene.common.errors import InputError
 
@@ -21,10 +21,11 @@ EXAMPLE = """  scarpsim dataset configs/datasets/small.yaml --out sets/small --w
   scarpsim dataset split sets/small --by sensor,noise --out sets/parts"""
 
 
-_BY = "sensor,noise,size"
+_DEFAULT_SPLIT_KEYS = "sensor,noise,size"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "words", nargs="+", metavar="CONFIG | verify DIR | merge DIR ... | split DIR", help="what to make, or what to do with it"
     )
@@ -35,12 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
-    parser.add_argument("--by", metavar="KEYS", help=f"split: one set for each combination (default: {_BY})")
+    parser.add_argument("--by", metavar="KEYS", help=f"split: one set for each combination (default: {_DEFAULT_SPLIT_KEYS})")
     parser.add_argument("--report-only", action="store_true", help="verify: do not make damaged tiles again; exit with 1")
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Make, verify, merge or split a data set."""
     if arguments.workers and arguments.scheduler:
         raise InputError("are given both", where="--workers and --scheduler", remedy="give one of them")
     action, *folders = arguments.words
@@ -52,18 +54,18 @@ def run(arguments: argparse.Namespace) -> Answer:
             remedy = f"write scarpsim dataset {goes_with} DIR, or leave it out"
             raise InputError(f"goes with {goes_with}, not with '{action}'", where=option, remedy=remedy)
     if action == "verify":
-        return _verify(arguments, _one(folders, "verify"))
+        return _verify(arguments, _single_folder(folders, "verify"))
     if action == "merge":
         return _merge(arguments, folders)
     if action == "split":
-        return _split(arguments, _one(folders, "split"))
+        return _split(arguments, _single_folder(folders, "split"))
     if folders:
         raise InputError(f"unexpected argument '{folders[0]}'", where="scarpsim dataset", remedy="see scarpsim dataset --help")
     return _make(arguments, Path(action))
 
 
-def _make(arguments: argparse.Namespace, path: Path) -> Answer:
-    out = _out(arguments)
+def _make(arguments: argparse.Namespace, path: Path) -> CommandOutput:
+    out = _output_folder(arguments)
     from pipeline.config.bundled import config_path
     from pipeline.dataset.config import load_dataset_config
     from pipeline.dataset.run import Workers, make_dataset
@@ -73,11 +75,11 @@ def _make(arguments: argparse.Namespace, path: Path) -> Answer:
     arguments.kept = f"what was finished is in {out} and usable; the same command goes on"
     workers = Workers(arguments.workers or 0, arguments.scheduler or "")
     with shown_progress(quiet=arguments.quiet) as progress:
-        summary = make_dataset(config, out, workers, command=_command(arguments, path), progress=progress)
-    return Answer(summary.summary(), lambda: _document(summary))
+        summary = make_dataset(config, out, workers, command=_reproducing_command(arguments, path), progress=progress)
+    return CommandOutput(summary.summary(), lambda: _document(summary))
 
 
-def _verify(arguments: argparse.Namespace, folder: Path) -> Answer:
+def _verify(arguments: argparse.Namespace, folder: Path) -> CommandOutput:
     from pipeline.dataset.run import Workers, verify_dataset
     from pipeline.report.progress import shown_progress
 
@@ -87,25 +89,25 @@ def _verify(arguments: argparse.Namespace, folder: Path) -> Answer:
     found = [f"{damage.problem}: {folder / damage.file}" for damage in summary.damage]
     if arguments.report_only:
         end = f"{len(found)} files are missing or damaged" if found else "the set is whole"
-        return Answer("\n".join([*found, end]), lambda: _document(summary), 1 if found else 0)
+        return CommandOutput("\n".join([*found, end]), lambda: _document(summary), 1 if found else 0)
     end = f"{len(found)} files were missing or damaged, {len(summary.made)} epochs made again; the set is whole"
-    return Answer("\n".join([*found, end]), lambda: _document(summary))
+    return CommandOutput("\n".join([*found, end]), lambda: _document(summary))
 
 
-def _merge(arguments: argparse.Namespace, folders: list[str]) -> Answer:
-    out = _out(arguments)
+def _merge(arguments: argparse.Namespace, folders: list[str]) -> CommandOutput:
+    out = _output_folder(arguments)
     from pipeline.dataset.combine import merge_datasets
 
     summary = merge_datasets([Path(folder) for folder in folders], out)
-    return Answer(summary.summary(), lambda: _document(summary))
+    return CommandOutput(summary.summary(), lambda: _document(summary))
 
 
-def _split(arguments: argparse.Namespace, folder: Path) -> Answer:
-    out = _out(arguments)
+def _split(arguments: argparse.Namespace, folder: Path) -> CommandOutput:
+    out = _output_folder(arguments)
     from pipeline.dataset.combine import split_dataset
 
-    parts = list(split_dataset(folder, out, (arguments.by or _BY).split(",")))
-    return Answer("\n".join(part.summary() for part in parts), lambda: {"sets": [_document(part) for part in parts]})
+    parts = list(split_dataset(folder, out, (arguments.by or _DEFAULT_SPLIT_KEYS).split(",")))
+    return CommandOutput("\n".join(part.summary() for part in parts), lambda: {"sets": [_document(part) for part in parts]})
 
 
 def _document(summary: DatasetSummary) -> dict[str, Any]:
@@ -115,19 +117,19 @@ def _document(summary: DatasetSummary) -> dict[str, Any]:
     return {"folder": str(summary.folder), "epochs_made": len(summary.made), **counts, "damage": damage}
 
 
-def _one(folders: list[str], action: str) -> Path:
+def _single_folder(folders: list[str], action: str) -> Path:
     if len(folders) != 1:
         raise InputError(f"takes one folder, got {len(folders)}", where=f"scarpsim dataset {action}")
     return Path(folders[0])
 
 
-def _out(arguments: argparse.Namespace) -> Path:
+def _output_folder(arguments: argparse.Namespace) -> Path:
     if arguments.out is None:
         raise InputError("needs a folder for the results", where="scarpsim dataset", remedy="add --out DIR")
     return Path(arguments.out)
 
 
-def _command(arguments: argparse.Namespace, path: Path) -> str:
+def _reproducing_command(arguments: argparse.Namespace, path: Path) -> str:
     """The command that makes the set; by how many workers and where to has no part in its bytes."""
     words = ["scarpsim", "dataset", str(path), "--out", "DIR"]
     words += [] if arguments.seed is None else ["--seed", str(arguments.seed)]

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options
 
 SUMMARY = "find rockfalls in difference maps: masks, events, pictures"
@@ -16,6 +16,7 @@ EXAMPLE = """  scarpsim detect default runs/my_run --out found
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "model",
         metavar="MODEL",
@@ -45,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Find the blocks and write masks, tables and pictures."""
     from pipeline.cli.train import load_keras
     from pipeline.detection.products.run import BASELINE, CONFIDENCES, detect, sorted_confidences
     from pipeline.formats.files.atomic import check_place, new_folder
@@ -79,4 +81,4 @@ def run(arguments: argparse.Namespace) -> Answer:
         "volume_m3": volume,
         "events": [asdict(item) for item in found],
     }
-    return Answer(f"{told}\nresults: {out}", lambda: document)
+    return CommandOutput(f"{told}\nresults: {out}", lambda: document)

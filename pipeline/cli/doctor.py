@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.cli import system_libraries
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options
 from scene.common.errors import InputError
 from scene.common.extras import how_to_install
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SUMMARY = "say what is installed, what is missing and how to get it"
 EXAMPLE = """  scarpsim doctor
   scarpsim doctor --json"""
-_SETUP = "run `make setup` in the checkout, or install scarpsim again"
+_INSTALL_AGAIN = "run `make setup` in the checkout, or install scarpsim again"
 _MEMORY_GIB, _DISK_GIB = 2.0, 1.0
 """What the demo needs, with room to spare."""
 EXTRAS = {
@@ -64,40 +64,42 @@ class Finding:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Examine the installation and list what was found."""
     findings = examine()
     ready = all(finding.ok is not False for finding in findings)
     end = "\nready: `simulate` can run here" if ready else "\nnot ready: mend what is marked PROBLEM"
     document = {"ready": ready, "findings": [asdict(finding) for finding in findings]}
-    return Answer("\n".join([*map(_line, findings), end]), lambda: document, 0 if ready else 1)
+    return CommandOutput("\n".join([*map(_format_finding, findings), end]), lambda: document, 0 if ready else 1)
 
 
 def examine() -> list[Finding]:
     """Every finding; a probe that fails is itself a finding."""
     probes: tuple[Callable[[], Iterator[Finding]], ...] = (_python, _packages, _extras, _libraries, _backend, _machine, _caches)
-    return [finding for probe in probes for finding in _guarded(probe)]
+    return [finding for probe in probes for finding in _run_probe(probe)]
 
 
-def _guarded(probe: Callable[[], Iterator[Finding]]) -> list[Finding]:
+def _run_probe(probe: Callable[[], Iterator[Finding]]) -> list[Finding]:
     found: list[Finding] = []
     try:
         found.extend(probe())
     except InputError as error:
         found.append(Finding(probe.__name__.strip("_"), False, str(error)))
     except Exception as error:  # whatever it is, it is what this command is there to tell
-        found.append(Finding(probe.__name__.strip("_"), False, _brief(error), _SETUP))
+        found.append(Finding(probe.__name__.strip("_"), False, _first_line(error), _INSTALL_AGAIN))
     return found
 
 
-def _line(finding: Finding) -> str:
+def _format_finding(finding: Finding) -> str:
     mark = {True: "ok", False: "PROBLEM", None: "-"}[finding.ok]
     return f"{mark:<8}{finding.name:<32}{finding.found}" + (f"; {finding.remedy}" if finding.remedy else "")
 
 
-def _brief(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".partition("\n")[0]
 
 
@@ -149,12 +151,12 @@ def _package(requirement: Requirement) -> Finding:
         version = metadata.version(name)
         importlib.import_module(_IMPORTS.get(name, name))
     except metadata.PackageNotFoundError:
-        return Finding(name, False, f"not installed, wanted {wanted}", _SETUP)
+        return Finding(name, False, f"not installed, wanted {wanted}", _INSTALL_AGAIN)
     except Exception as error:  # compiled packages fail in many ways, each worth reading
-        return Finding(name, False, f"{version} does not load: {_brief(error)}", "see the system libraries below")
+        return Finding(name, False, f"{version} does not load: {_first_line(error)}", "see the system libraries below")
     fits = version in wanted
     found = f"{version}, {_megabytes(metadata.distribution(name)):.0f} MB"
-    return Finding(name, fits, found, "" if fits else f"wanted {wanted}; {_SETUP}")
+    return Finding(name, fits, found, "" if fits else f"wanted {wanted}; {_INSTALL_AGAIN}")
 
 
 def _libraries() -> Iterator[Finding]:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, one_of
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detectio
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument("truth", type=Path, metavar="TRUTH", help="COCO annotations, or a folder that holds annotations.json")
     parser.add_argument("predictions", type=Path, metavar="PREDICTIONS", help="COCO detections with scores")
     parser.add_argument(
@@ -43,7 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Score the detections and print the tables."""
     from pipeline.detection.products.run import CONFIDENCES, sorted_confidences
     from pipeline.detection.products.score_files import as_text, assess, write
     from pipeline.formats.files.atomic import check_place
@@ -56,4 +58,4 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.out:
         write(assessment, arguments.out)
     place = f"\nscores: {arguments.out}" if arguments.out else ""
-    return Answer(as_text(assessment) + place, assessment.to_dict)
+    return CommandOutput(as_text(assessment) + place, assessment.to_dict)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 from scene.common.errors import InputError
 
@@ -25,6 +25,7 @@ FORMS = (*_SUFFIXES, *_SETS, "package")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     sets = " and ".join(_SETS)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"a run; of {sets} a data set; of package any result")
     parser.add_argument(
@@ -49,18 +50,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Export a run, a data set or a result in the form asked for."""
     form = arguments.form
     _check_options(arguments)
     if form in _SETS:
-        return _of_a_set(arguments)
+        return _export_data_set(arguments)
     if form == "package":
         from pipeline.export.package import PACKAGE_FILE, save_package
 
         path = arguments.out or arguments.folder / PACKAGE_FILE
         count = save_package(arguments.folder, path)
-        return Answer(f"{count:,} files: {path}", lambda: {"file": str(path), "files": count})
-    return _of_a_run(arguments)
+        return CommandOutput(f"{count:,} files: {path}", lambda: {"file": str(path), "files": count})
+    return _export_run(arguments)
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
@@ -74,7 +76,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
         raise InputError(f"got '{arguments.out.name}'", where="--out", allowed=suffix)
 
 
-def _of_a_set(arguments: argparse.Namespace) -> Answer:
+def _export_data_set(arguments: argparse.Namespace) -> CommandOutput:
     from pipeline.formats.files.atomic import empty_folder
     from pipeline.report.progress import shown_progress
 
@@ -85,14 +87,14 @@ def _of_a_set(arguments: argparse.Namespace) -> Answer:
             from pipeline.export import yolo
 
             made = yolo.save_yolo(arguments.folder, out, arguments.limit_m, progress)
-            return Answer(yolo.summary(made), lambda: yolo.to_dict(made))
+            return CommandOutput(yolo.summary(made), lambda: yolo.to_dict(made))
         from pipeline.export import huggingface
 
         written = huggingface.save_huggingface(arguments.folder, out, progress)
-        return Answer(huggingface.summary(written), lambda: huggingface.to_dict(written))
+        return CommandOutput(huggingface.summary(written), lambda: huggingface.to_dict(written))
 
 
-def _of_a_run(arguments: argparse.Namespace) -> Answer:
+def _export_run(arguments: argparse.Namespace) -> CommandOutput:
     from pipeline.export.exported_run import ExportedRun
     from pipeline.report.progress import shown_progress
 
@@ -102,7 +104,7 @@ def _of_a_run(arguments: argparse.Namespace) -> Answer:
     path = arguments.out or arguments.folder / f"{form}{'' if form == 'epochs' else f'_{number:03d}'}{_SUFFIXES[form]}"
     with shown_progress(quiet=arguments.quiet) as progress:
         _save(form, run, number, path, arguments.width or 1280, progress)
-    return Answer(str(path), lambda: {"file": str(path), "bytes": path.stat().st_size})
+    return CommandOutput(str(path), lambda: {"file": str(path), "bytes": path.stat().st_size})
 
 
 def _save(form: str, run: Any, number: int, path: Path, width: int, progress: Any) -> None:

@@ -6,8 +6,8 @@ import argparse
 from contextlib import ExitStack
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
-from pipeline.cli.measurement import add_source_arguments, built
+from pipeline.cli.command_output import CommandOutput, record_document
+from pipeline.cli.measurement import add_source_arguments, build_measurement_folder
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 from scene.common.errors import InputError
 
@@ -19,6 +19,7 @@ EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "measurement",
         nargs="+",
@@ -54,7 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Diagnose a measurement, or with --identifiability only its geometry."""
     from pipeline.formats.files.atomic import check_place, new_folder
 
     out = arguments.out or new_folder(Path("runs"), "gap")
@@ -73,10 +75,10 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
             "cameras; or name the folder of a measurement"
         )
         raise InputError("is a raw file, without what it is to be compared with", where=str(given[0]), remedy=remedy)
-    return built(arguments, given, out / "measurement").folder
+    return build_measurement_folder(arguments, given, out / "measurement").folder
 
 
-def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
+def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     from pipeline.formats.measurements.measurement import read_measurement
     from pipeline.gap.decisions import read_decisions
     from pipeline.gap.naming.workflow import STEPS, diagnose
@@ -97,10 +99,10 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
         measurement = read_measurement(_measurement_folder(arguments, out))
         found = diagnose(measurement, arguments.seed, begin_next, decisions)
         report = write(out, found, measurement)
-    return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "gap.json"))
+    return CommandOutput(f"{summary(found)}\nreport: {report}", record_document(report, "gap.json"))
 
 
-def _identifiability(arguments: argparse.Namespace, out: Path) -> Answer:
+def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     from pipeline.gap.report.identifiability_report import in_words, write_identifiability
     from pipeline.gap.survey.identifiability import identifiability, table
     from pipeline.gap.survey.surveys import surveys
@@ -111,4 +113,4 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> Answer:
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
     told = "\n\n".join(f"{in_words(each)}\n{table(each)}" for each in found)
-    return Answer(f"{told}\nreport: {report}", recorded(report, "identifiability.json"))
+    return CommandOutput(f"{told}\nreport: {report}", record_document(report, "identifiability.json"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
 
@@ -20,6 +20,7 @@ MOST_OFFSET_M = 100.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "source", type=Path, metavar="RUN|CONFIG", help="folder of a run, or a config file or bundled site to simulate"
     )
@@ -45,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Run the study and write the report."""
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
     from pipeline.formats.files.atomic import empty_folder, new_folder
@@ -68,4 +70,4 @@ def run(arguments: argparse.Namespace) -> Answer:
         settings = {"offset_m": arguments.offset_m, "repeats": arguments.repeats}
         found = study(sensor, surfaces, config.icp or IcpConfig(), KeyedRandom(config.seed), **settings, progress=progress)
     report = write_icp_study(out, found)
-    return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "icp_study.json"))
+    return CommandOutput(f"{summary(found)}\nreport: {report}", record_document(report, "icp_study.json"))

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options
 from scene.common.errors import InputError
 
@@ -19,6 +19,7 @@ EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_sit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument("--site", metavar="NAME", help="start from a bundled site, such as glendale (default: the demo)")
     words = "with the wall of this mesh file, or of several that make up the scene, in survey coordinates"
     parser.add_argument("--mesh", type=Path, metavar="FILE", nargs="+", help=words)
@@ -31,14 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Write the config and its JSON schema."""
     out = arguments.out
     if arguments.dataset and (arguments.site or arguments.scanner or arguments.mesh or arguments.cameras):
         raise InputError("stands beside --site or --scanner", where="--dataset", remedy="a data set's walls name their sites")
     kind = "dataset" if arguments.dataset else "simulation"
-    meshes = [_beside(out, path) for path in arguments.mesh or ()]
-    cameras = _beside(out, arguments.cameras) if arguments.cameras else ""
-    made = _dataset(arguments.dataset) if arguments.dataset else ""
+    meshes = [_relative_to_config(out, path) for path in arguments.mesh or ()]
+    cameras = _relative_to_config(out, arguments.cameras) if arguments.cameras else ""
+    made = _data_set_text(arguments.dataset) if arguments.dataset else ""
     text = made or simulation_text(arguments.site, arguments.scanner, meshes, cameras)
     from pipeline.cli.json_schema import schema_line, schema_name, schema_text
     from pipeline.formats.files.atomic import write_text
@@ -54,10 +56,10 @@ def run(arguments: argparse.Namespace) -> Answer:
     write_text(schema, schema_text(kind))
     command = f"scarpsim dataset {out} --out my_set" if arguments.dataset else f"simulate --sensor tls --config {out}"
     told = f"wrote {out} and, for editors, {schema}; run it with: {command}"
-    return Answer(told, lambda: {"file": str(out), "schema": str(schema), "command": command})
+    return CommandOutput(told, lambda: {"file": str(out), "schema": str(schema), "command": command})
 
 
-def _beside(out: Path, path: Path) -> str:
+def _relative_to_config(out: Path, path: Path) -> str:
     """The path of an input as the config in `out` names it: relative to its folder. Raises InputError where there is none."""
     if not path.exists():
         raise InputError("there is no such file", where=str(path), remedy="check the path")
@@ -81,7 +83,7 @@ def simulation_text(site: str | None, scanner: str | None, meshes: Sequence[str]
     return commented_yaml(parse(SimulationConfig, values, str(source)), values)
 
 
-def _dataset(name: str) -> str:
+def _data_set_text(name: str) -> str:
     from pipeline.config.bundled import bundled_config
 
     return bundled_config("datasets", name).read_text(encoding="utf-8")

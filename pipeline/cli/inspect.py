@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "map what a planned set-up promises: precision, spacing, blind spots, smallest block"
@@ -14,6 +14,7 @@ EXAMPLE = """  scarpsim inspect my_site.yaml
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "config",
         type=Path,
@@ -31,7 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Compute the maps of the set-up and write the report."""
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
     from pipeline.formats.files.atomic import empty_folder, new_folder
@@ -47,4 +49,6 @@ def run(arguments: argparse.Namespace) -> Answer:
         plans = inspect(config, sensors, progress)
         with progress.stage("report"):
             report = write_plans(out, config, plans)
-    return Answer("\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]), recorded(report, PLAN_FILE))
+    return CommandOutput(
+        "\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]), record_document(report, PLAN_FILE)
+    )

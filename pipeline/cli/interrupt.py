@@ -14,7 +14,7 @@ INTERRUPTED = 130
 
 
 @contextmanager
-def second_interrupt_ends(kept: Callable[[], str]) -> Iterator[None]:
+def exit_on_second_interrupt(kept: Callable[[], str]) -> Iterator[None]:
     """In the block a second SIGINT ends the process with 130 and the words of `kept`.
 
     Python hears signals between two of its own instructions only, so that native code that waits for memory or for a thread which

@@ -22,10 +22,10 @@ KINDS: dict[str, type[BaseModel]] = {
     "model": RootModel[SensorModel],
     "measurement": MeasurementConfig,
 }
-"""What a file of each kind holds once it is read; `_written` adds the short forms that a file may have."""
+"""What a file of each kind holds once it is read; `_with_short_forms` adds the short forms that a file may have."""
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _NUMBER, _NAME = {"type": "number"}, {"type": "string"}
-_NUMBERS_ALONE = ("DrawnParameter", "Constant")
+_NUMBER_ALLOWED = ("DrawnParameter", "Constant")
 """Sections for which a plain number may stand."""
 
 
@@ -34,7 +34,7 @@ def json_schema(kind: str) -> dict[str, Any]:
     if kind not in KINDS:
         raise InputError(f"there is no schema '{kind}'", allowed=", ".join(KINDS), remedy=nearest(kind, KINDS))
     found = KINDS[kind].model_json_schema()
-    return {"$schema": _DRAFT, **_written(found), "title": f"scarpsim: {kind}"}
+    return {"$schema": _DRAFT, **_with_short_forms(found), "title": f"scarpsim: {kind}"}
 
 
 def schema_text(kind: str) -> str:
@@ -52,10 +52,10 @@ def schema_line(kind: str) -> str:
     return f"# yaml-language-server: $schema={schema_name(kind)}\n"
 
 
-def _written(schema: dict[str, Any]) -> dict[str, Any]:
+def _with_short_forms(schema: dict[str, Any]) -> dict[str, Any]:
     """The schema with the short forms that the reading of a file resolves: names of presets, models and sites, plain numbers."""
     known = schema.get("$defs", {})
-    for name in _NUMBERS_ALONE:
+    for name in _NUMBER_ALLOWED:
         if name in known:
             known[name] = {"anyOf": [known[name], _NUMBER]}
     simulations = [part for part in (schema, known.get("SimulationConfig")) if part and "rockfall" in part.get("properties", {})]

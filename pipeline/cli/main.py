@@ -38,13 +38,13 @@ from pipeline.cli import (
     view,
 )
 from pipeline.cli import simulate as simulate_command
-from pipeline.cli.answer import Answer, as_json
-from pipeline.cli.interrupt import INTERRUPTED, second_interrupt_ends
+from pipeline.cli.command_output import CommandOutput, as_json
+from pipeline.cli.interrupt import INTERRUPTED, exit_on_second_interrupt
 from pipeline.cli.parser import Parser
 from scene.common.errors import InputError, OutsideError, nearest, one_line
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
-_BAD_PLACES = {
+_REMEDIES = {
     errno.ENOSPC: "make room, or choose another folder with --out",
     errno.EDQUOT: "make room, or choose another folder with --out",
     errno.EACCES: "check the permissions, or choose another folder with --out",
@@ -64,7 +64,7 @@ class Command(Protocol):
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
 
-    def run(self, arguments: argparse.Namespace) -> Answer:
+    def run(self, arguments: argparse.Namespace) -> CommandOutput:
         """Carry the command out. It may set `arguments.kept`, what an interrupt leaves usable."""
         ...
 
@@ -97,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     name = words[0] if words else ""
     if name in COMMANDS:
-        return _carry_out(f"scarpsim {name}", COMMANDS[name], words[1:])
+        return _run_command(f"scarpsim {name}", COMMANDS[name], words[1:])
     if name in ("-h", "--help", ""):
         print(_overview())
         return DONE if name else WRONG_INPUT
@@ -105,12 +105,12 @@ def main(argv: list[str] | None = None) -> int:
         print(f"scarpsim {metadata.version('scarpsim')}")
         return DONE
     hint = nearest(name, [*COMMANDS, "--help", "--version"]) or f"allowed: {', '.join(COMMANDS)}"
-    return _complain(f"scarpsim: there is no command '{name}'; {hint}", WRONG_INPUT)
+    return _print_error(f"scarpsim: there is no command '{name}'; {hint}", WRONG_INPUT)
 
 
 def simulate(argv: list[str] | None = None) -> int:
     """`simulate ...`, the same as `scarpsim simulate ...`."""
-    return _carry_out("simulate", simulate_command, sys.argv[1:] if argv is None else argv)
+    return _run_command("simulate", simulate_command, sys.argv[1:] if argv is None else argv)
 
 
 def _overview() -> str:
@@ -139,17 +139,17 @@ def command_parser(prog: str, command: Command) -> Parser:
     return parser
 
 
-def _carry_out(prog: str, command: Command, words: list[str]) -> int:
+def _run_command(prog: str, command: Command, words: list[str]) -> int:
     """Run one command and print its answer; with --json one document on stdout, of an error too, and all else on stderr."""
     arguments = argparse.Namespace(debug="--debug" in words, kept="")
-    _take_any_character()
+    _escape_unprintable_characters()
     as_document = "--json" in words
     try:
         parser = command_parser(prog, command)
         arguments = parser.parse(words)
         _check_current_folder()
         as_document = getattr(arguments, "json", False)
-        ended = second_interrupt_ends(lambda: arguments.kept or "nothing is kept")
+        ended = exit_on_second_interrupt(lambda: arguments.kept or "nothing is kept")
         with redirect_stdout(sys.stderr) if as_document else nullcontext(), ended:
             answer = command.run(arguments)
             text = as_json(answer.document()) if as_document else answer.text
@@ -161,10 +161,10 @@ def _carry_out(prog: str, command: Command, words: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
-        message, code = _explained(error, arguments)
+        message, code = _message_and_exit_code(error, arguments)
         if as_document:
             print(as_json({"error": message, "exit_status": code}))
-        return _complain(message, code)
+        return _print_error(message, code)
 
 
 def _check_current_folder() -> None:
@@ -175,14 +175,14 @@ def _check_current_folder() -> None:
         raise InputError("the current folder is not there any more", remedy="cd to one that is") from None
 
 
-def _take_any_character() -> None:
+def _escape_unprintable_characters() -> None:
     """Print what stdout's encoding lacks, or is no character, as an escape: a file's name can hold any bytes."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str, int]:
+def _message_and_exit_code(error: BaseException, arguments: argparse.Namespace) -> tuple[str, int]:
     """The message and the exit code of an error; the only place where errors become exit codes."""
     if isinstance(error, InputError):
         return str(error), WRONG_INPUT
@@ -193,9 +193,9 @@ def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str
         return f"interrupted; {kept}" if kept else "interrupted", INTERRUPTED
     if isinstance(error, ImportError):
         return f"a library does not load ({error}); `scarpsim doctor` says what is missing", FAILED
-    if isinstance(error, OSError) and error.errno in _BAD_PLACES:
+    if isinstance(error, OSError) and error.errno in _REMEDIES:
         where = one_line(str(error.filename or "output"))
-        return f"{where}: {error.strerror}; {_BAD_PLACES[error.errno]}", WRONG_INPUT
+        return f"{where}: {error.strerror}; {_REMEDIES[error.errno]}", WRONG_INPUT
     if (
         isinstance(error, MemoryError) or type(error).__name__ == "ResourceExhaustedError"
     ):  # TensorFlow's, which is not loaded here
@@ -204,7 +204,7 @@ def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str
     return _unexpected(error, show=arguments.debug), FAILED
 
 
-def _complain(message: str, code: int) -> int:
+def _print_error(message: str, code: int) -> int:
     with suppress(OSError):  # nobody reads it, or no room is left
         print(f"error: {message}", file=sys.stderr, flush=True)
     return code

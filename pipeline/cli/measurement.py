@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
 from scene.common.lengths import METRES
@@ -26,6 +26,7 @@ EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner rieg
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "scans", nargs="+", type=Path, metavar="SCAN", help="raw scan: las, laz, e57, ply, ptx, pts, xyz, csv; several: epochs"
     )
@@ -45,7 +46,7 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
     parser.add_argument(
         "--position",
-        type=numbers(3),
+        type=comma_separated_numbers(3),
         metavar="X,Y,Z",
         help="where the scanner stood, m, in the points' frame, if no header says; with --photographs any place before the wall",
     )
@@ -59,7 +60,11 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         "--reference-unit", type=one_of(*METRES), metavar="|".join(METRES), help="of the reference (default: as for --unit)"
     )
     parser.add_argument(
-        "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
+        "--columns",
+        type=comma_separated_words,
+        default=[],
+        metavar="x,y,z,...",
+        help="of a text file; - for one that is left out",
     )
     parser.add_argument(
         "--cameras",
@@ -76,12 +81,13 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scan", type=at_least(1), metavar="N", help="take one scan of a file that holds several")
 
 
-def run(arguments: argparse.Namespace) -> Answer:
-    found = built(arguments, arguments.scans, arguments.out)
-    return Answer(f"{found.summary()}\npicture: {found.folder / 'understood.png'}", found.to_dict)
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Build the measurement folder and say how the inputs were interpreted."""
+    found = build_measurement_folder(arguments, arguments.scans, arguments.out)
+    return CommandOutput(f"{found.summary()}\npicture: {found.folder / 'understood.png'}", found.to_dict)
 
 
-def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Interpretation:
+def build_measurement_folder(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Interpretation:
     """Build the folder that the arguments ask for."""
     from pipeline.formats.files.atomic import empty_folder
     from pipeline.measurement.build import build, build_stereo
@@ -115,7 +121,7 @@ def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
     )
 
 
-def words(text: str) -> list[str]:
+def comma_separated_words(text: str) -> list[str]:
     """An argument's type: words between commas."""
     return [word.strip().lower() for word in text.split(",")]
 
@@ -128,7 +134,7 @@ def pair(text: str) -> tuple[str, str]:
     return labels[0], labels[1]
 
 
-def numbers(count: int) -> Callable[[str], Any]:
+def comma_separated_numbers(count: int) -> Callable[[str], Any]:
     """An argument's type: so many coordinates between commas."""
 
     def check(text: str) -> tuple[float, ...]:

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.cli.answer import Answer, recorded
-from pipeline.cli.measurement import numbers, words
+from pipeline.cli.command_output import CommandOutput, record_document
+from pipeline.cli.measurement import comma_separated_numbers, comma_separated_words
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 from scene.common.errors import InputError
 from scene.common.lengths import METRES
@@ -22,6 +22,7 @@ EXAMPLE = """  scarpsim monitor march.laz april.laz --out april
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "epochs",
         nargs="+",
@@ -33,18 +34,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=Path, metavar="FILE", help="compare with this instead of the first epoch")
     parser.add_argument(
         "--position",
-        type=numbers(3),
+        type=comma_separated_numbers(3),
         metavar="X,Y,Z",
         help="where the sensor stood, or any place before the wall, in the points' coordinates, m, if no header says",
     )
     parser.add_argument(
-        "--direction", type=numbers(3), metavar="X,Y,Z", help="measure change along it, towards the sensor (default: mean plane)"
+        "--direction",
+        type=comma_separated_numbers(3),
+        metavar="X,Y,Z",
+        help="measure change along it, towards the sensor (default: mean plane)",
     )
     parser.add_argument("--scanner", metavar="PRESET", help="say what level of detection this scanner promises, too")
     parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
     parser.add_argument("--photographs", action="store_true", help="the epochs are from photographs")
     parser.add_argument("--stable", type=Path, metavar="FILE", help="stable rock: YAML list of boxes or polygons, wall frame, m")
-    parser.add_argument("--times", type=words, default=[], metavar="T,T,...", help="time of each epoch, ISO 8601")
+    parser.add_argument("--times", type=comma_separated_words, default=[], metavar="T,T,...", help="time of each epoch, ISO 8601")
     parser.add_argument(
         "--gsd", type=between(1e-4, 100.0), metavar="M", help="side of a pixel, m (default: by the points' density)"
     )
@@ -52,7 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--unit", type=one_of(*METRES), metavar="|".join(METRES), help="of the epochs (default: as the files state, else m)"
     )
     parser.add_argument(
-        "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
+        "--columns",
+        type=comma_separated_words,
+        default=[],
+        metavar="x,y,z,...",
+        help="of a text file; - for one that is left out",
     )
     parser.add_argument(
         "--detector",
@@ -67,7 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Compare the epochs and write maps, events and report."""
     from pipeline.monitor.follow import follow
     from pipeline.monitor.report import headline
     from pipeline.monitor.run import monitor_paths
@@ -87,7 +96,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         write_site(result, arguments.write_site)
         lines.append(f"a config of this site: {arguments.write_site}")
     report = arguments.out / "report.html"
-    return Answer("\n".join([*lines, f"report: {report}"]), recorded(report, "monitor.json"))
+    return CommandOutput("\n".join([*lines, f"report: {report}"]), record_document(report, "monitor.json"))
 
 
 def _options(arguments: argparse.Namespace) -> MonitorOptions:

@@ -6,18 +6,19 @@ import argparse
 import os
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
 
 SUMMARY = "observe a rock wall before and after rocks fall, and map the differences"
 EXAMPLE = """  simulate --sensor tls
   simulate --sensor stereo --config my_site.yaml --seed 7 --set rockfall.count=200 --out runs/my_site"""
-_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """The variables by which the numerical libraries learn how many threads they may use."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "--sensor", required=True, type=one_of("stereo", "tls"), metavar="stereo|tls", help="what observes the wall"
     )
@@ -36,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Run or resume the simulation and write the report."""
     if arguments.resume and not arguments.out:
         raise InputError("needs the folder to go on with", where="--resume", remedy="add --out DIR")
     if arguments.threads:
@@ -53,11 +55,11 @@ def run(arguments: argparse.Namespace) -> Answer:
     arguments.kept = f"what was finished is in {out} and usable; go on with --resume --out {out}"
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = pipeline_run.simulate(config, arguments.sensor, out, resume=arguments.resume, progress=progress)
-    return Answer(f"report: {summary.report}", recorded(summary.report, "run.json"))
+    return CommandOutput(f"report: {summary.report}", record_document(summary.report, "run.json"))
 
 
 def _use_threads(count: int) -> None:
-    for variable in _POOLS:  # read when the libraries are loaded, so before the imports
+    for variable in _THREAD_VARIABLES:  # read when the libraries are loaded, so before the imports
         os.environ[variable] = str(count)
     import cv2
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, between, one_of
 from scene.common.errors import InputError
 from scene.common.lengths import METRES
@@ -16,6 +16,7 @@ EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="points: .laz .las .ply .e57 .xyz")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the mesh, .ply, in the points' coordinates, m")
     parser.add_argument(
@@ -51,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Mesh the point cloud and write the PLY file."""
     out = arguments.out
     if out.suffix.lower() != ".ply":
         raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply")
@@ -72,4 +74,4 @@ def run(arguments: argparse.Namespace) -> Answer:
     told = f"{counts['points']:,} points, {counts['triangles']:,} triangles: {out}; a config of it: scarpsim init --mesh {out}"
     notes = [*(f"{arguments.cloud.name}: {note}" for note in cloud.notes), *surface.notes]
     told = "\n".join([*(f"note: {note}" for note in notes), told])
-    return Answer(told, lambda: {"file": str(out), **counts, "notes": notes})
+    return CommandOutput(told, lambda: {"file": str(out), **counts, "notes": notes})

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, at_least
 from scene.common.errors import InputError
 
@@ -16,6 +16,7 @@ EXAMPLE = """  scarpsim train my_dataset --out my_detector
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "data_set", type=Path, metavar="DATASET", help="folder with train/ and val/, as scarpsim dataset makes it"
     )
@@ -33,7 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Train the detector or continue its training."""
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detection.inference.weights import check_detector
     from pipeline.detection.network.config import load_train_config
@@ -64,7 +66,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     count = len(history.total)
     told = f"{count} epoch{'s' if count > 1 else ''}, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
     document = {"folder": str(arguments.out), "model": str(model), "epochs": count}
-    return Answer(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})
+    return CommandOutput(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})
 
 
 def _check_training(out: Path) -> None:

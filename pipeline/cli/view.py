@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import at_least
 
 SUMMARY = "look at results in 3D: wall, differences, blocks, detections, residuals"
@@ -17,6 +17,7 @@ _PORT = 8050
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "folder", type=Path, metavar="FOLDER", help="a run, a result of scarpsim gap or monitor, or a split of a data set"
     )
@@ -30,8 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-browser", action="store_true", help="only say the address, open no browser")
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Serve the page until it is closed."""
     from pipeline.view.server import serve
 
     serve(arguments.folder, arguments.second, arguments.detections, arguments.port, open_browser=not arguments.no_browser)
-    return Answer("the page is closed")
+    return CommandOutput("the page is closed")

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli import main as cli
-from pipeline.cli.answer import as_json
+from pipeline.cli.command_output import as_json
 from pipeline.cli.json_schema import json_schema
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import CamerasFile, load_config

@@ -66,7 +66,7 @@ def test_a_probe_that_fails_is_a_finding() -> None:
     def explode() -> None:
         raise ZeroDivisionError("by nought")
 
-    (finding,) = doctor._guarded(explode)
+    (finding,) = doctor._run_probe(explode)
     assert (finding.name, finding.ok, finding.found) == ("explode", False, "ZeroDivisionError: by nought")
 
 
