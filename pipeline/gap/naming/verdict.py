@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.gap.decisions import decided
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.thresholds import thresholds
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 VERDICTS = {
@@ -27,7 +27,7 @@ _NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px",
 STILL_OPEN = (
     "Effects were named, but most of the gap stays open: the model is rejected with them too, and nothing else explains it."
 )
-STILL_WIDE = (
+STILL_OVERDISPERSED = (
     "Effects were named, but with them too the residuals spread far more than the model predicts, and nothing explains that."
 )
 STILL_REJECTED = (
@@ -62,17 +62,17 @@ class Evidence:
     @property
     def much_moved(self) -> bool:
         """Whether too much of the wall is not where the reference has it for anything to be said of the sensor."""
-        return self.moved >= decided().changes.moved_share
+        return self.moved >= thresholds().changes.moved_share
 
     @property
     def rejects(self) -> bool:
         """Whether what remains is more than chance would give."""
-        return self.p_value is not None and self.p_value <= decided().verdict.least_p
+        return self.p_value is not None and self.p_value <= thresholds().verdict.rejection_p
 
     @property
     def too_wide(self) -> bool:
         """Whether the residuals spread so much more than predicted that the model is rejected, whatever else says."""
-        return self.wide >= decided().verdict.most_wide
+        return self.wide >= thresholds().verdict.overdispersion
 
     @property
     def agrees(self) -> bool:
@@ -104,18 +104,18 @@ class Evidence:
     def closes_little(self) -> bool:
         """Whether the gap with the named effects is most of what it was, by more than its uncertainty, or not known at all."""
         gap = self.gap
-        by = decided().verdict
+        by = thresholds().verdict
         if gap is None or gap.closed is None:
             return True
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
-    def only_too_noisy(self, named: Sequence[Named]) -> bool:
+    def only_too_noisy(self, named: Sequence[NamedEffect]) -> bool:
         """Whether the model's noise is too large and nothing else was found to be wrong: with a lower one the floor is met."""
         open_still = self.gap is not None and self.gap.left_open and not self.agrees
         return self.spread < 1.0 and not (named or self.rejects or self.far or self.too_wide or open_still)
 
 
-def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
+def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
     """What the effects that were named, and the numbers, come to."""
     if evidence.much_moved:
         return "insufficient_data"
@@ -131,7 +131,7 @@ def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
     return "ambiguous" if named[0].alike else "named"
 
 
-def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> str:
+def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evidence) -> str:
     """A verdict in words."""
     if evidence.much_moved:
         return MUCH_MOVED
@@ -147,18 +147,18 @@ def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> s
             return STILL_OPEN
         if evidence.supports_nothing:
             return UNSUPPORTED
-        return STILL_REJECTED if evidence.stays_rejected else STILL_WIDE
+        return STILL_REJECTED if evidence.stays_rejected else STILL_OVERDISPERSED
     return VERDICTS[verdict]
 
 
-def left_over(named: Sequence[Named], evidence: Evidence) -> str:
+def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
     """Words for what is left beside what was named, "" where that may be chance."""
     if not named or not evidence.rejects:
         return ""
     return f"That does not explain all of it: what remains has a p-value of {evidence.p_value:.2g}."
 
 
-def closing(gap: Gap, mended: bool) -> str:
+def describe_closing(gap: Gap, mended: bool) -> str:
     """How far the gap closes, in words. mended: whether the model after is another one than before."""
     if gap.closed is None:
         return "before and floor differ by no more than their uncertainty"
@@ -168,7 +168,7 @@ def closing(gap: Gap, mended: bool) -> str:
     return f"{share} % of the gap is closed" if share > 0 else "none of the gap is closed"
 
 
-def lower_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float]:
+def reduced_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float]:
     """The noise that a model would need for the residuals' spread, all of it lowered alike; empty where it fits.
 
     spread: share of the model's own standard deviation.
@@ -179,28 +179,28 @@ def lower_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float
     return {key: float(f"{spread * value:.3g}") for key, value in values.items() if value > 0}
 
 
-def much_moved(evidence: Evidence, stable_areas: bool) -> list[str]:
+def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
     """Words for a wall much of which moved, with what to do. stable_areas: whether the measurement names some."""
     if not evidence.much_moved:
         return []
-    by = decided().changes
+    by = thresholds().changes
     said = (
         f"{100 * evidence.moved:.0f} % of the points lie off the reference together with their neighbours, by more than "
-        f"{by.moved_sigmas:g} predicted sigmas and {1e3 * by.smallest:g} mm: rock moved, or the reference is of another place or "
-        "time"
+        f"{by.moved_sigmas:g} predicted sigmas and {1e3 * by.smallest_departure:g} mm: rock moved, or the reference "
+        "is of another place or time"
     )
     remedy = "the stable_areas that were given are not stable" if stable_areas else "name stable_areas where nothing moved"
     return [f"{said}; {remedy}, or bring a reference of the same time"]
 
 
-def unexplained(evidence: Evidence, notes: Sequence[str]) -> list[str]:
+def note_overdispersion(evidence: Evidence, notes: Sequence[str]) -> list[str]:
     """Words for residuals that spread more than predicted, where no note says more of that already."""
     if not evidence.too_wide or any("the residuals spread" in note for note in notes):
         return []
     return [f"the residuals spread {evidence.wide:.2g} times what the model predicts, and nothing that was tried explains that"]
 
 
-def too_noisy(spread: float, lower: dict[str, float]) -> list[str]:
+def note_excess_noise(spread: float, lower: dict[str, float]) -> list[str]:
     """Words for a model that predicts more spread than there is."""
     if spread >= 1.0:
         return []

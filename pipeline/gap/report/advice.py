@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.named_effects import NamedEffect
 from sensors.effects.base import Stage
 
 _ROOT = Path(__file__).parents[3]
@@ -19,24 +19,24 @@ class Advice:
     act: str
 
 
-_OF_A_SHAPE = Advice(
+_ABOUT_A_SURFACE_TERM = Advice(
     "The cloud has another shape than the reference. The term says where and by how much; without cameras nothing can be said of "
     "the cause.",
     "Give the cameras (--cameras): then their effects are tried by name. A bowl or a dome over the whole wall is what a block of "
     "parallel views that calibrates itself leaves behind (lens distortion); a tilt or a step along the wall is rather a "
     "weak end of the block or a seam. Oblique views, control points or a calibration of the camera tell.",
 )
-_OF_A_SPREAD = Advice(
+_ABOUT_POINT_NOISE = Advice(
     "The points scatter more than the model says.",
     "Simulate and plan with the value found. The maps and profiles show where they scatter most: steep parts, edges or smooth "
     "rock without texture.",
 )
 
 
-def advice(named: Named) -> Advice:
+def advice_on(named: NamedEffect) -> Advice:
     """Of an effect what its class says; of one that says nothing its docstring; of an empirical term general words."""
     if named.effect.stage == Stage.POINT:
-        return _OF_A_SPREAD if named.spreads else _OF_A_SHAPE
+        return _ABOUT_POINT_NOISE if named.spreads else _ABOUT_A_SURFACE_TERM
     if named.kind == "empirical":
         return Advice(
             "Something that the catalogue does not hold: the term describes its pattern and says nothing of its cause. From one "

@@ -13,10 +13,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.gap_score import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.report.covariate_ranking import bins, standardised, steady
-from pipeline.gap.report.in_words import with_unit
+from pipeline.gap.report.covariate_ranking import inliers, quantile_bins, standardised_by_covariate
+from pipeline.gap.report.wording import covariate_with_unit
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, sigma_of
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.report.figures import COLOURS, label_map_axes
@@ -33,32 +33,32 @@ _MOST_NMAD = 6.0
 """Of a map's values, beyond which those that are more have no say in its colours."""
 _PLATE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 _COLUMNS = 3
-_CROWDED = ("edge_step",)
+_LOGARITHMIC = ("edge_step",)
 """Covariates of which most values lie near zero, the rest over decades."""
 _MOST_PIXELS = 400
 """Of a map, each way, of points however narrow a strip they fill."""
-_MANY = 300.0
+_MANY_DECADES = 300.0
 """Span of a logarithmic axis from which on it has a number per decade, else two."""
 
 
 def maps_figure(found: GapDiagnosis) -> bytes:
     """Residuals before and after on one scale: means of small pixels, and their spread over what each model predicts."""
-    unit, pixels = 1e3 * found.residuals.depth_m, _Pixels(found)
+    unit, pixels = 1e3 * found.residuals.depth_m, _PixelGrid(found)
     left, right, low, high = pixels.extent
     figure = Figure(figsize=(11.5, float(np.clip(10.0 * (high - low) / (right - left), 4.0, 12.0)) + 2.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
     means = [pixels.mean(values * unit) for values in (found.before, found.after)]
-    limit = _limit(means[0])
+    limit = _colour_limit(means[0])
     sigmas = found.residuals.sigma, sigma_after(found)
     spreads = [pixels.spread(values / sigma) for values, sigma in zip((found.before, found.after), sigmas, strict=True)]
     for panel, values, title in zip(panels[0], means, ("before", "after"), strict=True):
         image = panel.imshow(values, cmap=COLOURS, vmin=-limit, vmax=limit, extent=pixels.extent, origin="lower")
         panel.set_title(f"mean residual, {title}", fontsize=10)
-    _bar(figure, image, panels[0], DEPTH_LABEL)
+    _colour_bar(figure, image, panels[0], DEPTH_LABEL)
     for panel, values, title in zip(panels[1], spreads, ("before", "after"), strict=True):
         image = panel.imshow(values, cmap="PuOr_r", vmin=0.4, vmax=1.6, extent=pixels.extent, origin="lower")
         panel.set_title(f"spread over the predicted one, {title}", fontsize=10)
-    _bar(figure, image, panels[1], "1: as predicted")
+    _colour_bar(figure, image, panels[1], "1: as predicted")
     for panel in panels.ravel():
         panel.set_facecolor("0.85")
         panel.set_anchor("N")  # in the middle of its place the title of a low map may end above the figure
@@ -70,7 +70,7 @@ def maps_figure(found: GapDiagnosis) -> bytes:
     return png(figure)
 
 
-def _limit(means: FloatArray) -> float:
+def _colour_limit(means: FloatArray) -> float:
     """Where the colours of a map end: at the 98 % quantile of its values, or sooner where some lie far beyond all others."""
     known = np.abs(means[np.isfinite(means)])
     usual = _MOST_NMAD * nmad(known, 0.0) if known.size else 0.0
@@ -78,7 +78,7 @@ def _limit(means: FloatArray) -> float:
     return (min(top, usual) if usual > 0 else top) or 1.0
 
 
-def _bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: str) -> None:
+def _colour_bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: str) -> None:
     """A colour bar beneath a row of maps, where the label has room however low the maps are."""
     figure.colorbar(image, ax=panels, label=label, extend="both", location="bottom", shrink=0.6, aspect=45)
 
@@ -97,13 +97,13 @@ def sigma_after(found: GapDiagnosis) -> FloatArray:
 
 def profiles_figure(found: GapDiagnosis) -> bytes:
     """Means and spreads against each covariate, with two standard errors, and what the named effects explain on top."""
-    names = [name for name, _, _ in standardised(found)]
+    names = [name for name, _, _ in standardised_by_covariate(found)]
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
     figure = Figure(figsize=(11.5, 4.0 * rows))
     panels = np.atleast_2d(figure.subplots(2 * rows, _COLUMNS, height_ratios=[1.4, 1.0] * rows))
     # margins of so many inches: all panels are alike, and a layout that is worked out takes as long as the drawing
     figure.subplots_adjust(0.055, 0.3 / (4.0 * rows), 0.99, 1 - 0.3 / (4.0 * rows), wspace=0.22, hspace=0.33)
-    kept = steady(found)
+    kept = inliers(found)
     unit = 1e3 * found.residuals.depth_m[kept]
     before, after = found.before[kept] * unit, found.after[kept] * unit
     predicted = found.residuals.sigma[kept] * np.abs(unit), sigma_after(found)[kept] * np.abs(unit)
@@ -111,7 +111,7 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
         row, column = divmod(number, _COLUMNS)
         upper, lower = panels[2 * row, column], panels[2 * row + 1, column]
         x = found.residuals.covariates[name][kept]
-        edges, group = bins(x, _BINS)
+        edges, group = quantile_bins(x, _BINS)
         if len(edges) < 3:
             upper.set_visible(False)
             lower.set_visible(False)
@@ -125,12 +125,12 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
         for sigma, colour in zip(predicted, (_BEFORE, _AFTER), strict=True):
             lower.plot(middle, np.sqrt(_means(group, sigma**2, len(middle))), color=colour, linestyle="--", linewidth=1.0)
         upper.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
-        upper.set_title(with_unit(name, found.residuals.sensor), fontsize=9)
+        upper.set_title(covariate_with_unit(name, found.residuals.sensor), fontsize=9)
         upper.set_ylabel("mean depth, mm", fontsize=8)
         lower.set_ylabel("spread, mm", fontsize=8)
         for panel in (upper, lower):
             panel.tick_params(labelsize=7)
-            if name in _CROWDED:
+            if name in _LOGARITHMIC:
                 _log_axis(panel)
         if number == 0:
             upper.legend(fontsize=7)
@@ -144,7 +144,7 @@ def _log_axis(panel: Axes) -> None:
     """Few and plain numbers along x."""
     panel.set_xscale("log")
     low, high = panel.get_xlim()
-    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < _MANY * low else (1.0,)))
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < _MANY_DECADES * low else (1.0,)))
     panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
     panel.xaxis.set_minor_formatter(NullFormatter())
 
@@ -196,7 +196,7 @@ def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -
     return png(figure)
 
 
-class _Pixels:
+class _PixelGrid:
     """Square pixels over the smooth points, with some points in each."""
 
     def __init__(self, found: GapDiagnosis) -> None:

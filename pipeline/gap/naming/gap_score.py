@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_simulation import simulate_disparities
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals
@@ -26,13 +25,14 @@ from pipeline.gap.residuals.several_scans import simulate_departures
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, simulated_distances
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 MEASURE = "mean continuous ranked probability score of patches (mean and spread of their residuals) against simulated ones"
 LOSS_MEASURE = "mean Brier score of pulses (lost or not) against the chance of losing them"
-_DRAWS = 8
+_ENSEMBLE_SIZE = 8
 _MOST_POINTS = 30_000
 _POINTS_PER_PATCH = 30.0
 _FEWEST_POINTS = 8
@@ -69,17 +69,17 @@ class Gap:
     @property
     def above_floor(self) -> bool:
         """Whether before lies above the floor by more than the uncertainty of that."""
-        return self.before - self.floor > decided().verdict.floor_sigmas * self.floor_error
+        return self.before - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property
     def left_open(self) -> bool:
         """Whether after lies above the floor by more than the uncertainty of that."""
-        return self.after - self.floor > decided().verdict.floor_sigmas * self.floor_error
+        return self.after - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property
     def uncertain(self) -> bool:
         """Whether before - floor is within its own uncertainty, and before - after, scored on the same patches, within its."""
-        return not self.above_floor and self.before - self.after <= decided().verdict.gap_sigmas * self.error
+        return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
 
     def to_dict(self) -> dict[str, Any]:
         """As gap.json holds it."""
@@ -99,14 +99,14 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Version:
+class RegisteredModel:
     """A model with its registration (6,), by which the sensor stands shifted (m) and turned (rad) against the survey."""
 
     model: TlsModel | StereoModel
     pose: FloatArray
 
 
-def simulated(
+def simulate_errors(
     measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
     """(d, n) simulated minus geometric observable of the residuals' points, NaN without a return, for each source of random
@@ -126,8 +126,8 @@ def simulated(
 
 def measure_gap(
     measurement: Measurement,
-    before: Version,
-    after: Version,
+    before: RegisteredModel,
+    after: RegisteredModel,
     residuals: Residuals,
     reference_sigma: float,
     largest: float,
@@ -139,15 +139,15 @@ def measure_gap(
     largest: predicted sigmas by which a point may lie off one of the versions; those farther off both are left out.
     """
     patch = patches(residuals.at, _POINTS_PER_PATCH)
-    versions = [_draws(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
-    truth, measured = _draws(measurement, after, residuals, random.child("floor")), residuals.observed
+    versions = [_draw_ensemble(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
+    truth, measured = _draw_ensemble(measurement, after, residuals, random.child("floor")), residuals.observed
     usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
     middles, sigma = [np.median(draws, axis=0) for draws in versions], residuals.sigma
     off = np.min([np.abs(measured - middle) for middle in middles], axis=0)
     usable &= off < largest * sigma
     if not usable.any():
         return None
-    spread = max(largest, decided().points.outlier * nmad((measured - middles[0])[usable] / sigma[usable], 0.0))
+    spread = max(largest, thresholds().points.outlier_sigmas * nmad((measured - middles[0])[usable] / sigma[usable], 0.0))
     low, high = middles[0] - spread * sigma, middles[0] + spread * sigma
     measured, truth, *versions = (np.clip(each, low, high) for each in (measured, truth, *versions))
     usable &= np.isin(patch, np.flatnonzero(np.bincount(patch[usable], minlength=patch.max() + 1) >= _FEWEST_POINTS))
@@ -155,12 +155,14 @@ def measure_gap(
         return None
     _, number = np.unique(patch[usable], return_inverse=True)
     unit = np.bincount(number, residuals.unit_m[usable]) / np.bincount(number)
-    errors = reference_sigma * random.child("reference").generator().standard_normal((3, _DRAWS, len(unit)))
-    value = _summaries(measured[None, usable], number)[:, 0]
-    ensembles = [_summaries(drawn[:, usable], number, errors[0]) for drawn in versions]
-    drawn = _summaries(truth[:, usable], number, errors[1])
-    old, new = (np.sum([_scores(e, v) for e, v in zip(found, value, strict=True)], axis=0) * unit for found in ensembles)
-    floors = [np.sum([_scores(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_DRAWS)]
+    errors = reference_sigma * random.child("reference").generator().standard_normal((3, _ENSEMBLE_SIZE, len(unit)))
+    value = _patch_statistics(measured[None, usable], number)[:, 0]
+    ensembles = [_patch_statistics(drawn[:, usable], number, errors[0]) for drawn in versions]
+    drawn = _patch_statistics(truth[:, usable], number, errors[1])
+    old, new = (np.sum([_crps(e, v) for e, v in zip(found, value, strict=True)], axis=0) * unit for found in ensembles)
+    floors = [
+        np.sum([_crps(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_ENSEMBLE_SIZE)
+    ]
     floor, count = np.mean(floors, axis=0) * unit, len(unit)
     floor = floor + min(float(new.mean() - floor.mean()), 0.0)
     return Gap(
@@ -199,16 +201,16 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
     )
 
 
-def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+def _draw_ensemble(measurement: Measurement, version: RegisteredModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
     stood = measurement.moved(version.pose)
-    draws = simulated(stood, version.model, residuals, [random.child(number) for number in range(_DRAWS)])
+    draws = simulate_errors(stood, version.model, residuals, [random.child(number) for number in range(_ENSEMBLE_SIZE)])
     if isinstance(residuals, TlsResiduals):
-        return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_DRAWS)])
+        return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_ENSEMBLE_SIZE)])
     # a cloud without cameras has no place from which to simulate it: its datum counts by its slopes
     return draws + residuals.pose @ version.pose if isinstance(residuals, SurfaceResiduals) else draws
 
 
-def _summaries(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
+def _patch_statistics(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
     """(2, d, p) mean, with an error (d, p) of the reference, and standard deviation of each of p patches in draws (d, n)."""
     count = np.bincount(patch)
     mean = np.stack([np.bincount(patch, row) for row in draws]) / count
@@ -216,7 +218,7 @@ def _summaries(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | 
     return np.stack([mean if error is None else mean + error, np.sqrt(square / np.maximum(count - 1, 1))])
 
 
-def _scores(draws: FloatArray, value: FloatArray) -> FloatArray:
+def _crps(draws: FloatArray, value: FloatArray) -> FloatArray:
     """(n,) fair ensemble CRPS: mean |x - y| - mean |x - x'| / 2."""
     ordered, count = np.sort(draws, axis=0), len(draws)
     weight = (2 * np.arange(count) - count + 1)[:, None]
@@ -224,6 +226,6 @@ def _scores(draws: FloatArray, value: FloatArray) -> FloatArray:
     return np.asarray(np.abs(draws - value).mean(axis=0) - spread / 2)
 
 
-def thinned(count: int) -> slice:
+def subsampling(count: int) -> slice:
     """Every how-manieth held-out point is simulated."""
     return slice(None, None, max(count // _MOST_POINTS, 1))

@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import Cells, block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn
 
 DRAWS = 1999
-_LEAST_LEFT = 0.3
+_LEAST_REMAINING_VARIANCE = 0.3
 """Share of a point's variance that its cell's plane must leave."""
-_LEAST_OWN, _SHARE_DRAWS = 0.02, 10
+_LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
 """Share of a point's variance that counts as its own where a model says there is none; draws of noise that neighbours share."""
 _BINS = 8
-_CUT = 12.0
+_CLIP_SIGMAS = 12.0
 """Sigmas at which a far residual is cut off."""
-_HIGHEST = 0.999
+_HIGHEST_QUANTILE = 0.999
 """Quantile of a form of the variance beyond which it is held."""
-_ROUNDS = 25
+_FISHER_ROUNDS = 25
 
 
 @dataclass(frozen=True)
-class SpreadCandidate:
+class VarianceCandidate:
     """variance: (n, k) forms that are scaled by theta (k,); parameters: their square roots times `scale`, by name; cost: free
     parameters; fixed: values that tell variants apart."""
 
@@ -55,7 +55,7 @@ class SpreadCandidate:
 
 
 @dataclass(frozen=True)
-class SpreadFound:
+class VarianceTerm:
     """An effect on the spread.
 
     effect: the catalogue's that comes nearest, which carries an empirical one; std: of the parameters by the curvature of the
@@ -72,13 +72,13 @@ class SpreadFound:
     empirical: bool
     variance: FloatArray
 
-    def everywhere(self, count: int) -> SpreadFound:
+    def everywhere(self, count: int) -> VarianceTerm:
         """The same of `count` points: what is no function of the place adds alike to all."""
         return replace(self, variance=np.full(count, float(self.variance.mean())))
 
 
 @dataclass(frozen=True)
-class SpreadTried:
+class VarianceScore:
     """What one form of the spread gains in log-likelihood over the model; score: less what it costs; empirical: of no effect."""
 
     name: str
@@ -87,7 +87,7 @@ class SpreadTried:
     empirical: bool = False
 
 
-def standardised(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
+def standardised_deviations(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
     """(n,) deviations from the cells' planes over the predicted spread, of unit variance if the model is right; NaN outside.
 
     A plane in each cell takes away what the reference's error, correlated over metres, does within it.
@@ -108,11 +108,13 @@ def standardised(residuals: Residuals, cells: Cells, value: FloatArray) -> Float
     fitted = np.einsum("ni,nij,nj->n", basis, inverse[cell], right[cell])
     left = 1 - np.einsum("ni,nij,nj->n", basis, inverse[cell], basis)
     z = np.full(len(residuals), np.nan)
-    z[inside] = np.where(left > _LEAST_LEFT, (y - fitted) / np.sqrt(np.maximum(left, _LEAST_LEFT)), np.nan)
+    z[inside] = np.where(
+        left > _LEAST_REMAINING_VARIANCE, (y - fitted) / np.sqrt(np.maximum(left, _LEAST_REMAINING_VARIANCE)), np.nan
+    )
     return z
 
 
-def spread_candidates(residuals: Residuals) -> list[SpreadCandidate]:
+def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
     """The catalogue's forms of the variance of single points, by what is recorded; without noise that neighbours share."""
     found = []
     for effect in residuals.candidates:
@@ -124,33 +126,33 @@ def spread_candidates(residuals: Residuals) -> list[SpreadCandidate]:
     return found
 
 
-def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]) -> SpreadCandidate:
+def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]) -> VarianceCandidate:
     """Of the effect at its typical sizes, one column for each of them; a few extreme points must not carry a form alone."""
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
-    columns = np.minimum(columns, np.quantile(columns, _HIGHEST, axis=0))
-    cost = len(sizes) + decided().spread.cost_of_a_trial * len(fixed)
-    return SpreadCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), cost, fixed)
+    columns = np.minimum(columns, np.quantile(columns, _HIGHEST_QUANTILE, axis=0))
+    cost = len(sizes) + thresholds().variance.trial_cost * len(fixed)
+    return VarianceCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), cost, fixed)
 
 
-def find_spread(
+def fit_variance_model(
     residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom, left_out: frozenset[str] = frozenset()
-) -> tuple[list[SpreadFound], list[SpreadTried], str]:
+) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
     """The effects that the spread asks for, at most two, all that were tried, best first, and words for a spread of no effect.
 
     value: (n,) residuals without the mean effects found; left_out: effects that are no candidates.
     """
-    candidates = [each for each in spread_candidates(residuals) if each.name not in left_out]
+    candidates = [each for each in variance_candidates(residuals) if each.name not in left_out]
     if not candidates:
         return [], [], ""
-    weighed, predicted = residuals, residuals.sigma**2 * _expected_square(residuals, cells, random)
+    weighed, predicted = residuals, residuals.sigma**2 * _expected_mean_square(residuals, cells, random)
     for again in (True, False):
         # noisy points move a cell's plane, and with that what its quiet points show, unless they have the weight they deserve
-        z = standardised(weighed, cells, value)
-        kept = np.isfinite(z) & (np.abs(z) < decided().spread.clip * max(1.0, nmad(z, 0.0)))
+        z = standardised_deviations(weighed, cells, value)
+        kept = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
         squared = (z * weighed.sigma)[kept] ** 2 / predicted[kept]
         forms = [candidate.variance[kept] / predicted[kept, None] for candidate in candidates]
-        singles = [_Joint.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
+        singles = [_JointFit.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
         best = max(singles, key=lambda fit: fit.score)
         if again:
             added = candidates[best.members[0]].variance @ best.theta[0]
@@ -158,38 +160,38 @@ def find_spread(
     excess = float(np.mean(best.added(forms)))
     block = block_numbers(residuals.at[kept], cells.side_m)
     p_value = null_p_value(squared, [form.sum(axis=1) for form in forms], block, random)
-    tried = [SpreadTried(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
+    tried = [VarianceScore(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
-    by = decided().spread
+    by = thresholds().variance
     if best.gain < by.least_gain or p_value > by.significance or excess < by.least_excess:
         return [], tried, ""
     # of disparities `stereo_noise` looks at neighbours, which noise on nodes moves alike too
-    between = _between_neighbours(residuals, value, kept, best.added(forms)) if residuals.sensor == "tls" else 1.0
-    if between < by.least_between:
-        return [], tried, _shared_by_neighbours(excess, between, residuals.sigma)
+    between = _unshared_share(residuals, value, kept, best.added(forms)) if residuals.sensor == "tls" else 1.0
+    if between < by.least_unshared_share:
+        return [], tried, _describe_shared_variance(excess, between, residuals.sigma)
     pairs = [
-        _Joint.fitted(squared, forms, [first, second], candidates)
+        _JointFit.fitted(squared, forms, [first, second], candidates)
         for first, second in combinations(range(len(forms)), 2)
         if candidates[first].name != candidates[second].name
     ]
     pair = max(pairs, key=lambda fit: fit.score, default=best)
-    free_name, free_score, free = _free_form(squared, {name: v[kept] for name, v in residuals.covariates.items()})
+    free_name, free_score, free = _best_binned_variance(squared, {name: v[kept] for name, v in residuals.covariates.items()})
     # where one effect leaves something over, a second of the catalogue comes before a form of no effect
-    ahead = max(by.free_margin, by.class_share * best.gain)
+    ahead = max(by.nonparametric_margin, by.class_share * best.gain)
     needed = by.second_gain if free_score > best.score + ahead else by.least_gain
     agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    more = free_score > chosen.score + ahead and _blocks_prefer(squared, chosen.added(forms), free, block)
-    empirical = more and free_score > chosen.score + by.free_share * chosen.gain
+    more = free_score > chosen.score + ahead and _blocks_prefer_binned(squared, chosen.added(forms), free, block)
+    empirical = more and free_score > chosen.score + by.nonparametric_share * chosen.gain
     words = f"the spread varies along {free_name} beyond that: no effect of the catalogue explains that part" if more else ""
     if empirical:
         chosen, words = best, ""
-    tried = sorted([*tried, SpreadTried(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
+    tried = sorted([*tried, VarianceScore(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
     margin = max(by.class_margin, by.class_share * chosen.gain)
     found = []
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
-        others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _differ_by(fit, chosen, number)]
+        others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _replaces_only(fit, chosen, number)]
         near = {candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
         alike = near - {candidates[each].name for each in chosen.members}
         parameters = candidate.parameters(theta)
@@ -199,7 +201,7 @@ def find_spread(
         )
         name = f"spread by {free_name}" if empirical else candidate.name
         found.append(
-            SpreadFound(
+            VarianceTerm(
                 name,
                 candidate.name,
                 tuple(sorted(alike)),
@@ -214,7 +216,7 @@ def find_spread(
     return found, tried, words
 
 
-def _shared_by_neighbours(excess: float, between: float, sigma: FloatArray) -> str:
+def _describe_shared_variance(excess: float, between: float, sigma: FloatArray) -> str:
     """Words for a spread that neighbours share, which is no noise. excess: added variance over the predicted one."""
     times, more = float(np.sqrt(1 + excess)), 1e3 * float(np.median(sigma)) * float(np.sqrt(excess))
     shared = 100 * min(max(1 - between, 0.0), 1.0)
@@ -224,7 +226,7 @@ def _shared_by_neighbours(excess: float, between: float, sigma: FloatArray) -> s
     )
 
 
-def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray, added: FloatArray) -> float:
+def _unshared_share(residuals: Residuals, value: FloatArray, kept: BoolArray, added: FloatArray) -> float:
     """Share of an added variance, of the points `kept` and over the predicted one, that differences of neighbours show."""
     part = residuals.part(kept)
     value, predicted = value[kept], part.sigma**2
@@ -236,7 +238,7 @@ def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray
 
 
 @dataclass(frozen=True)
-class TimesPredicted:
+class NoiseRatio:
     """How many of the predicted standard deviations residuals really spread within cells. below: whether blocks all over the wall
     agree that it is less."""
 
@@ -244,39 +246,39 @@ class TimesPredicted:
     below: bool
 
     @classmethod
-    def of(cls, residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> TimesPredicted:
+    def of(cls, residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> NoiseRatio:
         """Of residuals (n,) without the effects on the mean; a few that are far off do not make it more."""
-        z = standardised(residuals, cells, value)
+        z = standardised_deviations(residuals, cells, value)
         kept = np.isfinite(z)
-        squared = np.minimum(z[kept] ** 2, _CUT**2) / _expected_square(residuals, cells, random)
+        squared = np.minimum(z[kept] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
         means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
-        below = float(means.sum()) < -decided().spread.block_sigmas * float(np.linalg.norm(means))
+        below = float(means.sum()) < -thresholds().variance.block_sigmas * float(np.linalg.norm(means))
         return cls(float(np.sqrt(squared.mean())), below)
 
     @property
     def share(self) -> float:
         """The same where it is clearly less than 1, else 1: no effect takes noise away, the model's own is too large."""
-        return self.value if self.below and self.value < decided().spread.too_noisy else 1.0
+        return self.value if self.below and self.value < thresholds().variance.excess_noise_ratio else 1.0
 
 
-def _expected_square(residuals: Residuals, cells: Cells, random: KeyedRandom) -> float:
+def _expected_mean_square(residuals: Residuals, cells: Cells, random: KeyedRandom) -> float:
     """Mean square of standardised deviations from cells where the model is right: of noise that neighbours share, planes take
     away more than of white noise, by draws of it."""
     field = residuals.shared_noise.field(len(residuals))
     if not field.weights.shape[1]:
         return 1.0
-    own = np.sqrt(np.maximum(residuals.sigma**2 - field.variance, _LEAST_OWN * residuals.sigma**2))
+    own = np.sqrt(np.maximum(residuals.sigma**2 - field.variance, _LEAST_WHITE_SHARE * residuals.sigma**2))
     root, draws = np.linalg.cholesky(field.covariance), random.child("share").generator()
     squares = []
-    for _ in range(_SHARE_DRAWS):
+    for _ in range(_EXPECTATION_DRAWS):
         shared = field.weights @ (root @ draws.standard_normal(len(root)))
-        squares.append(np.nanmean(standardised(residuals, cells, shared + own * draws.standard_normal(len(own))) ** 2))
+        squares.append(np.nanmean(standardised_deviations(residuals, cells, shared + own * draws.standard_normal(len(own))) ** 2))
     return float(np.mean(squares))
 
 
-def _best_variants(tried: list[SpreadTried]) -> list[SpreadTried]:
+def _best_variants(tried: list[VarianceScore]) -> list[VarianceScore]:
     """One of each name: of an effect with variants the one that scores most."""
-    best: dict[str, SpreadTried] = {}
+    best: dict[str, VarianceScore] = {}
     for item in tried:
         if item.name not in best or item.score > best[item.name].score:
             best[item.name] = item
@@ -284,7 +286,7 @@ def _best_variants(tried: list[SpreadTried]) -> list[SpreadTried]:
 
 
 @dataclass(frozen=True)
-class _Joint:
+class _JointFit:
     """Some candidates fitted together. theta, error: of each; gain in log-likelihood over the model; score: less cost."""
 
     members: tuple[int, ...]
@@ -295,15 +297,15 @@ class _Joint:
 
     @classmethod
     def fitted(
-        cls, squared: FloatArray, forms: list[FloatArray], members: list[int], candidates: list[SpreadCandidate]
-    ) -> _Joint:
+        cls, squared: FloatArray, forms: list[FloatArray], members: list[int], candidates: list[VarianceCandidate]
+    ) -> _JointFit:
         """By Fisher scoring on 1 + sum theta f, theta at least 0."""
         columns = np.concatenate([forms[number] for number in members], axis=1)
         scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
         columns = columns * scale
         theta = np.full(len(scale), max(float(np.mean(squared)) - 1, 1e-3) / len(scale))
         information = np.eye(len(scale))
-        for _ in range(_ROUNDS):
+        for _ in range(_FISHER_ROUNDS):
             total = 1 + columns @ theta
             slope = 0.5 * columns.T @ ((squared - total) / total**2)
             information = 0.5 * (columns / total[:, None] ** 2).T @ columns
@@ -311,7 +313,7 @@ class _Joint:
             step = np.zeros(len(theta))
             step[free] = np.linalg.lstsq(information[np.ix_(free, free)], slope[free], rcond=1e-10)[0]
             theta = np.maximum(theta + step, 0.0)
-        gain = _gain(squared, columns @ theta)
+        gain = _log_likelihood_gain(squared, columns @ theta)
         error = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
         ends = np.cumsum([forms[number].shape[1] for number in members])[:-1]
         score = gain - sum(candidates[number].cost for number in members)
@@ -322,7 +324,7 @@ class _Joint:
         return np.asarray(sum(forms[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))
 
 
-def _differ_by(fit: _Joint, chosen: _Joint, number: int) -> bool:
+def _replaces_only(fit: _JointFit, chosen: _JointFit, number: int) -> bool:
     """Whether a fit has another form in place of one of the chosen."""
     return number not in fit.members and set(chosen.members) - {number} <= set(fit.members)
 
@@ -330,13 +332,13 @@ def _differ_by(fit: _Joint, chosen: _Joint, number: int) -> bool:
 def _blocks_agree(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether the gain of one variance over another is common to the blocks and not due to a few."""
     gain, sigmas = _gain_over(squared, first, second, block)
-    return gain > 0 and sigmas > decided().spread.block_sigmas
+    return gain > 0 and sigmas > thresholds().variance.block_sigmas
 
 
-def _blocks_prefer(squared: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
+def _blocks_prefer_binned(squared: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
     """The same of a free form, which only has to say that the named one does not fit."""
     gain, sigmas = _gain_over(squared, first, free, block)
-    return gain > decided().spread.free_gain and sigmas > decided().spread.free_block_sigmas
+    return gain > thresholds().variance.nonparametric_gain and sigmas > thresholds().variance.nonparametric_block_sigmas
 
 
 def _gain_over(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
@@ -346,7 +348,7 @@ def _gain_over(squared: FloatArray, first: FloatArray, second: FloatArray, block
     return float(sums.sum()), float(sums.sum() / max(float(np.linalg.norm(sums)), 1e-300))
 
 
-def _gain(squared: FloatArray, added: FloatArray) -> float:
+def _log_likelihood_gain(squared: FloatArray, added: FloatArray) -> float:
     return float(0.5 * np.sum(squared * added / (1 + added) - np.log1p(added)))
 
 
@@ -361,7 +363,7 @@ def null_p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np
 
 
 @dataclass(frozen=True)
-class Tails:
+class HeavyTails:
     """Residuals farther out than normal noise of the predicted spread leaves them.
 
     share: of all residuals, beyond `beyond` predicted sigmas; sigma: to how many predicted ones they raise the standard
@@ -382,21 +384,21 @@ class Tails:
         return f"{100 * self.share:.2g} % of the points lie beyond {self.beyond:g} predicted sigmas, {where}"
 
 
-def find_tails(z: FloatArray, block: NDArray[np.int64]) -> Tails | None:
+def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | None:
     """What lies farther out than it should, None where that is no more than normal noise and small faults of a reference leave.
 
     z: (n,) residuals over the spread that all effects together predict; of normal ones 6e-5 lie beyond 4.
     """
-    by = decided().spread
-    far = np.abs(z) > by.far
+    by = thresholds().variance
+    far = np.abs(z) > by.tail_sigmas
     share = float(far.mean())
-    if share < by.most_far:
+    if share < by.most_tail_share:
         return None
-    square = np.minimum(z**2, _CUT**2)
+    square = np.minimum(z**2, _CLIP_SIGMAS**2)
     wide = max(float(square[far].mean()), 1.0)
     mixed = np.log(1 - share + share / np.sqrt(wide) * np.exp(0.5 * square * (1 - 1 / wide)))
     sigma = float(np.sqrt(max(float(square.mean()) - 1, 0.0)))
-    return Tails(share, by.far, sigma, float(mixed.sum()), _unevenness(far, block) < by.most_uneven)
+    return HeavyTails(share, by.tail_sigmas, sigma, float(mixed.sum()), _unevenness(far, block) < by.most_tail_unevenness)
 
 
 def _unevenness(far: BoolArray, block: NDArray[np.int64]) -> float:
@@ -407,7 +409,7 @@ def _unevenness(far: BoolArray, block: NDArray[np.int64]) -> float:
     return float(np.sqrt(max(float(beyond_chance), 0.0) / np.sum(expected**2)))
 
 
-def _free_form(squared: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
+def _best_binned_variance(squared: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
     """The covariate along which a variance free in each of some bins explains most, its score, and what it adds (n,)."""
     best: tuple[str, float, FloatArray] = ("", -np.inf, np.zeros(len(squared)))
     for name, values in covariates.items():

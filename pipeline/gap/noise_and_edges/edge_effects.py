@@ -8,20 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 
-_STRAY = 1e-3
-_SLACK = 0.15
+_OUTLIER_DENSITY = 1e-3
+_STEP_HEIGHT_UNCERTAINTY = 0.15
 """Share of what an effect adds by which its height on the reference may be off."""
 _POINTS_PER_BLOCK = 100.0
 
 
 @dataclass(frozen=True)
-class ShapeFound:
+class EdgeEffect:
     """An effect on the shape. effect: with its values; std: of the parameters; touched: (n,) points where it cannot be predicted
     to the noise."""
 
@@ -54,8 +54,8 @@ class WallBlocks:
     def tested(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
         """Total of gains (n,), None where they do not convince: blocks all over the wall have to agree, by their sums, or by the
         signs of these where few of them hold most of the points."""
-        by = decided().shapes
-        total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_of_a_point, by.most_of_a_point))
+        by = thresholds().edges
+        total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_gain_of_a_point, by.most_gain_of_a_point))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
         if by_signs:
             signs = np.sign(sums[sums != 0])
@@ -77,11 +77,11 @@ class WallBlocks:
 
 def log_density(rough: FloatArray, moved: FloatArray, sigma: FloatArray) -> FloatArray:
     """(n,) log density of residuals that an effect moves by `moved`: Gaussian, with some that may lie anywhere."""
-    spread = np.hypot(sigma, _SLACK * moved)
-    return np.asarray(np.log(np.exp(-0.5 * ((rough - moved) / spread) ** 2) / spread + _STRAY))
+    spread = np.hypot(sigma, _STEP_HEIGHT_UNCERTAINTY * moved)
+    return np.asarray(np.log(np.exp(-0.5 * ((rough - moved) / spread) ** 2) / spread + _OUTLIER_DENSITY))
 
 
-def refined(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
+def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
     """The value of the largest total gain: on a grid, on finer ones around the best, at the top of a parabola through three."""
     best = max(values, key=lambda each: float(gains(each).sum()))
     step = 0.0

@@ -17,28 +17,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.gap.decisions import decided
-from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
 from sensors.models.sensor_model import StereoModel
 
 _LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-_LONGEST_PX = (256.0, 128.0, 64.0)
+_LONGEST_LAG_PX = (256.0, 128.0, 64.0)
 """Of a lag: the first that enough blocks of the wall have pairs of."""
-_STEPS_PX = tuple(8.0 * 2 ** (quarter / 4) for quarter in range(17))
+_GRID_STEPS_PX = tuple(8.0 * 2 ** (quarter / 4) for quarter in range(17))
 _POINTS_PER_BLOCK = 400.0
 _FEWEST_BLOCKS, _FEWEST_LAGS = 12, 3
 _CLIP = 4.5
-_RIDGE, _FEW = 0.02, 0.2
+_RIDGE, _SHRINKAGE_PER_LAG = 0.02, 0.2
 """Share of the covariance of lags added to its diagonal: always, and times lags per block of the wall: few blocks mistake it."""
 _DRAWS = 1999
-_LENGTHS = tuple(2 ** (half / 2) for half in range(-4, 9))
+_RELATIVE_LENGTHS = tuple(2 ** (half / 2) for half in range(-4, 9))
 """Of correlation that the reference's error is tried with, times the one from which on it may be large."""
 
 
@@ -60,12 +60,12 @@ class _Variogram:
         """(k,) of all blocks, px^2."""
         return np.asarray(self.blocks.sum(axis=1))
 
-    def fitted(self, form: FloatArray) -> _Form:
+    def fitted(self, form: FloatArray) -> _VariogramFit:
         """A form (k,) beside the reference's error, both at least 0, and that no more than there may be."""
         columns, value = self.root @ np.stack([form, self._smooth], axis=1), self.root @ self.value
         weights = np.linalg.pinv(columns)
         smooth = float(weights[1] @ value)
-        most = self._variance(decided().nodes.reference_error)
+        most = self._variance(thresholds().grid_noise.reference_error)
         if not 0 <= smooth <= most:
             value = value - np.clip(smooth, 0, most) * columns[:, 1]
             columns = columns[:, :1]
@@ -75,7 +75,7 @@ class _Variogram:
         shares = weights[0] @ self.root @ self.blocks
         worse = np.sqrt(max(square / (len(value) - columns.shape[1]), 1.0))  # than a form of the right kind would fit
         error = max(worse * float(np.linalg.norm(weights[0])), float(np.linalg.norm(shares - shares.mean())))
-        return _Form(square, float(best[0]), error, shares)
+        return _VariogramFit(square, float(best[0]), error, shares)
 
     def p_value(self, random: KeyedRandom) -> float:
         """Of the largest variance of nodes over its error, whichever the step, by signs drawn block by block: (1 + b) / (1 + N).
@@ -84,7 +84,7 @@ class _Variogram:
         them: weights by the covariance of so few blocks would fit just these.
         """
         size = np.linalg.norm(self.blocks, axis=1)
-        forms = (np.stack([_nodes(self.lag, step), self._smooth], axis=1) for _, step in self._trials)
+        forms = (np.stack([_grid_semivariogram(self.lag, step), self._smooth], axis=1) for _, step in self._trials)
         weights = np.stack([np.linalg.pinv(form / size[:, None])[0] / size for form in forms])
         shares = weights @ self.blocks
         shares /= np.linalg.norm(shares, axis=1, keepdims=True)
@@ -93,10 +93,10 @@ class _Variogram:
         return float((1 + np.sum(largest >= np.max(shares.sum(axis=1)))) / (1 + _DRAWS))
 
     @property
-    def _trials(self) -> list[tuple[_Form, float]]:
+    def _trials(self) -> list[tuple[_VariogramFit, float]]:
         """Grids of nodes and their steps, px, that the raster is not too coarse for."""
-        finest = decided().nodes.finest * self.step
-        return [(self.fitted(_nodes(self.lag, step)), step) for step in _STEPS_PX if step >= finest]
+        finest = thresholds().grid_noise.finest_grid * self.step
+        return [(self.fitted(_grid_semivariogram(self.lag, step)), step) for step in _GRID_STEPS_PX if step >= finest]
 
     @property
     def _smooth(self) -> FloatArray:
@@ -108,16 +108,16 @@ class _Variogram:
     def plain_square(self) -> float:
         """chi^2 of white noise, or of a smooth error of the reference."""
         white = self.fitted(np.ones(len(self.lag))).square
-        return min(white, self._square_of(self._smooth, decided().nodes.reference_error))
+        return min(white, self._square_of(self._smooth, thresholds().grid_noise.reference_error))
 
     @property
     def reference_square(self) -> float:
         """chi^2 of the best form without nodes: errors of the reference of all lengths too, small where they are short."""
-        by = decided().nodes
+        by = thresholds().grid_noise
         square = self.plain_square
-        for length in _LENGTHS:
+        for length in _RELATIVE_LENGTHS:
             form = 1 - np.exp(-0.5 * (self.distance_m / (length * by.reference_length)) ** 2)
-            most = by.reference_error if length >= 1 else by.reference_relief
+            most = by.reference_error if length >= 1 else by.short_reference_error
             square = min(square, self._square_of(form, most))
         return square
 
@@ -130,7 +130,7 @@ class _Variogram:
         """px^2 of an error along the depth."""
         return (error_m / self.unit_m) ** 2
 
-    def best_nodes(self) -> tuple[_Form, float, list[float]] | None:
+    def best_nodes(self) -> tuple[_VariogramFit, float, list[float]] | None:
         """The grid of nodes in the middle of those that fit best, its step, px, and their steps; None where all are too fine."""
         trials = self._trials
         if not trials:
@@ -141,7 +141,7 @@ class _Variogram:
 
 
 @dataclass(frozen=True)
-class _Form:
+class _VariogramFit:
     """A form of the semivariogram fitted. square: chi^2; variance and its standard deviation, px^2; blocks: (b,) shares of the
     variance."""
 
@@ -151,19 +151,21 @@ class _Form:
     blocks: FloatArray
 
 
-def told_apart(found: list[SpreadFound], part: StereoResiduals, value: FloatArray, model: StereoModel) -> list[SpreadFound]:
+def separate_white_and_grid_noise(
+    found: list[VarianceTerm], part: StereoResiduals, value: FloatArray, model: StereoModel
+) -> list[VarianceTerm]:
     """Noise that was taken for white, named by how neighbours differ; a class of both where that does not tell.
 
     Noise on nodes seems to change with any covariate, as few of them have one value of it: it goes before an empirical term.
     value: (n,) residuals without the mean effects found.
     """
-    named = [_named(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
+    named = [_name_noise(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
     return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
 
 
-def find_nodes(
+def find_grid_noise(
     part: StereoResiduals, value: FloatArray, model: StereoModel, random: KeyedRandom
-) -> tuple[SpreadFound | None, str]:
+) -> tuple[VarianceTerm | None, str]:
     """Noise on nodes so far apart that the points around one do not differ by it; None and words where the reference may be wrong
     by as much, None and "" where there is none.
 
@@ -174,18 +176,18 @@ def find_nodes(
     if variogram is None or best is None:
         return None, ""
     form, step, near = best
-    by = decided().nodes
+    by = thresholds().grid_noise
     if form.square >= variogram.plain_square - by.least_gain or form.variance <= by.least_sigmas * form.error:
         return None, ""
     without = variogram.reference_square
     if form.square >= without - by.least_gain:
-        return None, _as_reference(form, step, variogram.unit_m)
+        return None, _describe_reference_error(form, step, variogram.unit_m)
     name, p_value = RegularizationNoise.tag(), variogram.p_value(random)
-    found = SpreadFound(name, name, (), p_value, (without - form.square) / 2, {}, {}, False, np.zeros(len(part)))
-    return _on_nodes(found, form, step, near), ""
+    found = VarianceTerm(name, name, (), p_value, (without - form.square) / 2, {}, {}, False, np.zeros(len(part)))
+    return _as_grid_noise(found, form, step, near), ""
 
 
-def _as_reference(form: _Form, step: float, unit_m: float) -> str:
+def _describe_reference_error(form: _VariogramFit, step: float, unit_m: float) -> str:
     """Words for an error that the reference may have."""
     sigma = np.sqrt(RegularizationNoise(sigma_px=1.0).total_variance * form.variance)
     return (
@@ -195,7 +197,7 @@ def _as_reference(form: _Form, step: float, unit_m: float) -> str:
     )
 
 
-def _named(white: SpreadFound, part: StereoResiduals, value: FloatArray, model: StereoModel) -> SpreadFound:
+def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, model: StereoModel) -> VarianceTerm:
     both = replace(white, alike=tuple(sorted({*white.alike, RegularizationNoise.tag()})))
     variogram = _variogram(part, value, model)
     if variogram is None:
@@ -203,25 +205,27 @@ def _named(white: SpreadFound, part: StereoResiduals, value: FloatArray, model: 
     plain = variogram.fitted(np.ones(len(variogram.lag)))
     if plain.variance > 0:
         both = _with_variance(both, plain, 1.0)
-    resolved = decided().nodes.finest * variogram.step <= _STEPS_PX[0]  # else a grid may be too fine for this raster to tell
+    resolved = (
+        thresholds().grid_noise.finest_grid * variogram.step <= _GRID_STEPS_PX[0]
+    )  # else a grid may be too fine for this raster to tell
     white = replace(both, alike=white.alike) if resolved else both
     best = variogram.best_nodes()
-    if best is None or plain.square < best[0].square - decided().nodes.margin:
+    if best is None or plain.square < best[0].square - thresholds().grid_noise.margin:
         return white
-    if best[0].variance <= 0 or plain.square < best[0].square + decided().nodes.margin:
+    if best[0].variance <= 0 or plain.square < best[0].square + thresholds().grid_noise.margin:
         return both
     nodes = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), alike=())
-    return _on_nodes(nodes, *best)
+    return _as_grid_noise(nodes, *best)
 
 
-def _on_nodes(found: SpreadFound, form: _Form, step: float, near: list[float]) -> SpreadFound:
+def _as_grid_noise(found: VarianceTerm, form: _VariogramFit, step: float, near: list[float]) -> VarianceTerm:
     """With the parameters of a grid of nodes."""
     nodes = _with_variance(found, form, RegularizationNoise(sigma_px=1.0).total_variance)
     parameters, std = {**nodes.parameters, "step_px": step}, {**nodes.std, "step_px": max(float(np.std(near)), 0.2 * step)}
     return replace(nodes, parameters=parameters, std=std)
 
 
-def _with_variance(found: SpreadFound, form: _Form, share: float) -> SpreadFound:
+def _with_variance(found: VarianceTerm, form: _VariogramFit, share: float) -> VarianceTerm:
     """With the standard deviation sigma_px that a variance with its error gives. share: of it that a disparity has on average."""
     sigma = float(np.sqrt(form.variance))
     return replace(
@@ -245,9 +249,9 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     block = np.zeros(raster.shape, dtype=np.int64)
     block[row, column] = patches(part.at, _POINTS_PER_BLOCK)
     count = int(block.max()) + 1
-    lags = [(axis, lag) for axis in (0, 1) for lag in _LAGS if lag * steps[axis] <= _LONGEST_PX[0]]
-    pairs, sums = np.stack([_by_block(raster, block, lag, axis, count) for axis, lag in lags], axis=1)
-    near = _near(pairs, np.array([lag * steps[axis] for axis, lag in lags]))
+    lags = [(axis, lag) for axis in (0, 1) for lag in _LAGS if lag * steps[axis] <= _LONGEST_LAG_PX[0]]
+    pairs, sums = np.stack([_pairs_by_block(raster, block, lag, axis, count) for axis, lag in lags], axis=1)
+    near = _usable_lags(pairs, np.array([lag * steps[axis] for axis, lag in lags]))
     lags = [each for each, is_near in zip(lags, near, strict=True) if is_near]
     pairs, sums = pairs[near], sums[near]
     full = (pairs > 0).all(axis=0)
@@ -258,7 +262,7 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     mean = means @ weight
     left = (means - mean[:, None]) * np.sqrt(weight)
     covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
-    covariance += (_RIDGE + _FEW * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
+    covariance += (_RIDGE + _SHRINKAGE_PER_LAG * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
     offsets = np.array([[lag * steps[axis] * (axis == 1), lag * steps[axis] * (axis == 0)] for axis, lag in lags])
     white = max(float(np.median(part.sigma**2)) - model.variance, 0.0)  # of what was found apart, such as a locking
     blocks = (means - (model.semivariogram(offsets) + white)[:, None]) * weight
@@ -273,16 +277,18 @@ def _wall_per_px(part: StereoResiduals) -> float:
     return float(np.sqrt(np.prod(np.std(part.at, axis=0)) / (np.std(g.u) * np.std(g.v))))
 
 
-def _near(pairs: FloatArray, length: FloatArray) -> BoolArray:
+def _usable_lags(pairs: FloatArray, length: FloatArray) -> BoolArray:
     """(k,) lags that are short enough for a dozen blocks of the wall to have pairs (k, b) of all of them. length: (k,) px."""
-    for longest in _LONGEST_PX[:-1]:
+    for longest in _LONGEST_LAG_PX[:-1]:
         near = length <= longest
         if (pairs[near] > 0).all(axis=0).sum() >= _FEWEST_BLOCKS:
             return np.asarray(near)
-    return np.asarray(length <= _LONGEST_PX[-1])
+    return np.asarray(length <= _LONGEST_LAG_PX[-1])
 
 
-def _by_block(raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int) -> tuple[FloatArray, FloatArray]:
+def _pairs_by_block(
+    raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int
+) -> tuple[FloatArray, FloatArray]:
     """(count,) pairs and half their squared differences, by the block of the first of each pair."""
     first, second = (raster[:-lag], raster[lag:]) if axis == 0 else (raster[:, :-lag], raster[:, lag:])
     there = block[:-lag] if axis == 0 else block[:, :-lag]
@@ -294,6 +300,6 @@ def _by_block(raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int,
     )
 
 
-def _nodes(lag: FloatArray, step: float) -> FloatArray:
+def _grid_semivariogram(lag: FloatArray, step: float) -> FloatArray:
     """(k,) semivariogram of a grid of nodes of variance 1."""
     return RegularizationNoise(sigma_px=1.0, step_px=step).semivariogram(lag)

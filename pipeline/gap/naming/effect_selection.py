@@ -10,32 +10,41 @@ import numpy as np
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import PLACE, REPEATED
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import Chosen, Tried
-from pipeline.gap.naming.entries import (
+from pipeline.gap.naming.candidate_families import candidate_families, model_has
+from pipeline.gap.naming.named_effects import (
     Estimate,
-    Named,
-    from_comb,
-    from_locking,
-    from_mean,
-    from_spread,
-    settled_with,
-    with_corrections,
+    NamedEffect,
+    aligned_with,
+    effect_from_estimate,
+    effect_from_locking,
+    effect_from_range_step,
+    effect_from_variance,
+    merge_angle_curves,
     within_bounds,
 )
-from pipeline.gap.naming.families import believes, families_of
-from pipeline.gap.naming.relinearised import Explained, SearchedPoints, at_points, beyond, followed_up, noisier, undone, weighed
-from pipeline.gap.other.locking import SpreadAllowed, find_locking
-from pipeline.gap.other.quantization import find_comb
-from pipeline.gap.other.spread import SpreadFound, SpreadTried, TimesPredicted, find_spread
-from pipeline.gap.other.stereo_noise import find_nodes, told_apart
+from pipeline.gap.naming.nonlinear_refit import (
+    SearchInput,
+    SearchOutcome,
+    absorbed_by_registration,
+    at_points_of,
+    out_of_bounds,
+    select_and_refit,
+    with_added_variance,
+    with_fitted_variance,
+)
+from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
+from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
+from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
+from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_empirical import AngleEmpirical
@@ -44,13 +53,13 @@ from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.regularization_noise import RegularizationNoise
 
-_NODES = RegularizationNoise.tag()
-FREE_FORMS = ("", True)
+_GRID_NOISE = RegularizationNoise.tag()
+NONPARAMETRIC_TERMS = ("", True)
 """Stands for all families of empirical terms."""
 
 
 @dataclass(frozen=True)
-class Naming:
+class SelectionResult:
     """What the selection leaves beside the effects: what was tried for the mean and for the spread, notes, and the standard
     deviation of the reference.
 
@@ -60,17 +69,17 @@ class Naming:
     """
 
     tried: tuple[Tried, ...]
-    spread_tried: tuple[SpreadTried, ...]
+    spread_tried: tuple[VarianceScore, ...]
     moving: frozenset[str]
     p_value: float | None
     p_alone: float | None
-    times: TimesPredicted
+    times: NoiseRatio
     notes: tuple[str, ...]
     identifiability: dict[str, Any]
     reference_sigma: float
     spreads: float
 
-    def p_beside(self, named: Sequence[Named]) -> float | None:
+    def p_beside(self, named: Sequence[NamedEffect]) -> float | None:
         """Of what remains beside those that were kept of the effects on the mean; None where that was not drawn."""
         kept = self.moving & {item.name for item in named}
         if kept == self.moving:
@@ -78,14 +87,14 @@ class Naming:
         return None if kept else self.p_alone
 
 
-def name_effects(
+def select_effects(
     measurement: Measurement,
     part: Residuals,
     scale: float,
     random: KeyedRandom,
     left_out: frozenset[tuple[str, bool]] = frozenset(),
-    nodes: SpreadFound | None = None,
-) -> tuple[list[Named], Naming]:
+    nodes: VarianceTerm | None = None,
+) -> tuple[list[NamedEffect], SelectionResult]:
     """Effects on the mean and on the spread.
 
     What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
@@ -95,72 +104,74 @@ def name_effects(
     nodes: noise that neighbours share, found in what a search had left: it feigns free forms, and an error of the reference that
     is larger than the true one, so that all is searched again beside it.
     """
-    named: list[Named] = []
+    named: list[NamedEffect] = []
     whole, whole_scale, added = part, scale, 0.0
     comb = locking = None
-    if isinstance(part, TlsResiduals) and not believes(measurement, RangeQuantization.tag()):
-        comb = find_comb(part.geometry.measured_m)
-    if isinstance(part, StereoResiduals) and not believes(measurement, PixelLocking.tag()):
+    if isinstance(part, TlsResiduals) and not model_has(measurement, RangeQuantization.tag()):
+        comb = find_range_step(part.geometry.measured_m)
+    if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
         at = part.geometry
-        allowed = SpreadAllowed(float(np.median(part.sigma)), nmad(registered(part)[0]))
+        allowed = NoiseBounds(float(np.median(part.sigma)), nmad(registered(part)[0]))
         locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
     if comb is not None:
-        named.append(from_comb(comb, part))
+        named.append(effect_from_range_step(comb, part))
         added, scale = comb.step_m**2 / 12, 1.0
     found_apart = set()
     if locking is not None:
-        named.append(from_locking(locking))
+        named.append(effect_from_locking(locking))
         added = locking.amplitude_px**2 / 2
         found_apart.add((PixelLocking.tag(), False))
-    part = noisier(part, added)
+    part = with_added_variance(part, added)
     out = left_out | found_apart
-    possible = (each for each in families_of(measurement, part) if (each.name, each.empirical) not in out)
-    families = [each for each in possible if not (each.empirical and FREE_FORMS in out)]
-    spread, spread_tried, words = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
-    if wrong := _too_wide(measurement, spread):
-        return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
+    possible = (each for each in candidate_families(measurement, part) if (each.name, each.empirical) not in out)
+    families = [each for each in possible if not (each.empirical and NONPARAMETRIC_TERMS in out)]
+    spread, spread_tried, words = _fit_variance(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
+    if wrong := _implausible_variance(measurement, spread):
+        return select_effects(measurement, whole, whole_scale, random, left_out | wrong)
     if not spread and nodes is not None:
         spread = [nodes]
 
-    def spread_at(at: Residuals) -> list[SpreadFound]:
-        there = _spread(measurement, at, Cells.over(at.at), registered(at)[0], random, left_out)[0]
+    def spread_at(at: Residuals) -> list[VarianceTerm]:
+        there = _fit_variance(measurement, at, Cells.over(at.at), registered(at)[0], random, left_out)[0]
         if there or nodes is None:
             return there
         return [replace(nodes, variance=nodes.variance[np.isin(part.index, at.index)])]
 
-    points = SearchedPoints(measurement, part, families, spread_at, added, random)
-    first = MeanSearch(weighed(part, spread, scale), families, random)
-    found = followed_up(points, first)
+    points = SearchInput(measurement, part, families, spread_at, added, random)
+    first = MeanSearch(with_fitted_variance(part, spread, scale), families, random)
+    found = select_and_refit(points, first)
     physical = any(not each.empirical for each in families)
     names, cosines, survival = first.design.identifiability() if physical else ([], np.zeros((0, 0)), np.zeros(0))
-    wrong = beyond(measurement, found.estimates, found.at)
-    doubtful = undone(found.estimates, found.at, dict(zip(names, survival, strict=True)))
-    if doubtful and not _explains_all(found):
+    wrong = out_of_bounds(measurement, found.estimates, found.at)
+    doubtful = absorbed_by_registration(found.estimates, found.at, dict(zip(names, survival, strict=True)))
+    if doubtful and not _explains_everything(found):
         wrong |= doubtful
     design = found.search.design
     left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
-        spread, spread_tried, words = _spread(measurement, found.at, design.cells, left, random, left_out)
-    if spread in ([], [nodes]) and (_NODES, False) not in left_out:
+        spread, spread_tried, words = _fit_variance(measurement, found.at, design.cells, left, random, left_out)
+    if spread in ([], [nodes]) and (_GRID_NOISE, False) not in left_out:
         match measurement, part, found.at:
             case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
-                nodes_left, shared = find_nodes(found.at, left, model, random)
+                nodes_left, shared = find_grid_noise(found.at, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
                 if nodes_left is not None and nodes is None:
-                    nodes_in_all = find_nodes(part, registered(part)[0], model, random)[0] if described else None
+                    nodes_in_all = find_grid_noise(part, registered(part)[0], model, random)[0] if described else None
                     found_nodes = nodes_in_all or nodes_left.everywhere(len(part))
-                    return name_effects(measurement, whole, whole_scale, random, left_out, found_nodes)
+                    return select_effects(measurement, whole, whole_scale, random, left_out, found_nodes)
                 kept = nodes_left or (None if described else nodes)
                 spread, words = ([], words or shared) if kept is None else ([kept], words)
-    if wrong := (wrong | _too_wide(measurement, spread)) - left_out:
-        again, naming = name_effects(measurement, whole, whole_scale, random, left_out | wrong)
-        return with_doubtful(again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong), naming
-    moving = [from_mean(each, found.at) for each in found.estimates]
+    if wrong := (wrong | _implausible_variance(measurement, spread)) - left_out:
+        again, naming = select_effects(measurement, whole, whole_scale, random, left_out | wrong)
+        return keep_implausible_in_class(
+            again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong
+        ), naming
+    moving = [effect_from_estimate(each, found.at) for each in found.estimates]
     named += moving
-    named += [from_spread(each, part.sensor) for each in spread]
-    times = TimesPredicted(1.0, False) if spread else TimesPredicted.of(found.at, design.cells, left, random)
-    said = (*_repeats(found.estimates), *_slanting(found), *_most_like(found, part))
-    notes = (*part.notes, *_words(left_out), *filter(None, [words]), *said)
+    named += [effect_from_variance(each, part.sensor) for each in spread]
+    times = NoiseRatio(1.0, False) if spread else NoiseRatio.of(found.at, design.cells, left, random)
+    said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part))
+    notes = (*part.notes, *_note_left_out(left_out), *filter(None, [words]), *said)
     p_value = found.search.p_of_rest(found.tried)
     alone = first.tried(()) if moving else ()
     p_alone = first.p_of_rest(alone) if alone else p_value
@@ -170,23 +181,23 @@ def name_effects(
     shown = tuple(item for item in tried if not item.name.startswith(PLACE))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
     spreads = nmad(left / found.at.sigma, 0.0)
-    naming = Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, times, notes, table, sigma, spreads)
+    naming = SelectionResult(shown, tuple(spread_tried), names_moving, p_value, p_alone, times, notes, table, sigma, spreads)
     angles = [each for each in moving if each.effect is AngleEmpirical]
-    if angles and not believes(measurement, AngleEmpirical.tag()):
-        return _with_angles(measurement, whole, angles, naming, random, left_out)
+    if angles and not model_has(measurement, AngleEmpirical.tag()):
+        return _select_beside_angle_terms(measurement, whole, angles, naming, random, left_out)
     return named, naming
 
 
-def _explains_all(found: Explained) -> bool:
+def _explains_everything(found: SearchOutcome) -> bool:
     """Whether effects of the catalogue alone were found, and no more than chance is left beside them."""
     p_value = found.search.p_of_rest(found.tried)
     physical = not any(each.candidate.empirical for each in found.estimates)
-    return physical and p_value is not None and p_value > decided().verdict.least_p
+    return physical and p_value is not None and p_value > thresholds().verdict.rejection_p
 
 
-def with_doubtful(
-    named: list[Named], chosen: list[Chosen], before: frozenset[str], left_out: frozenset[tuple[str, bool]]
-) -> list[Named]:
+def keep_implausible_in_class(
+    named: list[NamedEffect], chosen: list[Chosen], before: frozenset[str], left_out: frozenset[tuple[str, bool]]
+) -> list[NamedEffect]:
     """An effect that was chosen first and is too large to be committed to stays in the class of those that would do as well: by
     slopes, or since they were not among those named with it (`before`) and stand in its place."""
     doubtful = [each for each in chosen if (each.candidate.name, False) in left_out]
@@ -199,38 +210,38 @@ def with_doubtful(
     return found
 
 
-def _with_angles(
+def _select_beside_angle_terms(
     measurement: Measurement,
     whole: Residuals,
-    angles: list[Named],
-    first: Naming,
+    angles: list[NamedEffect],
+    first: SelectionResult,
     random: KeyedRandom,
     left_out: frozenset[tuple[str, bool]],
-) -> tuple[list[Named], Naming]:
+) -> tuple[list[NamedEffect], SelectionResult]:
     """All is named again with the free forms of errors of an angle in the model: slopes miss where a ray goes that turns far.
 
     What the second search finds of the same form is added to the first's curve.
     """
-    there, found, _ = settled_with(measurement, angles, whole.index)
-    at = at_points(found, whole)
-    named, naming = name_effects(there, at, registered(at)[2], random.child("angles"), left_out)
-    joined, others = with_corrections(angles, [item for item in named if item.effect is AngleEmpirical], whole)
+    there, found, _ = aligned_with(measurement, angles, whole.index)
+    at = at_points_of(found, whole)
+    named, naming = select_effects(there, at, registered(at)[2], random.child("angles"), left_out)
+    joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], whole)
     rest = [item for item in named if item.effect is not AngleEmpirical]
     moving = naming.moving | {item.name for item in angles}
     again = replace(naming, tried=first.tried, moving=moving, p_alone=first.p_alone, identifiability=first.identifiability)
     return [*joined, *others, *rest], again
 
 
-def _repeats(estimates: list[Estimate]) -> list[str]:
+def _note_repetition(estimates: list[Estimate]) -> list[str]:
     """Words for forms that repeat after a few lines."""
     lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(REPEATED)]
     return [f"what is described repeats every {each} lines exactly: facets of a mirror or a read-out in blocks" for each in lines]
 
 
-def _most_like(found: Explained, part: Residuals) -> list[str]:
+def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
     """Words for what remains where it is more than chance leaves, and nothing was found that says it."""
     p_value = found.search.p_of_rest(found.tried)
-    if found.estimates or p_value is None or p_value > decided().verdict.least_p:
+    if found.estimates or p_value is None or p_value > thresholds().verdict.rejection_p:
         return []
     best = max((item for item in found.tried if not item.name.startswith(PLACE)), key=lambda item: item.score)
     what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name
@@ -241,10 +252,10 @@ def _most_like(found: Explained, part: Residuals) -> list[str]:
     ]
 
 
-def _slanting(found: Explained) -> list[str]:
+def _note_oblique_waves(found: SearchOutcome) -> list[str]:
     """Words for waves across the wall that are larger than chance leaves, though no sensor has an axis there."""
     p_value = found.search.p_of_places(found.tried)
-    if p_value is None or p_value > decided().verdict.least_p:
+    if p_value is None or p_value > thresholds().verdict.rejection_p:
         return []
     return [
         f"the residuals vary slantwise across the wall more than a reference wrong by a Gaussian process would let them (p-value "
@@ -252,31 +263,31 @@ def _slanting(found: Explained) -> list[str]:
     ]
 
 
-def _spread(
+def _fit_variance(
     measurement: Measurement,
     part: Residuals,
     cells: Cells,
     value: FloatArray,
     random: KeyedRandom,
     left_out: frozenset[tuple[str, bool]],
-) -> tuple[list[SpreadFound], list[SpreadTried], str]:
+) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
     """Effects on the spread of residuals (n,) without the mean effects found, what was tried, and words for a spread of none."""
     names = frozenset(name for name, empirical in left_out if not empirical)
-    found, tried, words = find_spread(part, cells, value, random, names)
+    found, tried, words = fit_variance_model(part, cells, value, random, names)
     match measurement, part:
         case StereoMeasurement(), StereoResiduals():
-            found = told_apart(found, part, value, measurement.model)
+            found = separate_white_and_grid_noise(found, part, value, measurement.model)
     return [each for each in found if each.effect not in names], tried, words
 
 
-def _too_wide(measurement: Measurement, spread: list[SpreadFound]) -> frozenset[tuple[str, bool]]:
+def _implausible_variance(measurement: Measurement, spread: list[VarianceTerm]) -> frozenset[tuple[str, bool]]:
     """Families of the spread whose values lie beyond the bounds of the effect that is to hold them."""
-    entries = {each.effect: from_spread(each, measurement.sensor).entry for each in spread}
+    entries = {each.effect: effect_from_variance(each, measurement.sensor).entry for each in spread}
     return frozenset((name, False) for name, entry in entries.items() if not within_bounds(measurement.model, entry))
 
 
-def _words(left_out: frozenset[tuple[str, bool]]) -> list[str]:
-    said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out - {FREE_FORMS}))
+def _note_left_out(left_out: frozenset[tuple[str, bool]]) -> list[str]:
+    said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out - {NONPARAMETRIC_TERMS}))
     why = (
         "the best value is beyond what a config may hold, or many times the usual where the registration undoes nearly all of it "
         "and more is left than chance gives"

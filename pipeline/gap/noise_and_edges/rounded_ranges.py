@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.gap.decisions import decided
+from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 
 _BIN_M = 1e-5
@@ -14,7 +14,7 @@ _SMALLEST_STEP_M, _LARGEST_STEP_M = 5e-5, 0.05
 
 
 @dataclass(frozen=True)
-class Comb:
+class RangeStep:
     """step_m of the recorded ranges; std_m: by the grid it was searched on; strength: mean resultant length modulo the step."""
 
     step_m: float
@@ -22,7 +22,7 @@ class Comb:
     strength: float
 
 
-def find_comb(ranges: FloatArray) -> Comb | None:
+def find_range_step(ranges: FloatArray) -> RangeStep | None:
     """The step to which ranges (n,), m, are rounded (multiples of it, from 0), if any.
 
     Where a file holds coordinates in steps of its own, ranges computed from them are smooth again.
@@ -35,18 +35,18 @@ def find_comb(ranges: FloatArray) -> Comb | None:
     strength = np.abs(np.fft.rfft(counts, size)) / len(ranges)
     frequency = np.arange(len(strength)) / (size * _BIN_M)
     allowed = (frequency > 1 / _LARGEST_STEP_M) & (frequency < 1 / _SMALLEST_STEP_M)
-    candidates = np.flatnonzero(allowed & (strength > decided().quantization.strong))
+    candidates = np.flatnonzero(allowed & (strength > thresholds().quantization.least_resultant))
     if not len(candidates):
         return None
     first = candidates[0]  # the fundamental; its multiples come later
     near = slice(first, first + int(0.1 * first) + 2)
     peak = first + int(np.argmax(strength[near]))
-    step = _refined(ranges, 1 / float(frequency[peak]), reach)
+    step = _refine_step(ranges, 1 / float(frequency[peak]), reach)
     coherence = float(np.abs(np.exp(2j * np.pi * ranges / step).mean()))
-    return Comb(step, 1e-4 * step**2 / reach, coherence) if coherence > decided().quantization.strong else None
+    return RangeStep(step, 1e-4 * step**2 / reach, coherence) if coherence > thresholds().quantization.least_resultant else None
 
 
-def _refined(ranges: FloatArray, step: float, reach: float) -> float:
+def _refine_step(ranges: FloatArray, step: float, reach: float) -> float:
     """The step of the largest resultant at phase 0: multiples are counted from range 0, which fixes the step far better."""
     some = ranges[:: max(len(ranges) // 4000, 1)]
     for width in (step**2 / reach, 0.05 * step**2 / float(ranges.max())):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
 from pipeline.gap.survey.planned import measured_survey
 from sensors.effects import effect_of
@@ -17,23 +17,23 @@ _IN_GENERAL = {
 }
 
 
-def with_splits(measurement: Measurement, named: list[Named]) -> list[Named]:
+def with_separating_measurements(measurement: Measurement, named: list[NamedEffect]) -> list[NamedEffect]:
     """Effects that are alike to others with what would split them, by their signatures in the survey and one measurement more."""
     if not any(item.alike for item in named):
         return named
     found = identifiability(measured_survey(measurement, _POINTS))
-    return [replace(item, split_by=_split(found, item)) if item.alike else item for item in named]
+    return [replace(item, split_by=_separating_measurement(found, item)) if item.alike else item for item in named]
 
 
-def split_of_noises(item: Named, sensor: str) -> str:
+def measurement_separating_noises(item: NamedEffect, sensor: str) -> str:
     """What would show which of some noises it is, by what they depend on; white noise depends on nothing."""
     told = (effect_of(name).told_by for name in (item.name, *item.alike))
     return " or ".join(filter(None, told)) or _IN_GENERAL[sensor]
 
 
-def _split(found: Identifiability, item: Named) -> str:
+def _separating_measurement(found: Identifiability, item: NamedEffect) -> str:
     if item.spreads:
-        return split_of_noises(item, found.sensor)
+        return measurement_separating_noises(item, found.sensor)
     known = [found.names.index(name) for name in item.alike if name in found.names]
     if item.name not in found.names or len(known) < len(item.alike):
         return _IN_GENERAL[found.sensor]  # lost returns, and effects beside edges, have no signature in the mean

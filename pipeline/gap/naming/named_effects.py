@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import SURFACE, Candidate
 from pipeline.gap.mean.selection import Chosen
-from pipeline.gap.other.locking import Locking
-from pipeline.gap.other.missing import MissingFound
-from pipeline.gap.other.quantization import Comb
-from pipeline.gap.other.shapes import ShapeFound
-from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
+from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
+from pipeline.gap.noise_and_edges.pixel_locking import Locking
+from pipeline.gap.noise_and_edges.rounded_ranges import RangeStep
+from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.registration import Settled, settled
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -33,17 +33,17 @@ from sensors.effects.range_quantization import RangeQuantization
 from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.numerics.curve import Axis, interpolate_on_host
 
-_NODES, _GRID, _JOINED, _MOST_POINTS = 65, 17, 257, 20_000
+_CURVE_NODES, _SURFACE_NODES, _SUM_NODES, _MOST_POINTS = 65, 17, 257, 20_000
 """Of the curve of an empirical term, of each side of a surface, and of a sum of curves."""
-_FITTED = 1.1
+_STD_INFLATION = 1.1
 """How much more the parameters scatter than the covariance says: that of the reference's error is itself fitted.
 By development cases, of whose 61 intervals of 90 % without it 52 held the truth."""
-_WEAKEST = 20
+_WEAKEST_POWERS = 20
 """Spacings of the weakest powers that tell how near they come to a limit."""
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedEffect:
     """One effect of gap.json.
 
     name: with the sensor's prefix; entry: of a model's `effects`; std: of the parameters; p_value: by draws, None where none were
@@ -92,9 +92,9 @@ def with_effects(
     return parse(type(model), {**values, **changed}, "model_after.yaml")
 
 
-def settled_with(
+def aligned_with(
     measurement: Measurement,
-    effects: Iterable[Named],
+    effects: Iterable[NamedEffect],
     trusted: NDArray[np.int64] | None = None,
     noise: dict[str, float] | None = None,
 ) -> Settled:
@@ -115,34 +115,34 @@ def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     return True
 
 
-def only_within_bounds(model: TlsModel | StereoModel, named: list[Named]) -> tuple[list[Named], list[str]]:
+def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) -> tuple[list[NamedEffect], list[str]]:
     """The effects whose values a config may hold, and words for the others: what no model can hold explains nothing."""
     kept = [item for item in named if within_bounds(model, item.entry)]
     return kept, [f"{item.name} left out: the best value is beyond what a config may hold" for item in named if item not in kept]
 
 
-def is_possible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
+def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     """Whether an entry's values lie within the bounds of its effect and are not far beyond what is typical of it."""
     if not within_bounds(model, entry):
         return False
-    return typical_sizes(entry) <= decided().mean.largest_size
+    return relative_size(entry) <= thresholds().mean.largest_size
 
 
-def typical_sizes(entry: dict[str, Any]) -> float:
+def relative_size(entry: dict[str, Any]) -> float:
     """How many times its typical size an effect has; 0 of one that is not in the catalogue."""
     effect = effect_of(entry["name"])
     sizes = effect.typical_sizes() if effect.catalogue else {}
     return max((abs(entry.get(key, 0.0) / typical) for key, typical in sizes.items()), default=0.0)
 
 
-def from_comb(comb: Comb, part: Residuals) -> Named:
+def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
     """Steps of the range. Gain: of the probability that all ranges lie on the comb, an e-fold each at the least."""
     entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
     name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
-    return Named(name, "physical", entry, {"step_m": comb.std_m}, (), None, gain)
+    return NamedEffect(name, "physical", entry, {"step_m": comb.std_m}, (), None, gain)
 
 
-def from_locking(found: Locking) -> Named:
+def effect_from_locking(found: Locking) -> NamedEffect:
     """Locking that the measured disparities show."""
     entry = {
         "name": PixelLocking.tag(),
@@ -151,40 +151,40 @@ def from_locking(found: Locking) -> Named:
         "phase_rad": found.phase_rad,
         "tilt_rad": found.tilt_rad,
     }
-    return Named(f"stereo.{PixelLocking.tag()}", "physical", entry, {"amplitude_px": found.std_px}, (), None, found.gain)
+    return NamedEffect(f"stereo.{PixelLocking.tag()}", "physical", entry, {"amplitude_px": found.std_px}, (), None, found.gain)
 
 
-def from_spread(found: SpreadFound, sensor: str) -> Named:
+def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
     """An effect on the spread of laser ranges or disparities."""
     alike = tuple(f"{sensor}.{name}" for name in found.alike)
     empirical = found.empirical or effect_of(found.effect).empirical
     entry = {"name": found.effect, **found.parameters}
     name, kind = f"{sensor}.{found.effect}", "empirical" if empirical else "physical"
-    return Named(name, kind, entry, found.std, () if empirical else alike, found.p_value, found.gain)
+    return NamedEffect(name, kind, entry, found.std, () if empirical else alike, found.p_value, found.gain)
 
 
-def from_shape(found: ShapeFound) -> Named:
+def effect_from_edges(found: EdgeEffect) -> NamedEffect:
     """An effect where the surface is not smooth."""
     entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
-    return Named(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
+    return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
-def from_tails(part: Residuals, sigma: float, gain: float) -> Named:
+def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
     """Noise with heavy tails, which the catalogue does not have: its standard deviation as white noise, marked empirical."""
     noise, key = part.noise
-    return Named(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
+    return NamedEffect(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
 
 
-def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:
+def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
     """An effect on the returns; a detection limit shows as the smallest recorded power."""
     parameters, std = dict(found.parameters), dict(found.std)
     kind = "empirical" if found.covariate else "physical"
     if found.name == DetectionLimit.tag() and intensity is not None:
         # above a limit the weakest powers lie about as far apart as the weakest lies above it
-        low = np.sort(intensity)[: _WEAKEST + 1]
+        low = np.sort(intensity)[: _WEAKEST_POWERS + 1]
         gap = float(low[-1] - low[0]) / (len(low) - 1)
         parameters["minimum_power"], std["minimum_power"] = float(low[0]) - gap, gap
-    return Named(f"tls.{found.name}", kind, {"name": found.name, **parameters}, std, (), None, found.gain)
+    return NamedEffect(f"tls.{found.name}", kind, {"name": found.name, **parameters}, std, (), None, found.gain)
 
 
 @dataclass(frozen=True)
@@ -197,21 +197,23 @@ class Estimate:
     covariance: FloatArray
 
 
-def from_mean(found: Estimate, part: Residuals) -> Named:
+def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
     """An effect on the mean; part: the residuals on whose rows its candidate stands."""
     if found.candidate.empirical:
-        return _empirical(found.candidate, found.values, found.chosen, part)
-    return _physical(found.candidate, found.values, found.covariance, found.chosen, part)
+        return _empirical_effect(found.candidate, found.values, found.chosen, part)
+    return _physical_effect(found.candidate, found.values, found.covariance, found.chosen, part)
 
 
-def _physical(candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals) -> Named:
+def _physical_effect(
+    candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals
+) -> NamedEffect:
     entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(values)}
-    std = _uncertainty(candidate, values, covariance)
+    std = _standard_deviations(candidate, values, covariance)
     alike = tuple(f"{part.sensor}.{name}" for name in item.alike)
-    return Named(f"{part.sensor}.{candidate.name}", "physical", _plain(entry), std, alike, item.p_value, item.gain)
+    return NamedEffect(f"{part.sensor}.{candidate.name}", "physical", _plain_numbers(entry), std, alike, item.p_value, item.gain)
 
 
-def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
+def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
     """Standard deviations of the parameters, by finite differences of what the coefficients mean."""
     base = candidate.parameters(values)
     steps = np.sqrt(np.maximum(np.diag(covariance), 1e-300)) * 1e-3
@@ -221,74 +223,76 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
             (candidate.parameters(values + step * unit)[key] - base[key]) / step
             for step, unit in zip(steps, np.eye(len(values)), strict=True)
         ]
-        std[key] = _FITTED * float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
+        std[key] = _STD_INFLATION * float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
     return std
 
 
-def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:
+def _empirical_effect(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> NamedEffect:
     """A free form by values: over one cycle of a periodic one, else over all of its covariate that occurs."""
     error = candidate.columns @ values[: candidate.columns.shape[1]]
     if candidate.angle and isinstance(part, TlsResiduals):
-        return _of_an_angle(candidate, error, item, part)
+        return _angle_term(candidate, error, item, part)
     term, key = part.described_by
-    found = _surface(candidate, error, part) if candidate.form == SURFACE else _curve(candidate, error, part)
-    rows = _rows(found.pop("values"))
+    found = _surface_nodes(candidate, error, part) if candidate.form == SURFACE else _curve_nodes(candidate, error, part)
+    rows = _rounded_rows(found.pop("values"))
     entry = {"name": term.tag(), **found, key: rows}
-    return Named(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
+    return NamedEffect(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
 
 
-def _of_an_angle(candidate: Candidate, error: FloatArray, item: Chosen, part: TlsResiduals) -> Named:
+def _angle_term(candidate: Candidate, error: FloatArray, item: Chosen, part: TlsResiduals) -> NamedEffect:
     """Its curve is found back from the ranges where the surface slants more than at half of the points."""
     levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
     lever = -levers[candidate.angle]
     steep = np.abs(lever) > np.median(np.abs(lever))
-    found = _curve(candidate, np.divide(error, lever, out=np.zeros_like(error), where=steep), part, steep)
-    rows = _rows(found.pop("values"))
+    found = _curve_nodes(candidate, np.divide(error, lever, out=np.zeros_like(error), where=steep), part, steep)
+    rows = _rounded_rows(found.pop("values"))
     entry = {"name": AngleEmpirical.tag(), "angle": candidate.angle, **found, "values_rad": rows}
-    return Named(f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
+    return NamedEffect(f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
 
 
-def with_corrections(angles: list[Named], later: list[Named], part: Residuals) -> tuple[list[Named], list[Named]]:
+def merge_angle_curves(
+    angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
+) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Curves of an angle's error with those that were found beside them along the same angle, as one; what remains of those."""
     joined, others = [], list(later)
     for term in angles:
         alike = [item for item in others if all(item.entry[key] == term.entry[key] for key in ("angle", "covariate"))]
         others = [item for item in others if item not in alike]
-        joined.append(_joined(term, alike, part) if alike else term)
+        joined.append(_sum_of_curves(term, alike, part) if alike else term)
     return joined, others
 
 
-def _joined(term: Named, later: list[Named], part: Residuals) -> Named:
+def _sum_of_curves(term: NamedEffect, later: list[NamedEffect], part: Residuals) -> NamedEffect:
     """The sum of curves, over all of the angle that occurs."""
     x = part.covariates[term.entry["covariate"]]
     low, high = float(x.min()), float(x.max())
-    nodes = np.linspace(low, high, _JOINED)
+    nodes = np.linspace(low, high, _SUM_NODES)
     curves = ((Axis(**item.entry["along"]), item.entry["values_rad"]) for item in (term, *later))
     total = sum(interpolate_on_host(nodes, nodes, along, Axis(), values) for along, values in curves)
-    return replace(term, entry={**term.entry, "along": {"low": low, "high": high}, "values_rad": _rows([total])})
+    return replace(term, entry={**term.entry, "along": {"low": low, "high": high}, "values_rad": _rounded_rows([total])})
 
 
-def _rows(values: Any) -> list[list[float]]:
+def _rounded_rows(values: Any) -> list[list[float]]:
     return [[float(f"{value:.6g}") for value in row] for row in values]
 
 
-def _curve(candidate: Candidate, error: FloatArray, part: Residuals, rows: Any = slice(None)) -> dict[str, Any]:
+def _curve_nodes(candidate: Candidate, error: FloatArray, part: Residuals, rows: Any = slice(None)) -> dict[str, Any]:
     """rows: those whose error (n,) is known."""
     x = part.covariates[candidate.name]
     cycle = candidate.period * ((float(x.std()) or 1.0) if candidate.form == "wave" else 1.0)
-    x = x + _shift(candidate.name, part)  # as the sensor counts it, before it is folded
+    x = x + _covariate_offset(candidate.name, part)  # as the sensor counts it, before it is folded
     low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))
     turned, error = (np.mod(x, cycle) if cycle else x)[rows], error[rows]
     order = np.argsort(turned)
-    curve = np.interp(np.linspace(low, high, _NODES), turned[order], error[order], period=cycle or None)
+    curve = np.interp(np.linspace(low, high, _CURVE_NODES), turned[order], error[order], period=cycle or None)
     return {"covariate": candidate.name, "along": {"low": low, "high": high, "period": cycle}, "values": [curve]}
 
 
-def _surface(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
+def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
     """The polynomial again, at the nodes of a grid: it is found back from its values at the points."""
     first, second = part.planes
     x, y = part.covariates[first], part.covariates[second]
-    axes = [np.linspace(values.min(), values.max(), _GRID) for values in (x, y)]
+    axes = [np.linspace(values.min(), values.max(), _SURFACE_NODES) for values in (x, y)]
     nodes = np.meshgrid(*axes)
     thin = slice(None, None, max(len(x) // _MOST_POINTS, 1))
     columns, there = (
@@ -303,12 +307,12 @@ def _surface(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[s
     return {"covariate": first, "along": along, "second": second, "across": across, "values": values}
 
 
-def _shift(covariate: str, part: Residuals) -> float:
+def _covariate_offset(covariate: str, part: Residuals) -> float:
     """What an effect's covariate is more than that of the residuals, which is relative for the power."""
     if covariate != "intensity" or not isinstance(part, TlsResiduals):
         return 0.0
     return float(np.median(np.log(np.maximum(part.geometry.power, 1e-12)) - part.covariates[covariate]))
 
 
-def _plain(entry: dict[str, Any]) -> dict[str, Any]:
+def _plain_numbers(entry: dict[str, Any]) -> dict[str, Any]:
     return {key: float(value) if isinstance(value, np.floating) else value for key, value in entry.items()}

@@ -17,24 +17,24 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import j1, jv
 
-from pipeline.gap.decisions import decided
+from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 _SCALE_UNKNOWN, _TILT_UNKNOWN = 0.03, 0.1
 """By how much the principal distance of the matcher's rectification may be another, and its turn about the base, rad."""
-_BESIDE = 0.18
+_SHAPE_BAND = 0.18
 """Frequencies about that of whole pixels, as a share of it, at which what crowds is the wall's shape."""
 _BINS_A_CYCLE, _STEPS_A_CYCLE = 8, 4
 _MOST_BINS = 4096
-_LARGEST = 0.6
+_LARGEST_AMPLITUDE = 0.6
 """Amplitude in matched pixels."""
-_AROUND = 0.06
+_PROFILE_HALF_WIDTH = 0.06
 """Matched pixels about the best amplitude over which its spread is taken: twice that of one that noise nearly hides."""
-_NOISE_UNSURE, _LEAST_LEFT = 0.1, 0.01
+_NOISE_UNCERTAINTY, _LEAST_NOISE_SHARE = 0.1, 0.01
 """Share by which the noise may be another than predicted and measured; of the measured variance, what is noise at least."""
 _MULTIPLES = np.arange(1, 5)
-_FOLDING, _FAR, _NO_SINE = 1 / (2 * np.pi), 0.3, 0.02
+_FOLDING, _LARGE_AMPLITUDE, _HARMONIC_MISFIT = 1 / (2 * np.pi), 0.3, 0.02
 _MOST_POINTS = 60_000
 
 
@@ -52,21 +52,23 @@ class Locking:
 
 
 @dataclass(frozen=True)
-class SpreadAllowed:
+class NoiseBounds:
     """Standard deviations, px, of the noise that a model predicts, and of what was measured about the surface as known, noise and
     locking together. Of small amplitudes the first multiple alone shows, whose size the noise changes as they do."""
 
     predicted: float
     measured: float
 
-    def in_pixels(self, frequency: float) -> SpreadAllowed:
+    def in_pixels(self, frequency: float) -> NoiseBounds:
         """In matched pixels, of so many a px."""
-        return SpreadAllowed(self.predicted * frequency, self.measured * frequency)
+        return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
     def blurs(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
         """From and to which the noise may be beside each amplitude, px."""
-        left = np.sqrt(np.maximum(self.measured**2 - amplitude**2 / 2, _LEAST_LEFT * self.measured**2))
-        return (1 - _NOISE_UNSURE) * np.minimum(left, self.predicted), (1 + _NOISE_UNSURE) * np.maximum(left, self.predicted)
+        left = np.sqrt(np.maximum(self.measured**2 - amplitude**2 / 2, _LEAST_NOISE_SHARE * self.measured**2))
+        return (1 - _NOISE_UNCERTAINTY) * np.minimum(left, self.predicted), (1 + _NOISE_UNCERTAINTY) * np.maximum(
+            left, self.predicted
+        )
 
 
 def find_locking(
@@ -74,7 +76,7 @@ def find_locking(
     reference: FloatArray,
     tangent: FloatArray | float = 0.0,
     infinity: FloatArray | float = 0.0,
-    spread: SpreadAllowed | None = None,
+    spread: NoiseBounds | None = None,
 ) -> Locking | None:
     """The locking that measured disparities (n,), px, show, if any: n |R|^2 is exponential where there is none (Rayleigh).
 
@@ -88,22 +90,22 @@ def find_locking(
     count, reach = len(some), float(np.ptp(np.quantile(some, [0.02, 0.98])))
     best: tuple[float, float, float, float] | None = None
     for reduction in _REDUCTIONS:
-        if reach < decided().locking.fewest_cycles * reduction:
+        if reach < thresholds().locking.fewest_cycles * reduction:
             continue
         whole = 1 / reduction
-        frequency, tilt, _, tries = _strongest(some, rows, whole, _SCALE_UNKNOWN)
-        _, _, crowded, tries_beside = _strongest(known, rows, whole, _BESIDE)
+        frequency, tilt, _, tries = _strongest_crowding(some, rows, whole, _SCALE_UNKNOWN)
+        _, _, crowded, tries_beside = _strongest_crowding(known, rows, whole, _SHAPE_BAND)
         shape = np.sqrt(max(crowded**2 - np.log(tries_beside) / count, 0.0))
-        frequency, tilt = _refined(some, rows, frequency, tilt)
+        frequency, tilt = _refine_frequency(some, rows, frequency, tilt)
         crowds = _crowding(some, rows, frequency, tilt)
-        gain = count * max(crowds - decided().locking.crowding * shape, 0.0) ** 2
+        gain = count * max(crowds - thresholds().locking.crowding_ratio * shape, 0.0) ** 2
         if best is None or gain > best[0]:
             best = gain, frequency, tilt, tries
     if best is None:
         return None
     gain, frequency, tilt, tries = best
     by_chance = min(1.0, len(_REDUCTIONS) * tries * float(np.exp(-gain)))
-    if by_chance > decided().locking.significance:
+    if by_chance > thresholds().locking.significance:
         return None
     pixels = frequency * (some / (1 + np.tan(tilt) * rows) + far)
     strength = np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES])
@@ -113,7 +115,9 @@ def find_locking(
     return Locking(share / frequency, error / frequency, 1 / frequency, phase, tilt, float(gain))
 
 
-def _strongest(disparity: FloatArray, tangent: FloatArray, whole: float, share: float) -> tuple[float, float, float, float]:
+def _strongest_crowding(
+    disparity: FloatArray, tangent: FloatArray, whole: float, share: float
+) -> tuple[float, float, float, float]:
     """Frequency (1/px) within a share of `whole`, and tilt, at which disparities crowd most; how much; how many were tried.
 
     The mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phases of whole pixels, in
@@ -144,7 +148,7 @@ def _crowding(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt
     return float(abs(np.exp(2j * np.pi * frequency * disparity / (1 + np.tan(tilt) * tangent)).mean()))
 
 
-def _refined(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> tuple[float, float]:
+def _refine_frequency(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> tuple[float, float]:
     """Frequency and tilt at the top of the crowding."""
     unit = 1 / float(np.ptp(disparity)), 1 / (frequency * max(float(np.ptp(disparity * tangent)), 1e-9))
 
@@ -157,7 +161,7 @@ def _refined(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt:
     return frequency + top[0] * unit[0], tilt + top[1] * unit[1]
 
 
-def _amplitude(strength: FloatArray, count: int, spread: SpreadAllowed | None) -> tuple[float, float]:
+def _amplitude(strength: FloatArray, count: int, spread: NoiseBounds | None) -> tuple[float, float]:
     """Amplitude and its standard deviation, matched pixels, from the mean of each multiple: least squares over blur and it.
 
     spread: in matched pixels.
@@ -171,12 +175,12 @@ def _amplitude(strength: FloatArray, count: int, spread: SpreadAllowed | None) -
             return found
         least, most = spread.blurs(share)
         beyond = np.maximum(least[:, None] - blur, 0) + np.maximum(blur - most[:, None], 0)
-        return np.asarray(found + (beyond / (_NOISE_UNSURE * spread.predicted)) ** 2)
+        return np.asarray(found + (beyond / (_NOISE_UNCERTAINTY * spread.predicted)) ** 2)
 
-    largest = decided().locking.most_blur
-    shares, blurs = np.linspace(0.002, _LARGEST, 400), np.linspace(0.0, largest, 60)
+    largest = thresholds().locking.most_noise
+    shares, blurs = np.linspace(0.002, _LARGEST_AMPLITUDE, 400), np.linspace(0.0, largest, 60)
     coarse = square(shares, blurs)
-    row = _plausible(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)
+    row = _plausible_minimum(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)
     for width in (0.01, 0.002):
         column = int(np.argmin(coarse[row]))
         shares = shares[row] + np.linspace(-width, width, 81)
@@ -185,7 +189,7 @@ def _amplitude(strength: FloatArray, count: int, spread: SpreadAllowed | None) -
         row = int(np.argmin(coarse.min(axis=1)))
     best = float(coarse.min())
     # its spread, the blur free within what is allowed
-    around = np.maximum(shares[row] + np.linspace(-_AROUND, _AROUND, 201), 0.0)
+    around = np.maximum(shares[row] + np.linspace(-_PROFILE_HALF_WIDTH, _PROFILE_HALF_WIDTH, 201), 0.0)
     profile = square(around, np.linspace(0.0, largest, 200)).min(axis=1)
     weight = np.exp(-0.5 * (profile - profile.min()) / max(best, 1.0))
     weight /= weight.sum()
@@ -193,17 +197,19 @@ def _amplitude(strength: FloatArray, count: int, spread: SpreadAllowed | None) -
     return mean, float(np.sqrt(weight @ (around - mean) ** 2 + 1e-8))
 
 
-def _plausible(shares: FloatArray, square: FloatArray, whole: float) -> int:
+def _plausible_minimum(shares: FloatArray, square: FloatArray, whole: float) -> int:
     """Row of the amplitude that is meant, of the minima of chi^2: Bessel functions come back to the same values.
 
     whole: chi^2 of no locking. Of amplitudes that fit alike it is the least; one that folds disparities over, from 1 / 2 pi on,
     has to fit well, and one beyond `_FAR` gives way to a small one that leaves as little as a matcher's curve is no sine.
     """
     lowest = (square <= np.append(square[1:], np.inf)) & (square <= np.append(np.inf, square[:-1]))
-    rows = np.flatnonzero(lowest & (square < square.min() + decided().locking.alike))
+    rows = np.flatnonzero(lowest & (square < square.min() + thresholds().locking.equal_fit))
     unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
     if len(unfolded):
         small = int(unfolded[np.argmin(square[unfolded])])
-        if square.min() > decided().locking.fits or (shares[rows[0]] > _FAR and square[small] < _NO_SINE * whole):
+        if square.min() > thresholds().locking.good_fit or (
+            shares[rows[0]] > _LARGE_AMPLITUDE and square[small] < _HARMONIC_MISFIT * whole
+        ):
             return small
     return int(rows[0])

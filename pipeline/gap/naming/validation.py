@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.decisions import decided
-from pipeline.gap.naming.entries import Named, settled_with, with_effects
-from pipeline.gap.naming.verify import LOSS_MEASURE, Gap, Version, measure_gap, measure_losses, thinned
-from pipeline.gap.other.missing import MissingFound
+from pipeline.gap.naming.gap_score import LOSS_MEASURE, Gap, RegisteredModel, measure_gap, measure_losses, subsampling
+from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, with_effects
+from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
 from pipeline.gap.residuals.registration import pose_of
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
@@ -23,11 +23,11 @@ _FEWEST_POINTS = 100
 
 
 @dataclass(frozen=True)
-class Shown:
+class ValidationResult:
     """The model with some effects, and values of a lower noise, (n,) residuals against it, registered, the pose (6,) of that, and
     the gap that is left."""
 
-    named: list[Named]
+    named: list[NamedEffect]
     lower: dict[str, float]
     model: TlsModel | StereoModel
     value: FloatArray
@@ -49,12 +49,12 @@ class Shown:
         return (
             self.is_worse
             and self.gap is not None
-            and self.gap.after - self.gap.before > decided().verdict.gap_sigmas * self.gap.error
+            and self.gap.after - self.gap.before > thresholds().verdict.gap_sigmas * self.gap.error
         )
 
 
 @dataclass(frozen=True)
-class Showing:
+class Validation:
     """What a gap is measured with.
 
     measurement: where its sensor stood; residuals: against its model, of which the rows `chosen` register; tested, learned: (n,)
@@ -68,7 +68,7 @@ class Showing:
     chosen: NDArray[np.int64]
     tested: BoolArray
     learned: BoolArray
-    losses: tuple[MissingFound, BoolArray] | None
+    losses: tuple[LossExplanation, BoolArray] | None
     reference_sigma: float
     largest: float
     random: KeyedRandom
@@ -79,7 +79,7 @@ class Showing:
         """(6,) by which the model as it is is registered."""
         return pose_of(self.residuals, self.chosen)
 
-    def show(self, named: list[Named]) -> tuple[Shown, list[str]]:
+    def show(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
         """The gap on points that no step has used, and words for effects that are taken out.
 
         As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, by
@@ -91,7 +91,7 @@ class Showing:
         if self.lower and shown.is_worse:
             return replace(self, lower={}).show(named)
         while shown.is_worse:
-            doubtful = [item for item in _scored(shown.named) if shown.is_clearly_worse or _may_be_harmful(item)]
+            doubtful = [item for item in _without_losses(shown.named) if shown.is_clearly_worse or _may_be_dropped(item)]
             harms = [self._harm(shown, item) for item in doubtful]
             if max(harms, default=0.0) <= 0:
                 break
@@ -100,32 +100,34 @@ class Showing:
             shown = self._of([item for item in shown.named if item is not out], self.tested)
         return shown, words
 
-    def _harm(self, shown: Shown, item: Named) -> float:
+    def _harm(self, shown: ValidationResult, item: NamedEffect) -> float:
         """By how much more than its uncertainty the model predicts the points that may be looked at worse with an effect than
         without; the same points, since an effect that moves some far may bring others near."""
         others = [each for each in shown.named if each is not item]
-        without = Version(self._model(_scored(others)), self._registered(others)[1])
-        gap = self._gap(shown.named, (without, Version(self._model(_scored(shown.named)), shown.pose)), self.learned)
-        return 0.0 if gap is None else gap.after - gap.before - decided().verdict.gap_sigmas * gap.error
+        without = RegisteredModel(self._model(_without_losses(others)), self._registered(others)[1])
+        gap = self._gap(
+            shown.named, (without, RegisteredModel(self._model(_without_losses(shown.named)), shown.pose)), self.learned
+        )
+        return 0.0 if gap is None else gap.after - gap.before - thresholds().verdict.gap_sigmas * gap.error
 
-    def _model(self, named: list[Named]) -> TlsModel | StereoModel:
+    def _model(self, named: list[NamedEffect]) -> TlsModel | StereoModel:
         return with_effects(self.measurement.model, [item.entry for item in named], self.lower)
 
-    def _of(self, named: list[Named], rows: BoolArray) -> Shown:
+    def _of(self, named: list[NamedEffect], rows: BoolArray) -> ValidationResult:
         value, pose = self._registered(named)
-        versions = Version(self.measurement.model, self.pose), Version(self._model(_scored(named)), pose)
-        return Shown(named, self.lower, self._model(named), value, pose, self._gap(named, versions, rows))
+        versions = RegisteredModel(self.measurement.model, self.pose), RegisteredModel(self._model(_without_losses(named)), pose)
+        return ValidationResult(named, self.lower, self._model(named), value, pose, self._gap(named, versions, rows))
 
-    def _registered(self, named: list[Named]) -> tuple[FloatArray, FloatArray]:
+    def _registered(self, named: list[NamedEffect]) -> tuple[FloatArray, FloatArray]:
         """(n,) residuals of the same points with some effects, NaN where their rays miss the reference; the pose (6,)."""
         if not (named or self.lower):
             return self.residuals.value - self.residuals.pose @ self.pose, self.pose
         trusted = self.residuals.index[self.chosen]
-        _, found, there = settled_with(self.measurement, named, trusted, self.lower)
+        _, found, there = aligned_with(self.measurement, named, trusted, self.lower)
         rest = pose_of(found, found.smooth & np.isin(found.index, trusted))
         return found.of_points(found.value - found.pose @ rest, self.residuals.index), there + rest
 
-    def _gap(self, named: list[Named], versions: tuple[Version, Version], rows: BoolArray) -> Gap | None:
+    def _gap(self, named: list[NamedEffect], versions: tuple[RegisteredModel, RegisteredModel], rows: BoolArray) -> Gap | None:
         missing = self.residuals.missing
         if self.losses is not None and missing is not None and named and named[0].name == f"tls.{self.losses[0].name}":
             found, held_out = self.losses
@@ -134,16 +136,16 @@ class Showing:
         places = np.flatnonzero(rows)
         if len(places) < _FEWEST_POINTS:
             return None
-        part = self.residuals.part(places[thinned(len(places))])
+        part = self.residuals.part(places[subsampling(len(places))])
         random = self.random.child("verify")
         return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.largest, random)
 
 
-def _scored(named: list[Named]) -> list[Named]:
+def _without_losses(named: list[NamedEffect]) -> list[NamedEffect]:
     """Those that ranges are scored with: drops return early, which no range on the wall is like."""
     return [item for item in named if item.effect.shows_in != ShowsIn.RETURNS]
 
 
-def _may_be_harmful(item: Named) -> bool:
+def _may_be_dropped(item: NamedEffect) -> bool:
     """Of what is described, only noise: a term on the mean is not exact, and without it nothing would be said of it."""
     return item.spreads or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)

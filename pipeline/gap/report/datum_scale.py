@@ -10,13 +10,13 @@ import numpy as np
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, datum_covariance
 
-_FEWEST = 100
-_CLEAR = 3.0
+_FEWEST_POINTS = 100
+_SIGNIFICANT_SIGMAS = 3.0
 """Standard deviations from which on a scale is said to be wrong."""
 
 
 @dataclass(frozen=True)
-class Scale:
+class DatumScale:
     """By how much a cloud is larger than the reference, with its standard deviation, ppm."""
 
     ppm: float
@@ -26,7 +26,7 @@ class Scale:
     def words(self) -> str:
         """A sentence."""
         std = f"\N{PLUS-MINUS SIGN} {self.std_ppm:.0f} ppm"
-        if abs(self.ppm) < _CLEAR * self.std_ppm:
+        if abs(self.ppm) < _SIGNIFICANT_SIGMAS * self.std_ppm:
             return f"Its scale agrees with the reference's as far as the relief tells ({self.ppm:+.0f} {std})."
         which = "larger" if self.ppm > 0 else "smaller"
         return (
@@ -39,13 +39,13 @@ class Scale:
         return {"value": self.ppm, "std": self.std_ppm}
 
 
-def scale_of(found: GapDiagnosis) -> Scale | None:
+def estimate_scale(found: GapDiagnosis) -> DatumScale | None:
     """Of a surface without cameras; None of what has no scale of its own, or too few points."""
     residuals = found.residuals
     if not isinstance(residuals, SurfaceResiduals) or not residuals.datum[6].any():
         return None
-    rows = residuals.smooth & ~found.held_out & (abs(found.after) < found.decisions.points.outlier * residuals.sigma)
-    if rows.sum() < _FEWEST:
+    rows = residuals.smooth & ~found.held_out & (abs(found.after) < found.thresholds.points.outlier_sigmas * residuals.sigma)
+    if rows.sum() < _FEWEST_POINTS:
         return None
     stretch, variance = residuals.datum[6] @ found.pose, datum_covariance(residuals, found.after, rows)[6, 6]
-    return Scale(1e6 * (1 / (1 + float(stretch)) - 1), 1e6 * float(np.sqrt(variance)))
+    return DatumScale(1e6 * (1 / (1 + float(stretch)) - 1), 1e6 * float(np.sqrt(variance)))

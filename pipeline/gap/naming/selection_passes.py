@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement
-from pipeline.gap.decisions import decided
-from pipeline.gap.naming.entries import Named, from_shape, settled_with, with_effects
-from pipeline.gap.naming.families import believes
-from pipeline.gap.naming.naming import Naming, name_effects
-from pipeline.gap.other.mixed_pixels import find_footprint
-from pipeline.gap.other.shapes import ShapeFound
-from pipeline.gap.other.stereo_shapes import find_shapes
+from pipeline.gap.naming.candidate_families import model_has
+from pipeline.gap.naming.effect_selection import SelectionResult, select_effects
+from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, effect_from_edges, with_effects
+from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
+from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.changes import SceneChange, find_changes, once_each
 from pipeline.gap.residuals.registration import registered, residuals_of, settled
@@ -23,19 +22,20 @@ from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import Sight
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.smoothing import Smoothing
 
-_LEAST = 0, 1
+_LEAST_COMPLEXITY = 0, 1
 """One effect, the least complexity that an attempt can have where there is something."""
 _MOST_POINTS = 60_000
 """Points that take part in the selection; more add little to 1,100 cells."""
 
 
 @dataclass(frozen=True)
-class State:
+class PassInput:
     """What naming starts from, once effects where the surface is not smooth are known.
 
     shaped: the measurement with them in its model; residuals: against that; touched, changed, held_out: (n,) points that they
@@ -43,7 +43,7 @@ class State:
     spread `scale` predicted sigmas; chosen: rows that selection may look at.
     """
 
-    shapes: list[ShapeFound]
+    shapes: list[EdgeEffect]
     shaped: Measurement
     residuals: Residuals
     touched: BoolArray
@@ -61,13 +61,13 @@ class State:
         there: Measurement,
         plain: Residuals,
         held_points: BoolArray,
-        shapes: list[ShapeFound],
+        shapes: list[EdgeEffect],
         resettled: bool = True,
-    ) -> State:
+    ) -> PassInput:
         """held_points: of the measurement, as what shapes touch; resettled: the sensor goes where it stood with the shapes."""
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in shapes)], axis=0)
         trusted = plain.index[~(touched | held_points[plain.index])] if resettled else None
-        shaped, residuals = _shaped(there, plain, shapes, touched, trusted)
+        shaped, residuals = _with_edge_effects(there, plain, shapes, touched, trusted)
         rough, _, scale = registered(residuals)
         sight = Sight.of(there, residuals)
         changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
@@ -76,8 +76,8 @@ class State:
         rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
         held_out = held_points[residuals.index]
-        usable = residuals.smooth & ~changed & (np.abs(rough) < decided().points.outlier * scale * residuals.sigma)
-        chosen = thinned_rows(np.flatnonzero(usable & ~held_out))
+        usable = residuals.smooth & ~changed & (np.abs(rough) < thresholds().points.outlier_sigmas * scale * residuals.sigma)
+        chosen = subsample_rows(np.flatnonzero(usable & ~held_out))
         return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
 
     @property
@@ -98,20 +98,20 @@ class State:
             shaped = np.zeros(len(there.cloud.points))
             shaped[residuals.index] = residuals.geometry.shaped
             there = there.changed(shaped_px=shaped)
-        return few(there, residuals, self.chosen)
+        return subsample(there, residuals, self.chosen)
 
 
 @dataclass(frozen=True)
-class Attempt:
+class SelectionPass:
     """What naming started from and what it named."""
 
-    state: State
-    named: list[Named]
-    naming: Naming
+    state: PassInput
+    named: list[NamedEffect]
+    naming: SelectionResult
 
     @classmethod
-    def of(cls, state: State, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> Attempt:
-        return cls(state, *name_effects(*state.part, state.scale, random, left_out))
+    def of(cls, state: PassInput, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> SelectionPass:
+        return cls(state, *select_effects(*state.part, state.scale, random, left_out))
 
     @property
     def shapes(self) -> set[str]:
@@ -126,7 +126,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, eq=False)
-class Starts:
+class PassInputs:
     """From what naming may start. there, plain: the measurement and its residuals; held_points: (n,) of its points those that no
     step before the last may look at."""
 
@@ -135,35 +135,35 @@ class Starts:
     held_points: BoolArray
 
     @cached_property
-    def _shapes(self) -> list[ShapeFound]:
-        return _shapes(self.there, self.plain, self.held_points)
+    def _shapes(self) -> list[EdgeEffect]:
+        return _find_edge_effects(self.there, self.plain, self.held_points)
 
     @cached_property
-    def first(self) -> State:
+    def first(self) -> PassInput:
         """Beside the effects where the surface is not smooth."""
         return self.beside(self._shapes)
 
     @cached_property
-    def staying(self) -> State:
+    def staying(self) -> PassInput:
         """The same, with the sensor where it stood without them."""
-        return State.of(self.there, self.plain, self.held_points, self._shapes, resettled=False)
+        return PassInput.of(self.there, self.plain, self.held_points, self._shapes, resettled=False)
 
     @cached_property
-    def smooth(self) -> State:
+    def smooth(self) -> PassInput:
         """Without such effects."""
         return self.beside([])
 
-    def seen_beside(self, named: list[Named]) -> list[ShapeFound]:
+    def seen_beside(self, named: list[NamedEffect]) -> list[EdgeEffect]:
         """The effects where the surface is not smooth that show with some others in the model."""
-        seen = settled_with(self.there, named, self.plain.index[~self.held_points[self.plain.index]])
-        return _shapes(seen.measurement, seen.residuals, self.held_points)
+        seen = aligned_with(self.there, named, self.plain.index[~self.held_points[self.plain.index]])
+        return _find_edge_effects(seen.measurement, seen.residuals, self.held_points)
 
-    def beside(self, shapes: list[ShapeFound]) -> State:
+    def beside(self, shapes: list[EdgeEffect]) -> PassInput:
         """Beside some of those."""
-        return State.of(self.there, self.plain, self.held_points, shapes)
+        return PassInput.of(self.there, self.plain, self.held_points, shapes)
 
 
-def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> Attempt:
+def best_pass(starts: PassInputs, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> SelectionPass:
     """What the naming started from in the end, and what it named. left_out: as of `name_effects`.
 
     What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
@@ -173,7 +173,7 @@ def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, 
     takes the place of any effect.
     """
 
-    def beside(found: Attempt) -> Attempt:
+    def beside(found: SelectionPass) -> SelectionPass:
         if not found.named:
             return found
         # rays that are not quite where they are thought to be look like a low-pass
@@ -181,37 +181,37 @@ def attempt(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, 
         shapes = [each for each in starts.seen_beside(found.named) if each.name not in feigned]
         if {each.name for each in shapes} == found.shapes:
             return found
-        return Attempt.of(starts.beside(shapes), random, left_out)
+        return SelectionPass.of(starts.beside(shapes), random, left_out)
 
-    first = Attempt.of(starts.first, random, left_out)
+    first = SelectionPass.of(starts.first, random, left_out)
     found = [beside(first)]
-    if first.shapes and found[0].complexity > _LEAST:
-        smooth = Attempt.of(starts.smooth, random, left_out)
+    if first.shapes and found[0].complexity > _LEAST_COMPLEXITY:
+        smooth = SelectionPass.of(starts.smooth, random, left_out)
         if smooth.named:
             found.append(beside(smooth))
-    simple = found[-1].complexity <= _LEAST and found[-1].naming.spreads <= found[0].naming.spreads
+    simple = found[-1].complexity <= _LEAST_COMPLEXITY and found[-1].naming.spreads <= found[0].naming.spreads
     if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0) and not simple:
-        found.insert(1, beside(Attempt.of(starts.staying, random, left_out)))
-    widest = decided().shapes.wider * min(each.naming.spreads for each in found)
+        found.insert(1, beside(SelectionPass.of(starts.staying, random, left_out)))
+    widest = thresholds().edges.most_relative_noise * min(each.naming.spreads for each in found)
     return min((each for each in found if each.naming.spreads <= widest), key=lambda each: each.complexity)
 
 
-def thinned_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
     return rows[:: max(len(rows) // _MOST_POINTS, 1)]
 
 
-def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> list[ShapeFound]:
+def _find_edge_effects(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> list[EdgeEffect]:
     """Effects where the surface is not smooth that the model does not hold, with the measurement's points that they touch.
 
     held_points: of the measurement's points those that have no say.
     """
     rough, _, scale = registered(residuals)
-    found: list[ShapeFound] = []
+    found: list[EdgeEffect] = []
     held_out = held_points[residuals.index]
     match measurement, residuals:
         case StereoMeasurement(), StereoResiduals():
-            found = find_shapes(measurement, residuals, rough, held_out)
-        case TlsMeasurement(), TlsResiduals() if not believes(measurement, BeamDivergence.tag()):
+            found = find_disparity_edge_effects(measurement, residuals, rough, held_out)
+        case TlsMeasurement(), TlsResiduals() if not model_has(measurement, BeamDivergence.tag()):
             found = find_footprint(measurement, residuals, rough, scale, held_out)
     touched = np.zeros((len(found), len(measurement.cloud.points)), dtype=bool)
     for row, each in zip(touched, found, strict=True):
@@ -219,10 +219,10 @@ def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArr
     return [replace(each, touched=row) for each, row in zip(found, touched, strict=True)]
 
 
-def _shaped(
+def _with_edge_effects(
     measurement: Measurement,
     residuals: Residuals,
-    shapes: list[ShapeFound],
+    shapes: list[EdgeEffect],
     touched: BoolArray,
     trusted: NDArray[np.int64] | None,
 ) -> tuple[Measurement, Residuals]:
@@ -231,7 +231,7 @@ def _shaped(
     the sensor stood, None where it stays."""
     if not shapes:
         return measurement, residuals
-    entries = [from_shape(shape).entry for shape in shapes]
+    entries = [effect_from_edges(shape).entry for shape in shapes]
     shaped = measurement.changed(model=with_effects(measurement.model, entries))
     if trusted is None:
         found = residuals_of(shaped)
@@ -245,7 +245,7 @@ def _shaped(
     return shaped, replace(there, smooth=residuals.smooth & ~touched & known)
 
 
-def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
+def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
     """The measurement with the points of some rows of its residuals alone, and their residuals."""
     part = residuals.part(rows)
     return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.decisions import decided
-from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_noise import AngleNoise
@@ -23,9 +23,9 @@ from sensors.signal_chain.beam import Mode
 
 _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
-_FINER = (1.12, 1.03)
+_REFINEMENT_FACTORS = (1.12, 1.03)
 _MOST_POINTS = 30_000
-_PROFILE = 0.12
+_PROFILE_UNCERTAINTY = 0.12
 """Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
 
 _RANDOM = KeyedRandom(0, ("gap", "mean"))
@@ -33,20 +33,20 @@ _RANDOM = KeyedRandom(0, ("gap", "mean"))
 
 def find_footprint(
     measurement: TlsMeasurement, residuals: TlsResiduals, rough: FloatArray, scale: float, held_out: BoolArray
-) -> list[ShapeFound]:
+) -> list[EdgeEffect]:
     """The divergence that points at edges ask for beyond what the noise of angles does there, if any.
 
     rough: (n,) registered residuals, m; scale: sigmas they spread; held_out: (n,) points that have no say.
     """
-    sigma, footprint = scale * residuals.sigma, _Footprint(measurement, residuals)
+    sigma, footprint = scale * residuals.sigma, _FootprintSimulation(measurement, residuals)
     thin = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
     some = np.flatnonzero(~held_out)[thin]
     wide = footprint.moved(some, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
     some = some[np.abs(wide) > sigma[some]]
-    if len(some) < decided().shapes.footprint_fewest:
+    if len(some) < thresholds().edges.footprint_fewest:
         return []
     blocks = WallBlocks(WallBlocks.over(residuals.at).number[some])
-    jittered = footprint.moved(some, ("mean",), _width_of_noise(measurement.model))["mean"]
+    jittered = footprint.moved(some, ("mean",), _equivalent_divergence(measurement.model))["mean"]
     without = [log_density(rough[some], moved, sigma[some]) for moved in (np.zeros_like(jittered), jittered)]
     null = np.logaddexp(*without) - np.log(2)  # at a step the one, on a slope that bends the other
     moved_by = cache(partial(footprint.moved, some, _MODES))
@@ -55,18 +55,18 @@ def find_footprint(
         moved = moved_by(divergence_rad)[mode]
         return np.asarray(log_density(rough[some], moved, sigma[some]) - null)
 
-    tops = {mode: refined(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
+    tops = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(tops, key=lambda each: float(gains(each, tops[each]).sum()))
-    gain = blocks.tested(gains(mode, tops[mode]), decided().shapes.footprint_block_sigmas)
+    gain = blocks.tested(gains(mode, tops[mode]), thresholds().edges.footprint_block_sigmas)
     if gain is None:
         return []
-    divergence = refined(partial(gains, mode), [tops[mode]], _FINER)
-    std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE * divergence))}
+    divergence = maximise_gain(partial(gains, mode), [tops[mode]], _REFINEMENT_FACTORS)
+    std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE_UNCERTAINTY * divergence))}
     touched = np.abs(footprint.moved(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
-    return [ShapeFound(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
+    return [EdgeEffect(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
 
 
-def _width_of_noise(model: TlsModel) -> float:
+def _equivalent_divergence(model: TlsModel) -> float:
     """Divergence of a beam whose energy lies about its axis as a thin one's directions do that have the model's noise, rad.
 
     Such a thin beam records on average what the wide one does that records the mean of its returns. Energy that falls as
@@ -78,7 +78,7 @@ def _width_of_noise(model: TlsModel) -> float:
 
 
 @dataclass(frozen=True)
-class _Footprint:
+class _FootprintSimulation:
     """What a beam's divergence does to the ranges of a scan."""
 
     measurement: TlsMeasurement
