@@ -1,4 +1,4 @@
-"""What a command tells at its end: text for people, or with --json one document for scripts."""
+"""Define what a command prints at its end: text for people or, with --json, one JSON document for scripts."""
 
 from __future__ import annotations
 
@@ -11,12 +11,22 @@ from typing import Any
 from pipeline.formats.files.plain_json import without_nan
 
 _OMITTED_KEYS = ("config", "versions")
-"""What the records in result folders hold to make them again; too long for a script's standard input."""
+"""Keys of the record files that --json leaves out. They only serve to repeat the run and are long."""
 
 
 @dataclass(frozen=True)
 class CommandOutput:
-    """The end of a command. text: for people, on stdout; document: gives what --json prints instead; code: exit status."""
+    """What a finished command prints, and its exit status.
+
+    Attributes
+    ----------
+    text : str
+        Text for people, printed on stdout.
+    document : function
+        Returns the document that --json prints instead of the text.
+    code : int
+        Exit status.
+    """
 
     text: str
     document: Callable[[], dict[str, Any]] = field(default=dict)
@@ -24,12 +34,12 @@ class CommandOutput:
 
 
 def as_json(document: dict[str, Any]) -> str:
-    """The document as JSON; NaN and infinity, which JSON does not know, become null, paths text."""
+    """Return a document as JSON text; NaN and infinity, which JSON does not know, become null, and paths become text."""
     return json.dumps(without_nan(document), indent=2, allow_nan=False, default=str)
 
 
 def record_document(report: Path, record: str) -> Callable[[], dict[str, Any]]:
-    """A document made of the JSON file `record` beside a report, without what is only there to make the results again."""
+    """Return a function that reads the JSON file `record` next to a report, without the keys in `_OMITTED_KEYS`."""
 
     def document() -> dict[str, Any]:
         values = json.loads((report.parent / record).read_text(encoding="utf-8"))

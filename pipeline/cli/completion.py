@@ -1,4 +1,4 @@
-"""`scarpsim completion`: what makes a shell complete commands, options and words."""
+"""`scarpsim completion`: print the script with which a shell completes commands, options and their values."""
 
 from __future__ import annotations
 
@@ -18,9 +18,13 @@ _SHELLS, _SCRIPTS = ("bash", "zsh", "fish"), ("scarpsim", "simulate")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("shell", type=one_of(*_SHELLS), metavar="|".join(_SHELLS), help="the shell that completes")
+    parser.add_argument("shell", type=one_of(*_SHELLS), metavar="|".join(_SHELLS), help="your shell")
     parser.add_argument(
-        "--script", type=one_of(*_SCRIPTS), default=_SCRIPTS[0], metavar="|".join(_SCRIPTS), help="the command to complete"
+        "--script",
+        type=one_of(*_SCRIPTS),
+        default=_SCRIPTS[0],
+        metavar="|".join(_SCRIPTS),
+        help="command to complete (default: scarpsim)",
     )
 
 
@@ -34,7 +38,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
         whole: argparse.ArgumentParser = command_parser("simulate", COMMANDS["simulate"])
         _add_completions(whole)
     else:
-        whole = argparse.ArgumentParser("scarpsim", description="rock walls as sensors see them")
+        whole = argparse.ArgumentParser("scarpsim", description="simulates what sensors measure on a rock wall")
         whole.add_argument("--version", action="store_true", help="print the version")
         below = whole.add_subparsers(dest="command")
         for name, command in COMMANDS.items():
@@ -46,7 +50,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 
 
 def _add_completions(parser: argparse.ArgumentParser) -> None:
-    """Tell shtab what the types of arguments tell argparse: the words that are allowed, and where a path is wanted."""
+    """Tell shtab which words an argument allows and which arguments are paths; it cannot read this from argparse's types."""
     import shtab
 
     for action in parser._actions:

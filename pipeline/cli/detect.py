@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "model",
         metavar="MODEL",
-        help="'default' (comes with scarpsim), 'baseline' (threshold, no network), or a trained detector's folder",
+        help="'default' (network that comes with scarpsim), 'baseline' (threshold, no network), or folder of a trained detector",
     )
     parser.add_argument(
         "inputs",
@@ -35,14 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         action="append",
         metavar="P",
-        help="lowest score, may be given several times (default: 0.9 0.95 0.99)",
+        help="smallest score to accept; may be given several times (default: 0.9 0.95 0.99)",
     )
     parser.add_argument(
         "--unmirrored",
         action="store_true",
-        help="look at maps as they are, not at their mirror images too: 'default' is three to four times as fast, and finds less",
+        help="do not also search mirror images of the maps; with 'default' three to four times as fast, but finds less",
     )
-    parser.add_argument("--no-pictures", action="store_true", help="neither overlays nor rasters of masks")
+    parser.add_argument("--no-pictures", action="store_true", help="write neither overlays nor mask rasters")
     add_output_options(parser)
 
 
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
         from pipeline.detection.inference.weights import check_detector
         from pipeline.detection.products.run import detector_folder, find_inputs
 
-        check_detector(detector_folder(arguments.model))  # a mistake there, or in the inputs, should not wait for TensorFlow
+        check_detector(detector_folder(arguments.model))  # report mistakes before TensorFlow takes its time to load
         find_inputs(arguments.inputs)
         load_keras(quiet=arguments.quiet)
     with shown_progress(quiet=arguments.quiet) as progress:

@@ -1,4 +1,4 @@
-"""`scarpsim inspect`: what a planned set-up promises, before anything is simulated."""
+"""`scarpsim inspect`: predict what a planned set-up achieves, before anything is simulated."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 
-SUMMARY = "map what a planned set-up promises: precision, spacing, blind spots, smallest block"
+SUMMARY = "map what a planned set-up achieves: precision, spacing, blind spots, smallest block"
 EXAMPLE = """  scarpsim inspect my_site.yaml
   scarpsim inspect my_site.yaml --sensor tls --set station.distance_m=100 --set planning.block_size_m=[0.2] --out plans/100m"""
 
@@ -19,13 +19,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "config",
         type=Path,
         metavar="CONFIG",
-        help="config file, as `scarpsim init` writes it, or a bundled site, such as glendale",
+        help="config file as `scarpsim init` writes it, or a bundled site, such as glendale",
     )
     parser.add_argument(
-        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="the one to inspect (default: those of the config)"
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="sensor to inspect (default: all of the config)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for maps and report (default: a new one under runs/)")
-    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of a wall made by rule (default: the config's)")
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of a procedural wall (default: the config's)")
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )

@@ -1,4 +1,4 @@
-"""`scarpsim monitor`: what fell between real epochs."""
+"""`scarpsim monitor`: find what fell between real epochs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--position",
         type=comma_separated_numbers(3),
         metavar="X,Y,Z",
-        help="where the sensor stood, or any place before the wall, in the points' coordinates, m, if no header says",
+        help="position of the sensor, or any point in front of the wall, in the points' coordinates, m, if no header gives it",
     )
     parser.add_argument(
         "--direction",
@@ -44,23 +44,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X,Y,Z",
         help="measure change along it, towards the sensor (default: mean plane)",
     )
-    parser.add_argument("--scanner", metavar="PRESET", help="say what level of detection this scanner promises, too")
-    parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
+    parser.add_argument("--scanner", metavar="PRESET", help="also predict the level of detection of this scanner")
+    parser.add_argument("--model", type=Path, metavar="FILE", help="sensor model (model.yaml) instead of --scanner")
     parser.add_argument("--photographs", action="store_true", help="the epochs are from photographs")
     parser.add_argument("--stable", type=Path, metavar="FILE", help="stable rock: YAML list of boxes or polygons, wall frame, m")
     parser.add_argument("--times", type=comma_separated_words, default=[], metavar="T,T,...", help="time of each epoch, ISO 8601")
     parser.add_argument(
-        "--gsd", type=between(1e-4, 100.0), metavar="M", help="side of a pixel, m (default: by the points' density)"
+        "--gsd", type=between(1e-4, 100.0), metavar="M", help="side of a pixel, m (default: from the points' density)"
     )
     parser.add_argument(
-        "--unit", type=one_of(*METRES), metavar="|".join(METRES), help="of the epochs (default: as the files state, else m)"
+        "--unit",
+        type=one_of(*METRES),
+        metavar="|".join(METRES),
+        help="unit of the epochs (default: as the files state, otherwise m)",
     )
     parser.add_argument(
         "--columns",
         type=comma_separated_words,
         default=[],
         metavar="x,y,z,...",
-        help="of a text file; - for one that is left out",
+        help="columns of a text file; - for a column to ignore",
     )
     parser.add_argument(
         "--detector",
@@ -68,9 +71,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="default|baseline|none|FOLDER",
         help="find events with a detector instead of the level of detection (default: none)",
     )
-    parser.add_argument("--workers", type=at_least(1), default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument("--follow", type=Path, metavar="FOLDER", help="go on with each new file in a folder, until interrupted")
-    parser.add_argument("--resume", action="store_true", help="go on with an interrupted monitoring in --out")
+    parser.add_argument("--workers", type=at_least(1), default=1, metavar="N", help="number of processes (default: 1)")
+    parser.add_argument(
+        "--follow", type=Path, metavar="FOLDER", help="also process each new file in this folder, until interrupted"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted monitoring in --out")
     parser.add_argument("--write-site", type=Path, metavar="FILE", help="write a config that simulates this site")
     add_output_options(parser)
 
@@ -100,12 +105,13 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 
 
 def _options(arguments: argparse.Namespace) -> MonitorOptions:
+    """Collect the options of the comparison from the arguments."""
     import numpy as np
 
     from pipeline.monitor.options import MonitorOptions, read_areas
 
     if arguments.scanner and arguments.model:
-        raise InputError("goes without --model: both say what the scanner does", where="--scanner", remedy="give one of them")
+        raise InputError("cannot be combined with --model", where="--scanner", remedy="give one of them")
     return MonitorOptions(
         position=None if arguments.position is None else np.array(arguments.position),
         direction=None if arguments.direction is None else np.array(arguments.direction),

@@ -1,4 +1,4 @@
-"""`scarpsim schema`: the JSON schema of a config file, for editors."""
+"""`scarpsim schema`: print the JSON schema of a config file, for editors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default="simulation",
         metavar="KIND",
-        help=f"{', '.join(_KINDS)} (default: first)",
+        help=f"{', '.join(_KINDS)} (default: simulation)",
     )
 
 

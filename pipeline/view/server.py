@@ -153,7 +153,7 @@ def serve(folder: Path, second: Path | None, detections: Path | None, port: int,
 
 def _tell(error: Exception) -> None:
     """Show an error on the page; the pictures stay as they are."""
-    fault = "" if isinstance(error, InputError) else f"unexpected fault of the program, {type(error).__name__}: "
+    fault = "" if isinstance(error, InputError) else f"internal error, {type(error).__name__}: "
     dash.set_props("note", {"children": f"{fault}{one_line(str(error))}"})
 
 
