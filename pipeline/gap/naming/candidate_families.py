@@ -1,4 +1,5 @@
-"""Every explanation of the mean that a measurement allows."""
+"""List the candidate explanations of the mean (families) that a measurement allows: the catalogue, non-parametric terms and
+nulls."""
 
 from __future__ import annotations
 
@@ -30,25 +31,26 @@ from sensors.effects import EFFECTS, effect_of
 from sensors.effects.angle_empirical import AngleEmpirical
 
 PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
-"""Sines, and along what: an error that repeats but is no sine is not theirs."""
+"""Sinusoidal effects and the covariate along which they repeat. A periodic error that is no sine belongs to none of them."""
 _IMAGE = ("image_x", "image_y")
 _NO_NONPARAMETRIC_TERM = ("edge_step", "line", "disparity_fraction")
 _MOST_POINTS = 5_000
-"""By which one sees whether one form holds another."""
+"""Number of points on which signatures are compared with the curves that the model already contains."""
 
 
 def model_has(measurement: Measurement, name: str) -> bool:
-    """Whether the model holds an effect already."""
+    """Whether the model contains an effect already."""
     return any(effect.name == name for effect in measurement.model.effects)
 
 
 def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """Every effect of the catalogue that the fields of `part` allow, with what is typical of it."""
+    """Return the effects of the catalogue that the recorded fields allow, with a Gaussian prior of their size."""
     return [_with_prior(each) for each in mean_families(part, measurement)]
 
 
 def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
+    """Return every explanation of the mean that the recorded fields allow: catalogue, non-parametric terms, spatial null
+    candidates."""
     named = catalogue_families(measurement, part)
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}
     free = [
@@ -66,7 +68,7 @@ def candidate_families(measurement: Measurement, part: Residuals) -> list[Candid
 
 
 def _most_cycles(name: str, values: FloatArray) -> float:
-    """Of a wave along a covariate; along an image's axes as many as a sensor may have and its raster can show."""
+    """Highest number of cycles of a wave along a covariate; along an image's axes as many as the raster can show."""
     if name not in _IMAGE:
         return MOST_CYCLES
     step = spacing(values)
@@ -74,7 +76,7 @@ def _most_cycles(name: str, values: FloatArray) -> float:
 
 
 def _angle_terms(part: TlsResiduals) -> list[Candidate | SineGrid]:
-    """Free forms of the errors of both angles: an error of an angle changes the range by the slope of the surface."""
+    """Non-parametric terms of errors of both angles. An error of an angle changes the range by the slope of the surface."""
     angles = {"azimuth": part.geometry.azimuth, "zenith": part.geometry.zenith}
     levers = {"azimuth": -part.geometry.by_azimuth, "zenith": -part.geometry.by_zenith}
     along = [(angle, name, values) for angle in levers for name, values in angles.items() if np.ptp(values) > 0]
@@ -84,7 +86,7 @@ def _angle_terms(part: TlsResiduals) -> list[Candidate | SineGrid]:
 def _without_described_by_curves(
     named: list[Candidate | SineGrid], angles: list[Candidate | SineGrid], measurement: Measurement, part: TlsResiduals
 ) -> list[Candidate | SineGrid]:
-    """Without the effects that a curve of an angle's error, where the model has one, holds too, but for its values."""
+    """Leave out effects that a curve of an angle's error, already in the model, describes too."""
     curves = {(each.angle, each.covariate) for each in measurement.model.effects if isinstance(each, AngleEmpirical)}
     held = [each.columns for each in angles if isinstance(each, Candidate) and (each.angle, each.name) in curves]
     if not held:
@@ -100,7 +102,7 @@ def _without_described_by_curves(
 
 
 def _repeating_terms(part: Residuals) -> list[Candidate]:
-    """Forms that repeat after a few scan lines, or columns or rows of a raster of pixels."""
+    """Terms that repeat after a few scan lines, or after a few columns or rows of a pixel raster."""
     found = part.covariates
     if "line" in found and np.ptp(found["line"]) > 0:
         turn = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
@@ -110,7 +112,7 @@ def _repeating_terms(part: Residuals) -> list[Candidate]:
 
 
 def _half_pixel_sines(part: Residuals) -> list[SineGrid]:
-    """Where disparities span as many pixels as locking to these has to."""
+    """Sines of twice the pixel frequency, if the disparities span enough pixels for locking."""
     disparity = part.covariates.get("disparity")
     if disparity is None or reach_of(disparity) < thresholds().locking.fewest_cycles:
         return []
@@ -118,7 +120,7 @@ def _half_pixel_sines(part: Residuals) -> list[SineGrid]:
 
 
 def _with_prior(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
-    """With what is typical of its effect: two effects that nearly cancel each other must not do so at any size."""
+    """Add the prior of an effect's size, so that two effects that nearly cancel cannot both become arbitrarily large."""
     if isinstance(candidate, SineGrid):
         return candidate
     typical = effect_of(candidate.name).typical_sizes()

@@ -1,4 +1,4 @@
-"""Naming: effects on the mean and on the spread, from the points that selection may look at."""
+"""Select effects from the training points: rounding and locking first, then systematic effects and noise terms in turn."""
 
 from __future__ import annotations
 
@@ -55,191 +55,243 @@ from sensors.effects.regularization_noise import RegularizationNoise
 
 _GRID_NOISE = RegularizationNoise.tag()
 NONPARAMETRIC_TERMS = ("", True)
-"""Stands for all families of empirical terms."""
+"""Stands for all families of non-parametric terms."""
 
 
 @dataclass(frozen=True)
 class SelectionResult:
-    """What the selection leaves beside the effects: what was tried for the mean and for the spread, notes, and the standard
-    deviation of the reference.
+    """What a selection leaves beside the effects that it named.
 
-    moving: names of the effects on the mean; p_value, p_alone: of what remains beside all of them, and without any; None where
-    nothing was tried; times: that they spread within cells, 1 where an effect says why; spreads: how many predicted sigmas the
-    residuals spread beside the effects on the mean.
+    Attributes
+    ----------
+    tried, variance_tried : systematic effects and noise terms that were tried.
+    systematic : names of the selected systematic effects, empirical ones included.
+    p_value : p-value of the misfit beside all of them, None where nothing was tried.
+    p_without_effects : p-value of the misfit without any of them, None where nothing was tried.
+    unexplained_noise : observed over predicted standard deviation within cells; 1 where a noise term explains it.
+    notes : notes for the report.
+    identifiability : cosines of the signatures, and the share of each that the pose fit leaves.
+    reference_sigma : standard deviation of the reference error, in the observable's unit.
+    noise_ratio : standard deviation of the residuals beside the systematic effects, over the predicted one.
     """
 
     tried: tuple[Tried, ...]
-    spread_tried: tuple[VarianceScore, ...]
-    moving: frozenset[str]
+    variance_tried: tuple[VarianceScore, ...]
+    systematic: frozenset[str]
     p_value: float | None
-    p_alone: float | None
-    times: NoiseRatio
+    p_without_effects: float | None
+    unexplained_noise: NoiseRatio
     notes: tuple[str, ...]
     identifiability: dict[str, Any]
     reference_sigma: float
-    spreads: float
+    noise_ratio: float
 
     def p_beside(self, named: Sequence[NamedEffect]) -> float | None:
-        """Of what remains beside those that were kept of the effects on the mean; None where that was not drawn."""
-        kept = self.moving & {item.name for item in named}
-        if kept == self.moving:
+        """Return the p-value of the misfit beside the systematic effects that were kept; None where it was not computed for this
+        set."""
+        kept = self.systematic & {item.name for item in named}
+        if kept == self.systematic:
             return self.p_value
-        return None if kept else self.p_alone
+        return None if kept else self.p_without_effects
 
 
 def select_effects(
     measurement: Measurement,
     part: Residuals,
-    scale: float,
+    noise_ratio: float,
     random: KeyedRandom,
-    left_out: frozenset[tuple[str, bool]] = frozenset(),
-    nodes: VarianceTerm | None = None,
+    excluded: frozenset[tuple[str, bool]] = frozenset(),
+    grid_noise: VarianceTerm | None = None,
 ) -> tuple[list[NamedEffect], SelectionResult]:
-    """Effects on the mean and on the spread.
+    """Select the systematic effects and noise terms that explain the residuals.
 
-    What the first search finds goes into the model, the residuals are taken again against that (exactly, where the first had only
-    slopes), and the search is repeated beside what was found. scale: how many predicted sigmas the residuals spread; left_out:
-    families (name, empirical) whose best values lie beyond the effect's bounds; all is done again without them, with a word; or
-    `FREE_FORMS`;
-    nodes: noise that neighbours share, found in what a search had left: it feigns free forms, and an error of the reference that
-    is larger than the true one, so that all is searched again beside it.
+    The effects that the first search finds are put into the model, the residuals are computed again against it, and the search is
+    repeated beside them. Strong effects are refitted without linearising (`nonlinear_refit`). The noise terms are fitted to the
+    residuals of the search and weight the next one.
+
+    Parameters
+    ----------
+    measurement : measurement of the training points.
+    part : residuals of the training points.
+    noise_ratio : their standard deviation over the predicted one.
+    random : source of random numbers of the null distributions.
+    excluded : families (name, empirical) that are not tried, or `NONPARAMETRIC_TERMS`. A family whose best value is out of bounds
+        is added, and the selection is repeated.
+    grid_noise : grid-correlated noise that an earlier selection left. It imitates non-parametric terms and errors of the
+        reference, so the selection is repeated beside it.
+
+    Returns
+    -------
+    tuple : the named effects, and the rest of the result.
     """
     named: list[NamedEffect] = []
-    whole, whole_scale, added = part, scale, 0.0
-    comb = locking = None
+    all_residuals, initial_noise_ratio, added = part, noise_ratio, 0.0
+    range_step = locking = None
     if isinstance(part, TlsResiduals) and not model_has(measurement, RangeQuantization.tag()):
-        comb = find_range_step(part.geometry.measured_m)
+        range_step = find_range_step(part.geometry.measured_m)
     if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
         at = part.geometry
         allowed = NoiseBounds(float(np.median(part.sigma)), nmad(registered(part)[0]))
         locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
-    if comb is not None:
-        named.append(effect_from_range_step(comb, part))
-        added, scale = comb.step_m**2 / 12, 1.0
-    found_apart = set()
+    if range_step is not None:
+        named.append(effect_from_range_step(range_step, part))
+        added, noise_ratio = range_step.step_m**2 / 12, 1.0
+    found_separately = set()
     if locking is not None:
         named.append(effect_from_locking(locking))
         added = locking.amplitude_px**2 / 2
-        found_apart.add((PixelLocking.tag(), False))
+        found_separately.add((PixelLocking.tag(), False))
     part = with_added_variance(part, added)
-    out = left_out | found_apart
+    out = excluded | found_separately
     possible = (each for each in candidate_families(measurement, part) if (each.name, each.empirical) not in out)
     families = [each for each in possible if not (each.empirical and NONPARAMETRIC_TERMS in out)]
-    spread, spread_tried, words = _fit_variance(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
-    if wrong := _implausible_variance(measurement, spread):
-        return select_effects(measurement, whole, whole_scale, random, left_out | wrong)
-    if not spread and nodes is not None:
-        spread = [nodes]
+    noise_terms, variance_tried, note = _fit_variance(
+        measurement, part, Cells.over(part.at), registered(part)[0], random, excluded
+    )
+    if wrong := _implausible_variance(measurement, noise_terms):
+        return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong)
+    if not noise_terms and grid_noise is not None:
+        noise_terms = [grid_noise]
 
-    def spread_at(at: Residuals) -> list[VarianceTerm]:
-        there = _fit_variance(measurement, at, Cells.over(at.at), registered(at)[0], random, left_out)[0]
-        if there or nodes is None:
+    def variance_at(at: Residuals) -> list[VarianceTerm]:
+        there = _fit_variance(measurement, at, Cells.over(at.at), registered(at)[0], random, excluded)[0]
+        if there or grid_noise is None:
             return there
-        return [replace(nodes, variance=nodes.variance[np.isin(part.index, at.index)])]
+        return [replace(grid_noise, variance=grid_noise.variance[np.isin(part.index, at.index)])]
 
-    points = SearchInput(measurement, part, families, spread_at, added, random)
-    first = MeanSearch(with_fitted_variance(part, spread, scale), families, random)
+    points = SearchInput(measurement, part, families, variance_at, added, random)
+    first = MeanSearch(with_fitted_variance(part, noise_terms, noise_ratio), families, random)
     found = select_and_refit(points, first)
     physical = any(not each.empirical for each in families)
     names, cosines, survival = first.design.identifiability() if physical else ([], np.zeros((0, 0)), np.zeros(0))
     wrong = out_of_bounds(measurement, found.estimates, found.at)
-    doubtful = absorbed_by_registration(found.estimates, found.at, dict(zip(names, survival, strict=True)))
-    if doubtful and not _explains_everything(found):
-        wrong |= doubtful
+    implausible = absorbed_by_registration(found.estimates, found.at, dict(zip(names, survival, strict=True)))
+    if implausible and not _explains_everything(found):
+        wrong |= implausible
     design = found.search.design
     left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
-        spread, spread_tried, words = _fit_variance(measurement, found.at, design.cells, left, random, left_out)
-    if spread in ([], [nodes]) and (_GRID_NOISE, False) not in left_out:
+        noise_terms, variance_tried, note = _fit_variance(measurement, found.at, design.cells, left, random, excluded)
+    if noise_terms in ([], [grid_noise]) and (_GRID_NOISE, False) not in excluded:
         match measurement, part, found.at:
             case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
-                nodes_left, shared = find_grid_noise(found.at, left, model, random)
+                noise_left, shared = find_grid_noise(found.at, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
-                if nodes_left is not None and nodes is None:
-                    nodes_in_all = find_grid_noise(part, registered(part)[0], model, random)[0] if described else None
-                    found_nodes = nodes_in_all or nodes_left.everywhere(len(part))
-                    return select_effects(measurement, whole, whole_scale, random, left_out, found_nodes)
-                kept = nodes_left or (None if described else nodes)
-                spread, words = ([], words or shared) if kept is None else ([kept], words)
-    if wrong := (wrong | _implausible_variance(measurement, spread)) - left_out:
-        again, naming = select_effects(measurement, whole, whole_scale, random, left_out | wrong)
+                if noise_left is not None and grid_noise is None:
+                    noise_in_all = find_grid_noise(part, registered(part)[0], model, random)[0] if described else None
+                    refound = noise_in_all or noise_left.with_constant_variance(len(part))
+                    return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded, refound)
+                kept = noise_left or (None if described else grid_noise)
+                noise_terms, note = ([], note or shared) if kept is None else ([kept], note)
+    if wrong := (wrong | _implausible_variance(measurement, noise_terms)) - excluded:
+        again, result = select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong)
         return keep_implausible_in_class(
             again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong
-        ), naming
-    moving = [effect_from_estimate(each, found.at) for each in found.estimates]
-    named += moving
-    named += [effect_from_variance(each, part.sensor) for each in spread]
-    times = NoiseRatio(1.0, False) if spread else NoiseRatio.of(found.at, design.cells, left, random)
+        ), result
+    systematic = [effect_from_estimate(each, found.at) for each in found.estimates]
+    named += systematic
+    named += [effect_from_variance(each, part.sensor) for each in noise_terms]
+    unexplained_noise = NoiseRatio(1.0, False) if noise_terms else NoiseRatio.of(found.at, design.cells, left, random)
     said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part))
-    notes = (*part.notes, *_note_left_out(left_out), *filter(None, [words]), *said)
+    notes = (*part.notes, *_note_left_out(excluded), *filter(None, [note]), *said)
     p_value = found.search.p_of_rest(found.tried)
-    alone = first.tried(()) if moving else ()
-    p_alone = first.p_of_rest(alone) if alone else p_value
-    names_moving = frozenset(each.name for each in moving)
+    alone = first.tried(()) if systematic else ()
+    p_without_effects = first.p_of_rest(alone) if alone else p_value
+    systematic_names = frozenset(each.name for each in systematic)
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     tried = found.chosen[0].tried if found.chosen else found.tried
-    shown = tuple(item for item in tried if not item.name.startswith(PLACE))
+    without_nulls = tuple(item for item in tried if not item.name.startswith(PLACE))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
-    spreads = nmad(left / found.at.sigma, 0.0)
-    naming = SelectionResult(shown, tuple(spread_tried), names_moving, p_value, p_alone, times, notes, table, sigma, spreads)
-    angles = [each for each in moving if each.effect is AngleEmpirical]
+    noise_ratio_left = nmad(left / found.at.sigma, 0.0)
+    result = SelectionResult(
+        without_nulls,
+        tuple(variance_tried),
+        systematic_names,
+        p_value,
+        p_without_effects,
+        unexplained_noise,
+        notes,
+        table,
+        sigma,
+        noise_ratio_left,
+    )
+    angles = [each for each in systematic if each.effect is AngleEmpirical]
     if angles and not model_has(measurement, AngleEmpirical.tag()):
-        return _select_beside_angle_terms(measurement, whole, angles, naming, random, left_out)
-    return named, naming
+        return _select_beside_angle_terms(measurement, all_residuals, angles, result, random, excluded)
+    return named, result
 
 
 def _explains_everything(found: SearchOutcome) -> bool:
-    """Whether effects of the catalogue alone were found, and no more than chance is left beside them."""
+    """Whether only effects of the catalogue were found, and no misfit is left beside them."""
     p_value = found.search.p_of_rest(found.tried)
     physical = not any(each.candidate.empirical for each in found.estimates)
     return physical and p_value is not None and p_value > thresholds().verdict.rejection_p
 
 
 def keep_implausible_in_class(
-    named: list[NamedEffect], chosen: list[Chosen], before: frozenset[str], left_out: frozenset[tuple[str, bool]]
+    named: list[NamedEffect], chosen: list[Chosen], before: frozenset[str], excluded: frozenset[tuple[str, bool]]
 ) -> list[NamedEffect]:
-    """An effect that was chosen first and is too large to be committed to stays in the class of those that would do as well: by
-    slopes, or since they were not among those named with it (`before`) and stand in its place."""
-    doubtful = [each for each in chosen if (each.candidate.name, False) in left_out]
+    """Add effects that were selected first, but are implausibly large, to the class of the effects named instead.
+
+    An effect belongs to the class if the linearised search says so, or if it was named only after the implausible one was
+    excluded.
+
+    Parameters
+    ----------
+    named : effects of the selection without the implausible ones.
+    chosen : explanations of the first selection.
+    before : names of the systematic effects of the first selection.
+    excluded : families that were excluded as implausible.
+    """
+    implausible = [each for each in chosen if (each.candidate.name, False) in excluded]
     found = []
     for item in named:
         sensor, name = item.name.split(".", 1)
         instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
-        alike = {f"{sensor}.{each.candidate.name}" for each in doubtful if instead or name in each.alike}
+        alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.alike}
         found.append(replace(item, alike=(*item.alike, *sorted(alike - {item.name, *item.alike}))))
     return found
 
 
 def _select_beside_angle_terms(
     measurement: Measurement,
-    whole: Residuals,
+    all_residuals: Residuals,
     angles: list[NamedEffect],
     first: SelectionResult,
     random: KeyedRandom,
-    left_out: frozenset[tuple[str, bool]],
+    excluded: frozenset[tuple[str, bool]],
 ) -> tuple[list[NamedEffect], SelectionResult]:
-    """All is named again with the free forms of errors of an angle in the model: slopes miss where a ray goes that turns far.
+    """Repeat the selection with curves of an angle's error in the model: the linear model is wrong for a ray that turns far.
 
-    What the second search finds of the same form is added to the first's curve.
+    What the second selection finds of the same form is added to the curves of the first.
     """
-    there, found, _ = aligned_with(measurement, angles, whole.index)
-    at = at_points_of(found, whole)
-    named, naming = select_effects(there, at, registered(at)[2], random.child("angles"), left_out)
-    joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], whole)
+    there, found, _ = aligned_with(measurement, angles, all_residuals.index)
+    at = at_points_of(found, all_residuals)
+    named, result = select_effects(there, at, registered(at)[2], random.child("angles"), excluded)
+    joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], all_residuals)
     rest = [item for item in named if item.effect is not AngleEmpirical]
-    moving = naming.moving | {item.name for item in angles}
-    again = replace(naming, tried=first.tried, moving=moving, p_alone=first.p_alone, identifiability=first.identifiability)
+    systematic = result.systematic | {item.name for item in angles}
+    again = replace(
+        result,
+        tried=first.tried,
+        systematic=systematic,
+        p_without_effects=first.p_without_effects,
+        identifiability=first.identifiability,
+    )
     return [*joined, *others, *rest], again
 
 
 def _note_repetition(estimates: list[Estimate]) -> list[str]:
-    """Words for forms that repeat after a few lines."""
+    """Notes on terms that repeat after a few scan lines."""
     lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(REPEATED)]
-    return [f"what is described repeats every {each} lines exactly: facets of a mirror or a read-out in blocks" for each in lines]
+    return [
+        f"the empirical term repeats after exactly {each} lines: think of the facets of a mirror, or of a read-out in blocks"
+        for each in lines
+    ]
 
 
 def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
-    """Words for what remains where it is more than chance leaves, and nothing was found that says it."""
+    """Note on the best candidate where a misfit is left and nothing was accepted."""
     p_value = found.search.p_of_rest(found.tried)
     if found.estimates or p_value is None or p_value > thresholds().verdict.rejection_p:
         return []
@@ -247,19 +299,19 @@ def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
     what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name
     size = 1e3 * found.search.size(best) * float(np.median(part.unit_m))
     return [
-        f"what remains is most like {what}, {size:.2g} mm (standard deviation): a reference that is wrong along whole lines or "
-        "columns, as in strips, looks so too, and points from another station would tell"
+        f"the remaining misfit is most similar to {what}, {size:.2g} mm (standard deviation). A reference that errs along whole "
+        "lines or columns, as in strips, looks the same; a scan from another station would separate the two"
     ]
 
 
 def _note_oblique_waves(found: SearchOutcome) -> list[str]:
-    """Words for waves across the wall that are larger than chance leaves, though no sensor has an axis there."""
+    """Note on oblique waves on the wall that the error model of the reference does not explain."""
     p_value = found.search.p_of_places(found.tried)
     if p_value is None or p_value > thresholds().verdict.rejection_p:
         return []
     return [
-        f"the residuals vary slantwise across the wall more than a reference wrong by a Gaussian process would let them (p-value "
-        f"{p_value:.2g}): no sensor has an axis there, so this is taken for the reference's error"
+        f"the residuals contain waves at an oblique angle that the reference's error model does not explain (p = {p_value:.2g}). "
+        "No sensor effect is aligned like that; they are attributed to the reference"
     ]
 
 
@@ -269,27 +321,33 @@ def _fit_variance(
     cells: Cells,
     value: FloatArray,
     random: KeyedRandom,
-    left_out: frozenset[tuple[str, bool]],
+    excluded: frozenset[tuple[str, bool]],
 ) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
-    """Effects on the spread of residuals (n,) without the mean effects found, what was tried, and words for a spread of none."""
-    names = frozenset(name for name, empirical in left_out if not empirical)
-    found, tried, words = fit_variance_model(part, cells, value, random, names)
+    """Fit the variance model: noise terms, what was tried, and a note on variance that no term explains.
+
+    value: (n,) residuals after the systematic effects.
+    """
+    names = frozenset(name for name, empirical in excluded if not empirical)
+    found, tried, note = fit_variance_model(part, cells, value, random, names)
     match measurement, part:
         case StereoMeasurement(), StereoResiduals():
             found = separate_white_and_grid_noise(found, part, value, measurement.model)
-    return [each for each in found if each.effect not in names], tried, words
+    return [each for each in found if each.effect not in names], tried, note
 
 
-def _implausible_variance(measurement: Measurement, spread: list[VarianceTerm]) -> frozenset[tuple[str, bool]]:
-    """Families of the spread whose values lie beyond the bounds of the effect that is to hold them."""
-    entries = {each.effect: effect_from_variance(each, measurement.sensor).entry for each in spread}
+def _implausible_variance(measurement: Measurement, noise_terms: list[VarianceTerm]) -> frozenset[tuple[str, bool]]:
+    """Families of noise terms whose values are outside the bounds of their effect."""
+    entries = {each.effect: effect_from_variance(each, measurement.sensor).entry for each in noise_terms}
     return frozenset((name, False) for name, entry in entries.items() if not within_bounds(measurement.model, entry))
 
 
-def _note_left_out(left_out: frozenset[tuple[str, bool]]) -> list[str]:
-    said = (f"free forms of {name}" if empirical else name for name, empirical in sorted(left_out - {NONPARAMETRIC_TERMS}))
+def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
+    """Notes on families that were excluded."""
+    said = (
+        f"non-parametric terms of {name}" if empirical else name for name, empirical in sorted(excluded - {NONPARAMETRIC_TERMS})
+    )
     why = (
-        "the best value is beyond what a config may hold, or many times the usual where the registration undoes nearly all of it "
-        "and more is left than chance gives"
+        "the best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
+        "of it, and a misfit is left"
     )
     return [f"{what} left out: {why}" for what in said]

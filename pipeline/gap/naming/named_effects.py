@@ -1,4 +1,4 @@
-"""What was found as entries of a config and of gap.json: parameters with uncertainty, class, and what would split it."""
+"""Turn what was found into named effects: entries of a config and of gap.json, with standard deviations and equivalence class."""
 
 from __future__ import annotations
 
@@ -34,20 +34,29 @@ from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.numerics.curve import Axis, interpolate_on_host
 
 _CURVE_NODES, _SURFACE_NODES, _SUM_NODES, _MOST_POINTS = 65, 17, 257, 20_000
-"""Of the curve of an empirical term, of each side of a surface, and of a sum of curves."""
+"""Nodes of the curve of an empirical term, of each side of a surface, and of a sum of curves; most points that a surface is
+fitted to."""
 _STD_INFLATION = 1.1
-"""How much more the parameters scatter than the covariance says: that of the reference's error is itself fitted.
-By development cases, of whose 61 intervals of 90 % without it 52 held the truth."""
+"""Factor on all standard deviations, because the covariance of the reference error is itself estimated. Without it, 52 of 61
+intervals of 90 % contained the true value on the development cases."""
 _WEAKEST_POWERS = 20
-"""Spacings of the weakest powers that tell how near they come to a limit."""
+"""Number of spacings between the weakest recorded powers that tell how close they come to a detection limit."""
 
 
 @dataclass(frozen=True)
 class NamedEffect:
     """One effect of gap.json.
 
-    name: with the sensor's prefix; entry: of a model's `effects`; std: of the parameters; p_value: by draws, None where none were
-    made; split_by: the measurement that would split the class, "" for a class of one.
+    Attributes
+    ----------
+    name : name with the sensor's prefix, such as `tls.range_offset`.
+    kind : physical (of the catalogue) or empirical.
+    entry : entry of the model's `effects`: name and parameters.
+    std : standard deviations of the parameters, by key.
+    alike : names of the other effects of its equivalence class.
+    p_value : p-value from the simulated null distribution, None where none was simulated.
+    gain : log-likelihood ratio, on validation blocks once it was validated.
+    split_by : further measurement that would separate the class, "" for a class of one.
     """
 
     name: str
@@ -61,16 +70,16 @@ class NamedEffect:
 
     @property
     def effect(self) -> type[Effect]:
-        """The class of what carries it."""
+        """Class of the effect, which for an empirical term is the effect that carries it."""
         return effect_of(self.name)
 
     @property
-    def spreads(self) -> bool:
-        """Whether it makes residuals spread more."""
+    def adds_variance(self) -> bool:
+        """Whether it is a noise term: it changes the standard deviation of the residuals and not their mean."""
         return self.effect.shows_in == ShowsIn.SPREAD
 
     def to_dict(self) -> dict[str, Any]:
-        """As gap.json holds it."""
+        """Return the effect as gap.json holds it."""
         parameters = {key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"}
         return {
             "name": self.name,
@@ -86,7 +95,18 @@ class NamedEffect:
 def with_effects(
     model: TlsModel | StereoModel, entries: list[dict[str, Any]], noise: dict[str, float] | None = None
 ) -> TlsModel | StereoModel:
-    """The model with further effects and other values of its noise, checked as a config is."""
+    """Return the model with further effects and other noise values, validated like a config.
+
+    Parameters
+    ----------
+    model : model to extend.
+    entries : entries of the effects to append.
+    noise : new values of the model's noise, by key.
+
+    Raises
+    ------
+    InputError : a value is outside its bounds.
+    """
     values = model.model_dump(mode="json")
     changed = {"effects": [*values["effects"], *entries], "noise": {**values["noise"], **(noise or {})}}
     return parse(type(model), {**values, **changed}, "model_after.yaml")
@@ -95,19 +115,28 @@ def with_effects(
 def aligned_with(
     measurement: Measurement,
     effects: Iterable[NamedEffect],
-    trusted: NDArray[np.int64] | None = None,
+    registration_rows: NDArray[np.int64] | None = None,
     noise: dict[str, float] | None = None,
 ) -> Settled:
-    """The measurement with further effects in its model, settled: its residuals are taken again and registered.
+    """Put effects into the model of a measurement, compute its residuals and estimate the pose again.
 
-    trusted: rows of the measurement's points by which to register, all where None; noise: other values of the model's noise.
+    Parameters
+    ----------
+    measurement : measurement to start from.
+    effects : effects to append to its model.
+    registration_rows : rows of the measurement's points from which the pose is estimated; all where None.
+    noise : new values of the model's noise, by key.
+
+    Returns
+    -------
+    Settled : the measurement at the estimated pose, its residuals and the pose.
     """
     model = with_effects(measurement.model, [item.entry for item in effects], noise)
-    return settled(measurement.changed(model=model), trusted)
+    return settled(measurement.changed(model=model), registration_rows)
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Whether a config may hold an entry's values."""
+    """Whether a config accepts the values of an entry."""
     try:
         with_effects(model, [entry])
     except InputError:
@@ -116,34 +145,36 @@ def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
 
 
 def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) -> tuple[list[NamedEffect], list[str]]:
-    """The effects whose values a config may hold, and words for the others: what no model can hold explains nothing."""
+    """Return the effects whose values a config accepts, and a note for each of the others."""
     kept = [item for item in named if within_bounds(model, item.entry)]
-    return kept, [f"{item.name} left out: the best value is beyond what a config may hold" for item in named if item not in kept]
+    return kept, [
+        f"{item.name} left out: its best value is outside the bounds of the effect" for item in named if item not in kept
+    ]
 
 
 def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Whether an entry's values lie within the bounds of its effect and are not far beyond what is typical of it."""
+    """Whether an entry's values are within the bounds of its effect and below the largest plausible size."""
     if not within_bounds(model, entry):
         return False
     return relative_size(entry) <= thresholds().mean.largest_size
 
 
 def relative_size(entry: dict[str, Any]) -> float:
-    """How many times its typical size an effect has; 0 of one that is not in the catalogue."""
+    """Return the size of an effect in its typical sizes; 0 for an effect that is not in the catalogue."""
     effect = effect_of(entry["name"])
     sizes = effect.typical_sizes() if effect.catalogue else {}
     return max((abs(entry.get(key, 0.0) / typical) for key, typical in sizes.items()), default=0.0)
 
 
 def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
-    """Steps of the range. Gain: of the probability that all ranges lie on the comb, an e-fold each at the least."""
+    """Name the rounding of ranges. Its gain is at least one unit of log-likelihood for each range on a multiple of the step."""
     entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
     name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
     return NamedEffect(name, "physical", entry, {"step_m": comb.std_m}, (), None, gain)
 
 
 def effect_from_locking(found: Locking) -> NamedEffect:
-    """Locking that the measured disparities show."""
+    """Name the pixel locking that the measured disparities show."""
     entry = {
         "name": PixelLocking.tag(),
         "amplitude_px": found.amplitude_px,
@@ -155,7 +186,7 @@ def effect_from_locking(found: Locking) -> NamedEffect:
 
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
-    """An effect on the spread of laser ranges or disparities."""
+    """Name a noise term of laser ranges or disparities."""
     alike = tuple(f"{sensor}.{name}" for name in found.alike)
     empirical = found.empirical or effect_of(found.effect).empirical
     entry = {"name": found.effect, **found.parameters}
@@ -164,23 +195,26 @@ def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
 
 
 def effect_from_edges(found: EdgeEffect) -> NamedEffect:
-    """An effect where the surface is not smooth."""
+    """Name an edge effect."""
     entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
     return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
 def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
-    """Noise with heavy tails, which the catalogue does not have: its standard deviation as white noise, marked empirical."""
+    """Name heavy tails as white noise marked empirical, because the catalogue has no effect for them.
+
+    sigma: standard deviation of that noise, in the observable's unit.
+    """
     noise, key = part.noise
     return NamedEffect(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
 
 
 def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
-    """An effect on the returns; a detection limit shows as the smallest recorded power."""
+    """Name an effect on the returns. Where powers were recorded, a detection limit is taken from the weakest ones."""
     parameters, std = dict(found.parameters), dict(found.std)
     kind = "empirical" if found.covariate else "physical"
     if found.name == DetectionLimit.tag() and intensity is not None:
-        # above a limit the weakest powers lie about as far apart as the weakest lies above it
+        # the limit lies about as far below the weakest power as the weakest powers lie apart
         low = np.sort(intensity)[: _WEAKEST_POWERS + 1]
         gap = float(low[-1] - low[0]) / (len(low) - 1)
         parameters["minimum_power"], std["minimum_power"] = float(low[0]) - gap, gap
@@ -189,7 +223,10 @@ def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> 
 
 @dataclass(frozen=True)
 class Estimate:
-    """An explanation of the mean with the values of its coefficients (k,) and their covariance (k, k)."""
+    """A systematic effect with estimated coefficients.
+
+    chosen: the selected explanation; candidate: its columns; values: (k,) coefficients; covariance: (k, k) of the coefficients.
+    """
 
     chosen: Chosen
     candidate: Candidate
@@ -198,7 +235,7 @@ class Estimate:
 
 
 def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
-    """An effect on the mean; part: the residuals on whose rows its candidate stands."""
+    """Name a systematic effect. part: the residuals on whose rows its candidate is defined."""
     if found.candidate.empirical:
         return _empirical_effect(found.candidate, found.values, found.chosen, part)
     return _physical_effect(found.candidate, found.values, found.covariance, found.chosen, part)
@@ -207,6 +244,7 @@ def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
 def _physical_effect(
     candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals
 ) -> NamedEffect:
+    """Name an effect of the catalogue by its parameters."""
     entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(values)}
     std = _standard_deviations(candidate, values, covariance)
     alike = tuple(f"{part.sensor}.{name}" for name in item.alike)
@@ -214,7 +252,7 @@ def _physical_effect(
 
 
 def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
-    """Standard deviations of the parameters, by finite differences of what the coefficients mean."""
+    """Standard deviations of the parameters, propagated from the coefficients by finite differences."""
     base = candidate.parameters(values)
     steps = np.sqrt(np.maximum(np.diag(covariance), 1e-300)) * 1e-3
     std = {}
@@ -228,7 +266,7 @@ def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: F
 
 
 def _empirical_effect(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> NamedEffect:
-    """A free form by values: over one cycle of a periodic one, else over all of its covariate that occurs."""
+    """Describe a non-parametric term by its values at nodes: over one cycle if periodic, else over the range of its covariate."""
     error = candidate.columns @ values[: candidate.columns.shape[1]]
     if candidate.angle and isinstance(part, TlsResiduals):
         return _angle_term(candidate, error, item, part)
@@ -240,7 +278,8 @@ def _empirical_effect(candidate: Candidate, values: FloatArray, item: Chosen, pa
 
 
 def _angle_term(candidate: Candidate, error: FloatArray, item: Chosen, part: TlsResiduals) -> NamedEffect:
-    """Its curve is found back from the ranges where the surface slants more than at half of the points."""
+    """Describe an error of an angle by a curve, recovered from the ranges where the surface slants more than at half of the
+    points."""
     levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
     lever = -levers[candidate.angle]
     steep = np.abs(lever) > np.median(np.abs(lever))
@@ -253,7 +292,18 @@ def _angle_term(candidate: Candidate, error: FloatArray, item: Chosen, part: Tls
 def merge_angle_curves(
     angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
-    """Curves of an angle's error with those that were found beside them along the same angle, as one; what remains of those."""
+    """Add curves of an angle's error that were found later along the same angle and covariate.
+
+    Parameters
+    ----------
+    angles : curves that were found first.
+    later : effects that were found with those curves in the model.
+    part : residuals, for the range of the covariates.
+
+    Returns
+    -------
+    tuple : the first curves with the later ones added, and the later effects that were not merged.
+    """
     joined, others = [], list(later)
     for term in angles:
         alike = [item for item in others if all(item.entry[key] == term.entry[key] for key in ("angle", "covariate"))]
@@ -263,7 +313,7 @@ def merge_angle_curves(
 
 
 def _sum_of_curves(term: NamedEffect, later: list[NamedEffect], part: Residuals) -> NamedEffect:
-    """The sum of curves, over all of the angle that occurs."""
+    """Return the sum of some curves over the whole range of their covariate."""
     x = part.covariates[term.entry["covariate"]]
     low, high = float(x.min()), float(x.max())
     nodes = np.linspace(low, high, _SUM_NODES)
@@ -273,14 +323,15 @@ def _sum_of_curves(term: NamedEffect, later: list[NamedEffect], part: Residuals)
 
 
 def _rounded_rows(values: Any) -> list[list[float]]:
+    """Round values to six significant digits."""
     return [[float(f"{value:.6g}") for value in row] for row in values]
 
 
 def _curve_nodes(candidate: Candidate, error: FloatArray, part: Residuals, rows: Any = slice(None)) -> dict[str, Any]:
-    """rows: those whose error (n,) is known."""
+    """Describe a curve by its values at nodes. rows: rows whose error (n,) is known."""
     x = part.covariates[candidate.name]
     cycle = candidate.period * ((float(x.std()) or 1.0) if candidate.form == "wave" else 1.0)
-    x = x + _covariate_offset(candidate.name, part)  # as the sensor counts it, before it is folded
+    x = x + _covariate_offset(candidate.name, part)  # the sensor's own value, before it is folded
     low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))
     turned, error = (np.mod(x, cycle) if cycle else x)[rows], error[rows]
     order = np.argsort(turned)
@@ -289,7 +340,7 @@ def _curve_nodes(candidate: Candidate, error: FloatArray, part: Residuals, rows:
 
 
 def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
-    """The polynomial again, at the nodes of a grid: it is found back from its values at the points."""
+    """Fit the polynomial of two covariates to its values at the points and evaluate it on a grid of nodes."""
     first, second = part.planes
     x, y = part.covariates[first], part.covariates[second]
     axes = [np.linspace(values.min(), values.max(), _SURFACE_NODES) for values in (x, y)]
@@ -308,11 +359,13 @@ def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> 
 
 
 def _covariate_offset(covariate: str, part: Residuals) -> float:
-    """What an effect's covariate is more than that of the residuals, which is relative for the power."""
+    """Return an effect's covariate minus that of the residuals: not zero only for the power, which is relative in the
+    residuals."""
     if covariate != "intensity" or not isinstance(part, TlsResiduals):
         return 0.0
     return float(np.median(np.log(np.maximum(part.geometry.power, 1e-12)) - part.covariates[covariate]))
 
 
 def _plain_numbers(entry: dict[str, Any]) -> dict[str, Any]:
+    """Convert NumPy numbers of an entry to Python floats."""
     return {key: float(value) if isinstance(value, np.floating) else value for key, value in entry.items()}

@@ -1,4 +1,4 @@
-"""Explanations of the mean with the effects in the model, where the first search had only slopes."""
+"""Refit strong systematic effects without linearising (Gauss-Newton), and repeat the selection beside them."""
 
 from __future__ import annotations
 
@@ -23,31 +23,47 @@ from sensors.effects import effect_of
 from sensors.effects.matching_noise import MatchingNoise
 
 _MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
-"""Effects whose values are sought exactly, by so many rounds, while the log-likelihood rises by so much."""
+"""Effects that are refitted to convergence, and most iterations of each."""
 _ABSORBED_SHARE = 0.5
-"""Share of what an effect gains that may be what slopes are wrong by."""
+"""Share of an effect's gain that may be linearisation error of the others."""
 _MOST_FITS, _CONVERGED_DECREASE = 10, 0.005
-"""Rounds of a fit of all effects together, and the share by which its sum of squares falls at the least."""
+"""Most iterations of the joint fit of all effects."""
 
 
 @dataclass(frozen=True)
 class SearchInput:
-    """What the searches for effects on the mean share. spread_at: effects on the spread by residuals of these points with some
-    effects on the mean in the model; added: variance to add to the predicted one."""
+    """Input shared by the searches for systematic effects.
+
+    Attributes
+    ----------
+    measurement : measurement of the training points.
+    part : their residuals.
+    families : candidates to search.
+    variance_at : returns the noise terms of residuals against a model with some systematic effects.
+    added : variance to add to the predicted one, in squared units of the observable.
+    random : source of random numbers of the null distributions.
+    """
 
     measurement: Measurement
     part: Residuals
     families: list[Candidate | SineGrid]
-    spread_at: Callable[[Residuals], list[VarianceTerm]]
+    variance_at: Callable[[Residuals], list[VarianceTerm]]
     added: float
     random: KeyedRandom
 
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """Effects that a search chose, and what a search beside them, taken exactly, found.
+    """Effects that a search selected, and the search repeated beside them without linearising.
 
-    estimates: of both; search, at, tried: the last search, its residuals and what it tried; beside: what it chose.
+    Attributes
+    ----------
+    chosen : explanations of the first search.
+    estimates : effects of both searches with their coefficients.
+    search : the last search.
+    at : residuals of the last search.
+    beside : explanations of the last search alone.
+    tried : candidates that the last search tried.
     """
 
     chosen: list[Chosen]
@@ -59,13 +75,16 @@ class SearchOutcome:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Empirical terms, and all effects."""
+        """Number of empirical terms, and number of all effects; smaller is simpler."""
         return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
 
 
 @dataclass(frozen=True)
 class _SingleFit:
-    """One effect in the model. at: residuals against that; log_likelihood: of all points."""
+    """One effect alone in the model, without linearising.
+
+    estimate: the effect; at: residuals against the model with it; there: the measurement with it; log_likelihood: of all points.
+    """
 
     estimate: Estimate
     at: Residuals
@@ -74,31 +93,31 @@ class _SingleFit:
 
     @property
     def name(self) -> str:
-        """The effect's."""
+        """Name of the effect."""
         return self.estimate.candidate.name
 
     @property
     def score(self) -> float:
-        """Of all points, less what the effect costs."""
+        """Penalised log-likelihood."""
         return self.log_likelihood - (self.estimate.chosen.gain - self.estimate.chosen.score)
 
     @classmethod
     def of(cls, points: SearchInput, first: MeanSearch, estimate: Estimate) -> _SingleFit | None:
-        """None where it is beyond what can be, or where the rays of many points would miss the reference with it."""
+        """Put one effect into the model; None if it is out of bounds, or if too few rays meet the reference with it."""
         if out_of_bounds(points.measurement, [estimate], points.part):
             return None
         there, found, _ = _aligned_with_estimates(points, [estimate])
         found = found.part(np.isin(found.index, points.part.index))
-        rough, _, scale = registered(found)
-        largest = thresholds().points.outlier_sigmas * scale * found.sigma
+        registered_residuals, _, noise_ratio = registered(found)
+        largest = thresholds().points.outlier_sigmas * noise_ratio * found.sigma
         value, kept = np.zeros(len(points.part)), _still_present(found, points.part)
         if kept.mean() < thresholds().points.least_share_on_reference:
             return None
-        value[kept] = np.where(found.smooth, np.clip(rough, -largest, largest), 0.0)
+        value[kept] = np.where(found.smooth, np.clip(registered_residuals, -largest, largest), 0.0)
         return cls(estimate, at_points_of(found, points.part), there, first.design.log_likelihood(value, estimate.candidate))
 
-    def better(self, points: SearchInput, first: MeanSearch) -> _SingleFit | None:
-        """With its values moved by the slopes here."""
+    def improved(self, points: SearchInput, first: MeanSearch) -> _SingleFit | None:
+        """Return the fit after one Gauss-Newton step from the present values."""
         candidate = _recomputed(self.estimate.candidate, candidate_families(self.there, self.at))
         width = candidate.columns.shape[1]
         step = _gauss_newton_step(self.at, candidate.columns, precision_of(candidate, width), np.zeros(width))
@@ -106,39 +125,49 @@ class _SingleFit:
 
 
 def select_and_refit(points: SearchInput, first: MeanSearch) -> SearchOutcome:
-    """What the first search chose, with what stands beside it when it is taken exactly.
+    """Select systematic effects and refit the strong ones without linearising.
 
-    Slopes miss some of a large effect, and others then make up for it: where one alone, taken exactly, needs fewer beside it,
-    or those that are found by slopes where all effects together fit best, that is the explanation.
+    The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
+    linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
+    beside the best one. It is also repeated at the joint fit of all effects. The explanation with the fewest effects is kept.
+
+    Parameters
+    ----------
+    points : input of the searches.
+    first : the linearised search.
+
+    Returns
+    -------
+    SearchOutcome : the explanation with the fewest empirical terms, then the fewest effects.
     """
     together, tried = first.select()
-    plain = SearchOutcome(together, _estimates_of(first, together), first, points.part, together, tried)
+    linear = SearchOutcome(together, _estimates_of(first, together), first, points.part, together, tried)
     alone = _strongest_single_fits(points, first, together) if together else []
     if not alone:
-        return _search_beside(points, plain) or plain
-    by_itself = _search_beside_best(points, plain, alone)
-    if by_itself is not None and len(by_itself.estimates) > 1:
-        others = {each.candidate.name for each in by_itself.estimates if not each.candidate.empirical}
-        more = _with_alternatives(points, first, alone, others)
-        if more[0] is not alone[0]:
-            by_itself = _search_beside_best(points, plain, more) or by_itself
-    if by_itself is not None and len(by_itself.estimates) == 1:
-        return by_itself
+        return _search_beside(points, linear) or linear
+    beside_best = _search_beside_best(points, linear, alone)
+    if beside_best is not None and len(beside_best.estimates) > 1:
+        others = {each.candidate.name for each in beside_best.estimates if not each.candidate.empirical}
+        extended = _with_alternatives(points, first, alone, others)
+        if extended[0] is not alone[0]:
+            beside_best = _search_beside_best(points, linear, extended) or beside_best
+    if beside_best is not None and len(beside_best.estimates) == 1:
+        return beside_best
     there = search_at_joint_fit(points)
-    found = [_search_beside(points, plain) or plain]
-    if by_itself is not None:
-        found.insert(0, by_itself)
+    found = [_search_beside(points, linear) or linear]
+    if beside_best is not None:
+        found.insert(0, beside_best)
     if there is not None and there.chosen:
         found.append(_search_beside(points, there) or there)
     possible = [each for each in found if not out_of_bounds(points.measurement, each.estimates, each.at)]
-    return min(possible, key=lambda each: each.complexity, default=plain)
+    return min(possible, key=lambda each: each.complexity, default=linear)
 
 
 def search_at_joint_fit(points: SearchInput) -> SearchOutcome | None:
-    """What a search chooses by slopes where all effects of the catalogue together, none far beyond its typical size, fit best.
+    """Select effects with the model linearised at the joint fit of all effects of the catalogue.
 
-    There the rays go where they went, whichever of the effects turned them: slopes are the true ones, and to what is left by all
-    of them the part of each is added again. None where one of them would be beyond what can be.
+    There the rays are traced to where they really went, whichever effect turned them, so the Jacobian is right. The fitted part
+    of all effects is added back to the residuals before the selection. Returns None if an effect is out of bounds.
     """
     plain = [each for each in points.families if isinstance(each, Candidate) and not each.empirical]
     fitted = fit_jointly(points, plain)
@@ -148,14 +177,18 @@ def search_at_joint_fit(points: SearchInput) -> SearchOutcome | None:
     allowed = {(family.name, family.empirical) for family in points.families}
     families = [each for each in candidate_families(there, at) if (each.name, each.empirical) in allowed]
     left = replace(at, value=at.value + explained)
-    heavier = replace(_with_variance_refitted(points, at), value=left.value)
-    search = MeanSearch(heavier, families, points.random.child("best fit"))
+    weighted = replace(_with_variance_refitted(points, at), value=left.value)
+    search = MeanSearch(weighted, families, points.random.child("best fit"))
     together, tried = search.select()
     return SearchOutcome(together, _estimates_of(search, together), search, left, together, tried)
 
 
 def fit_jointly(points: SearchInput, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
-    """The measurement with some effects in its model, what is left there, and how much (n,) they explain by slopes there."""
+    """Fit some effects together by Gauss-Newton.
+
+    Returns the measurement with them in its model, the residuals there, and their linearised part (n,) of the observations; None
+    if an effect is out of bounds or too few points remain.
+    """
     there, at, before = points.measurement, points.part, np.inf
     widths = [each.columns.shape[1] for each in candidates]
     values = np.zeros(sum(widths))
@@ -181,7 +214,7 @@ def fit_jointly(points: SearchInput, candidates: list[Candidate]) -> tuple[Measu
 
 
 def _too_few_left(points: SearchInput, at: Residuals) -> bool:
-    """Whether too few of the points are left to search among."""
+    """Whether too few of the points are left for a search."""
     return len(at) < thresholds().points.least_share_on_reference * len(points.part)
 
 
@@ -191,13 +224,14 @@ def _all_columns(candidates: list[Candidate]) -> FloatArray:
 
 
 def _estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
-    """An effect of some size for which nothing speaks yet."""
+    """An estimate with given coefficients and no evidence yet."""
     nothing = Chosen(candidate, (), 1.0, 0.0, 0.0, ())
     return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
 
 
 def _gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
-    """(k,) by how much values (k,) change: least squares by slopes (n, k), the pose free and each value known to be near 0."""
+    """(k,) change of the coefficients: weighted least squares with the Jacobian (n, k), free pose and a Gaussian prior around
+    0."""
     design = np.concatenate([at.pose, columns], axis=1) / at.sigma[:, None]
     known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
     start = at.pose.shape[1]
@@ -207,16 +241,18 @@ def _gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray
 
 
 def _strongest_single_fits(points: SearchInput, first: MeanSearch, together: list[Chosen]) -> list[_SingleFit]:
-    """The effects that explain most by themselves, of those that explain much, best first; none where slopes say all: where they
-    are wrong by less than anything gains that was chosen."""
+    """The effects that alone explain most, refitted without linearising, best first.
+
+    Empty where the linearised model is good enough: its error is smaller than the gain of any selected effect.
+    """
     found: list[_SingleFit] = []
-    serve = min([thresholds().mean.linearisation_error, *(_ABSORBED_SHARE * each.gain for each in together)])
+    tolerance = min([thresholds().mean.linearisation_error, *(_ABSORBED_SHARE * each.gain for each in together)])
     for candidate in first.leading():
         alone = _single_fit(points, first, candidate)
         if alone is None:
             continue
-        by_slopes = first.design.log_likelihood(points.part.value, candidate)
-        if not found and abs(alone.log_likelihood - by_slopes) < serve:
+        linearised = first.design.log_likelihood(points.part.value, candidate)
+        if not found and abs(alone.log_likelihood - linearised) < tolerance:
             return []
         found.append(alone)
     if not found:
@@ -226,9 +262,9 @@ def _strongest_single_fits(points: SearchInput, first: MeanSearch, together: lis
 
 
 def _with_alternatives(points: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:
-    """With more effects, of which slopes may miss nearly all, and those that slopes cannot tell from the best; best first.
+    """Add single fits of further effects, and of those that the linearised search cannot tell from the best; best first.
 
-    Of each the parameters that slopes ask for, in every camera.
+    Of each effect the variant with the parameters that the linearised search prefers is used, in every camera.
     """
     others = {item.name: item.candidate.names for item in first.tried(()) if not item.empirical and item.name in names}
     for each in alone:
@@ -243,14 +279,16 @@ def _with_alternatives(points: SearchInput, first: MeanSearch, alone: list[_Sing
 
 
 def _single_fit(points: SearchInput, first: MeanSearch, candidate: Candidate) -> _SingleFit | None:
-    """One effect in the model, at the values that slopes give it."""
+    """One effect in the model, at the coefficients of the linearised fit."""
     (estimate,) = _estimates_of(first, [first.alone(candidate)])
     return _SingleFit.of(points, first, estimate)
 
 
 def _best_variants(points: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:
-    """A variant of each of the likeliest effects, at the values that explain most, best first; of the best effect the best of the
-    likeliest variants: which camera it is may not show before."""
+    """The best effects, refitted to convergence, best first.
+
+    Of the best effect further variants are refitted too, because which camera it belongs to may not show before.
+    """
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
     variants = {each.name: each for each in reversed(ranked)}
     likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
@@ -261,33 +299,33 @@ def _best_variants(points: SearchInput, first: MeanSearch, found: list[_SingleFi
 
 
 def _search_beside_best(points: SearchInput, plain: SearchOutcome, alone: list[_SingleFit]) -> SearchOutcome | None:
-    """With what a search finds beside the best of some effects alone."""
+    """Repeat the search beside the best of some single fits."""
     estimate = _with_equivalence_class(alone).estimate
     return _search_beside(points, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
 
 
 def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
-    """The best, with those that would do as well: slopes say so of effects that were not taken exactly only."""
+    """The best single fit with its equivalence class; the linearised search decides for effects that were not refitted."""
     best, *others = converged
     chosen = best.estimate.chosen
     least = best.score - class_margin(chosen.gain)
     near = {each.name for each in others if each.score > least}
-    slopes = set(chosen.alike) - {each.name for each in others}
-    return replace(best, estimate=replace(best.estimate, chosen=replace(chosen, alike=tuple(sorted(near | slopes)))))
+    linearised = set(chosen.alike) - {each.name for each in others}
+    return replace(best, estimate=replace(best.estimate, chosen=replace(chosen, alike=tuple(sorted(near | linearised)))))
 
 
 def _converged(points: SearchInput, first: MeanSearch, alone: _SingleFit) -> _SingleFit:
-    """At the values that explain most."""
+    """Gauss-Newton steps until the log-likelihood rises by less than 1."""
     for _ in range(_MOST_ROUNDS):
-        better = alone.better(points, first)
-        if better is None or better.log_likelihood < alone.log_likelihood + _CONVERGED_GAIN:
+        improved = alone.improved(points, first)
+        if improved is None or improved.log_likelihood < alone.log_likelihood + _CONVERGED_GAIN:
             break
-        alone = better
+        alone = improved
     return alone
 
 
 def _search_beside(points: SearchInput, chosen: SearchOutcome) -> SearchOutcome | None:
-    """With what a search finds beside the effects; None where there are none, or where they are beyond what can be."""
+    """Repeat the search beside the selected effects; None where there are none, or where one is out of bounds."""
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or out_of_bounds(points.measurement, chosen.estimates, chosen.at):
         return None
@@ -299,7 +337,7 @@ def _search_beside(points: SearchInput, chosen: SearchOutcome) -> SearchOutcome 
 
 
 def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
-    """Families whose estimate lies beyond the bounds of the effect."""
+    """Return the families whose estimate is outside the bounds of the effect, or implausibly large."""
     wrong = [each for each in estimates if not is_plausible(measurement.model, effect_from_estimate(each, part).entry)]
     return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
 
@@ -307,7 +345,10 @@ def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Res
 def absorbed_by_registration(
     estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]
 ) -> frozenset[tuple[str, bool]]:
-    """Effects far beyond their typical size of which the registration leaves next to nothing. survival: that share by name."""
+    """Return implausibly large effects of which the registration leaves next to nothing.
+
+    survival: share of each signature that the pose fit leaves, by name.
+    """
     by = thresholds().mean
     doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]
     large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.absorbed_size]
@@ -315,21 +356,26 @@ def absorbed_by_registration(
 
 
 def with_added_variance(part: Residuals, variance: float) -> Residuals:
+    """Add a variance to the predicted one."""
     return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
 
 
-def with_fitted_variance(part: Residuals, spread: list[VarianceTerm], scale: float) -> Residuals:
-    """With the spread that the points really have, as it counts for means of neighbours."""
+def with_fitted_variance(part: Residuals, noise_terms: list[VarianceTerm], noise_ratio: float) -> Residuals:
+    """Use the fitted noise in place of the predicted one, as it counts for means of neighbours.
+
+    noise_terms: fitted noise terms; where there are none, the predicted standard deviations are multiplied by `noise_ratio`.
+    """
     part = part.averaged
-    if not spread:
-        return replace(part, sigma=part.sigma * scale)
-    made = (effect_of(each.effect)(**each.parameters) for each in spread if each.parameters)
+    if not noise_terms:
+        return replace(part, sigma=part.sigma * noise_ratio)
+    made = (effect_of(each.effect)(**each.parameters) for each in noise_terms if each.parameters)
     shared = [effect for effect in made if isinstance(effect, MatchingNoise)]
-    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in spread))
+    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in noise_terms))
     return replace(part, sigma=sigma, shared_noise=part.shared_noise.beside(shared))
 
 
 def _estimates_of(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
+    """Refine the selected explanations jointly and return their coefficients with covariance."""
     candidates, fit = search.design.refined([item.candidate for item in chosen])
     places = search.design.split(np.arange(len(fit.coefficients)), candidates)
     return [
@@ -341,10 +387,18 @@ def _estimates_of(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
 def _repeat_search(
     points: SearchInput, had: list[Estimate], alone: Mapping[Explanation, float]
 ) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]] | None:
-    """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
+    """Repeat the search with some effects in the model, whose coefficients stay free like the pose.
 
-    alone: what each explanation gains by itself. Returns the search, its residuals, the effects with what was found beside them,
-    that only, and what was tried last; None where the rays of many points would miss the reference with them.
+    Parameters
+    ----------
+    points : input of the searches.
+    had : effects to put into the model.
+    alone : log-likelihood ratio of each explanation alone.
+
+    Returns
+    -------
+    tuple or None : the search, its residuals, the estimates of all effects, the new explanations, and what was tried last; None
+        if too few rays meet the reference with the effects.
     """
     part = points.part
     there, found, _ = _aligned_with_estimates(points, had)
@@ -359,10 +413,10 @@ def _repeat_search(
     columns = [_free_columns(each) for each in known]
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
     others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in OVERTONES]
-    heavier = _with_variance_refitted(points, at)
+    weighted = _with_variance_refitted(points, at)
     precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
-        replace(heavier, pose=np.concatenate([at.pose, *columns], axis=1)),
+        replace(weighted, pose=np.concatenate([at.pose, *columns], axis=1)),
         others,
         points.random.child("again"),
         np.concatenate([np.zeros(at.pose.shape[1]), *precision]),
@@ -378,18 +432,17 @@ def _repeat_search(
 
 
 def _with_variance_refitted(points: SearchInput, at: Residuals) -> Residuals:
-    """Residuals with some effects on the mean in the model, with the spread that they have there: without those in the model what
-    they do looks like noise, beside which nothing small would be seen."""
-    return with_fitted_variance(at, points.spread_at(at), registered(at)[2])
+    """Residuals with the noise fitted beside the effects in the model. Without these, their signatures would look like noise."""
+    return with_fitted_variance(at, points.variance_at(at), registered(at)[2])
 
 
 def _aligned_with_estimates(points: SearchInput, effects: list[Estimate]) -> Settled:
-    """The measurement with some effects in its model, settled."""
+    """Put some effects into the model of the measurement and estimate the pose again."""
     return aligned_with(points.measurement, [effect_from_estimate(each, points.part) for each in effects], points.part.index)
 
 
 def _merge_sines_with_overtones(estimates: list[Estimate]) -> list[Estimate]:
-    """A named sine with overtones becomes one empirical term."""
+    """Merge a named sine and its overtones into one empirical term."""
     found = list(estimates)
     for overtones in (each for each in estimates if each.candidate.form == HARMONICS):
         sine = next(each for each in estimates if PERIODIC.get(each.candidate.name) == overtones.candidate.name)
@@ -402,9 +455,9 @@ def _merge_sines_with_overtones(estimates: list[Estimate]) -> list[Estimate]:
 
 
 def at_points_of(found: Residuals, part: Residuals) -> Residuals:
-    """What was found at the points of a part, where the surface is smooth there too and they are no outliers."""
-    rough, _, scale = registered(found)
-    good = found.smooth & (np.abs(rough) < thresholds().points.outlier_sigmas * scale * found.sigma)
+    """Restrict residuals to the points of `part` that are smooth there too and no outliers."""
+    registered_residuals, _, noise_ratio = registered(found)
+    good = found.smooth & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)
     place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
     place[found.index[good]] = np.flatnonzero(good)
     rows = place[part.index]
@@ -412,7 +465,7 @@ def at_points_of(found: Residuals, part: Residuals) -> Residuals:
 
 
 def _still_present(at: Residuals, part: Residuals) -> BoolArray:
-    """Which points of the part are left."""
+    """Which points of `part` are left."""
     return np.isin(part.index, at.index)
 
 
@@ -430,6 +483,6 @@ def _recomputed(candidate: Candidate, families: list[Candidate | SineGrid]) -> C
 
 
 def _free_columns(found: Estimate) -> FloatArray:
-    """(n, k) of its coefficients, a sine's with that of its frequency."""
+    """(n, k) columns of an effect's coefficients; a sine also has that of its frequency."""
     wave = found.candidate.wave
     return found.candidate.columns if wave is None else wave.with_slope(found.candidate.period, found.values[:2])

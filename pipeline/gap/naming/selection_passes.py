@@ -1,4 +1,4 @@
-"""What naming starts from, once effects where the surface is not smooth are known, what it names, and those again beside it."""
+"""Selection passes: the input of a pass after edge effects, the effects that it selects, and the choice between passes."""
 
 from __future__ import annotations
 
@@ -29,190 +29,243 @@ from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.smoothing import Smoothing
 
 _LEAST_COMPLEXITY = 0, 1
-"""One effect, the least complexity that an attempt can have where there is something."""
+"""Complexity (empirical terms, all effects) of a pass that selects one effect of the catalogue and nothing else."""
 _MOST_POINTS = 60_000
-"""Points that take part in the selection; more add little to 1,100 cells."""
+"""Most points that a selection uses; more add little information to about 800 cells."""
 
 
 @dataclass(frozen=True)
 class PassInput:
-    """What naming starts from, once effects where the surface is not smooth are known.
+    """Input of one selection pass: the measurement and its residuals after edge effects have been applied.
 
-    shaped: the measurement with them in its model; residuals: against that; touched, changed, held_out: (n,) points that they
-    touch, that lie in changes of the scene, and that no step before the last may look at; rough: (n,) registered residuals, which
-    spread `scale` predicted sigmas; chosen: rows that selection may look at.
+    Edge effects are edge fattening, smoothing, filled occlusions and the beam footprint.
+
+    Attributes
+    ----------
+    edge_effects : effects that were found at depth steps.
+    measurement : the measurement with these effects in its model.
+    residuals : residuals against that model.
+    touched : (n,) points that edge effects move, so that their residuals cannot be predicted to the noise.
+    changes : regions where the scene itself changed.
+    changed : (n,) points in these regions.
+    registered_residuals : (n,) residuals after a robust pose fit, in the observable's unit.
+    noise_ratio : their standard deviation over the predicted one.
+    cells : cells of the wall in which the mean model averages.
+    held_out : (n,) points kept for validation.
+    training_rows : (k,) rows of the residuals that the selection may use.
     """
 
-    shapes: list[EdgeEffect]
-    shaped: Measurement
+    edge_effects: list[EdgeEffect]
+    measurement: Measurement
     residuals: Residuals
     touched: BoolArray
     changes: list[SceneChange]
     changed: BoolArray
-    rough: FloatArray
-    scale: float
+    registered_residuals: FloatArray
+    noise_ratio: float
     cells: Cells
     held_out: BoolArray
-    chosen: NDArray[np.int64]
+    training_rows: NDArray[np.int64]
 
     @classmethod
     def of(
         cls,
         there: Measurement,
         plain: Residuals,
-        held_points: BoolArray,
-        shapes: list[EdgeEffect],
-        resettled: bool = True,
+        held_out_points: BoolArray,
+        edge_effects: list[EdgeEffect],
+        realigned: bool = True,
     ) -> PassInput:
-        """held_points: of the measurement, as what shapes touch; resettled: the sensor goes where it stood with the shapes."""
-        touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in shapes)], axis=0)
-        trusted = plain.index[~(touched | held_points[plain.index])] if resettled else None
-        shaped, residuals = _with_edge_effects(there, plain, shapes, touched, trusted)
-        rough, _, scale = registered(residuals)
+        """Build the input of a pass from the aligned measurement and some edge effects.
+
+        Parameters
+        ----------
+        there : aligned measurement.
+        plain : its residuals, without edge effects.
+        held_out_points : (N,) points of the measurement that are kept for validation.
+        edge_effects : effects to put into the model; their `touched` refers to the points of the measurement.
+        realigned : whether the pose is estimated again with the edge effects in the model.
+        """
+        touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
+        registration_rows = plain.index[~(touched | held_out_points[plain.index])] if realigned else None
+        modelled, residuals = _with_edge_effects(there, plain, edge_effects, touched, registration_rows)
+        registered_residuals, _, noise_ratio = registered(residuals)
         sight = Sight.of(there, residuals)
-        changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
+        changes, changed = find_changes(replace(residuals, value=registered_residuals), sight, residuals.even & ~touched)
         if isinstance(there, TlsMeasurement) and there.scans:
             changes = once_each(changes)
-        rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
+        registered_residuals, _, noise_ratio = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
-        held_out = held_points[residuals.index]
-        usable = residuals.smooth & ~changed & (np.abs(rough) < thresholds().points.outlier_sigmas * scale * residuals.sigma)
-        chosen = subsample_rows(np.flatnonzero(usable & ~held_out))
-        return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
+        held_out = held_out_points[residuals.index]
+        usable = (
+            residuals.smooth
+            & ~changed
+            & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * residuals.sigma)
+        )
+        training_rows = subsample_rows(np.flatnonzero(usable & ~held_out))
+        return cls(
+            edge_effects,
+            modelled,
+            residuals,
+            touched,
+            changes,
+            changed,
+            registered_residuals,
+            noise_ratio,
+            cells,
+            held_out,
+            training_rows,
+        )
 
     @property
-    def fit(self) -> BoolArray:
+    def stable(self) -> BoolArray:
         """(n,) points on smooth surface that did not change."""
         return np.asarray(self.residuals.smooth & ~self.changed)
 
     @property
-    def shown(self) -> BoolArray:
-        """(n,) points on which a gap may be measured: on smooth surface, or where an effect was found that shows elsewhere."""
+    def measurable(self) -> BoolArray:
+        """(n,) points on which the gap may be measured: on smooth surface, or moved by an edge effect, and unchanged."""
         return np.asarray((self.residuals.smooth | self.touched) & ~self.changed)
 
     @property
-    def part(self) -> tuple[Measurement, Residuals]:
-        """What selection may look at. What effects on the shape do there, cameras that move by millimetres hardly change."""
-        there, residuals = self.shaped, self.residuals
+    def training_part(self) -> tuple[Measurement, Residuals]:
+        """The measurement and the residuals of the training rows alone.
+
+        What edge effects do at these points is kept fixed: it hardly changes while the cameras move by millimetres.
+        """
+        there, residuals = self.measurement, self.residuals
         if isinstance(there, StereoMeasurement) and isinstance(residuals, StereoResiduals):
             shaped = np.zeros(len(there.cloud.points))
             shaped[residuals.index] = residuals.geometry.shaped
             there = there.changed(shaped_px=shaped)
-        return subsample(there, residuals, self.chosen)
+        return subsample(there, residuals, self.training_rows)
 
 
 @dataclass(frozen=True)
 class SelectionPass:
-    """What naming started from and what it named."""
+    """One selection pass: its input, the effects that it named, and the rest of its result."""
 
-    state: PassInput
+    pass_input: PassInput
     named: list[NamedEffect]
-    naming: SelectionResult
+    selection: SelectionResult
 
     @classmethod
-    def of(cls, state: PassInput, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> SelectionPass:
-        return cls(state, *select_effects(*state.part, state.scale, random, left_out))
+    def of(cls, pass_input: PassInput, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
+        """Select effects for this input. excluded: families that are not tried, as in `select_effects`."""
+        return cls(pass_input, *select_effects(*pass_input.training_part, pass_input.noise_ratio, random, excluded))
 
     @property
-    def shapes(self) -> set[str]:
-        """Effects where the surface is not smooth."""
-        return {each.name for each in self.state.shapes}
+    def edge_effect_names(self) -> set[str]:
+        """Names of the edge effects of the input."""
+        return {each.name for each in self.pass_input.edge_effects}
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Empirical terms, and all effects and changes of the scene."""
-        state = self.state
-        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(state.shapes) + len(state.changes)
+        """Number of empirical terms, and number of all effects and scene changes; smaller is simpler."""
+        given = self.pass_input
+        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(given.edge_effects) + len(
+            given.changes
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """From what naming may start. there, plain: the measurement and its residuals; held_points: (n,) of its points those that no
-    step before the last may look at."""
+    """The inputs that a selection pass may have: with all edge effects, with some, or with none.
 
-    there: Measurement
-    plain: Residuals
-    held_points: BoolArray
-
-    @cached_property
-    def _shapes(self) -> list[EdgeEffect]:
-        return _find_edge_effects(self.there, self.plain, self.held_points)
-
-    @cached_property
-    def first(self) -> PassInput:
-        """Beside the effects where the surface is not smooth."""
-        return self.beside(self._shapes)
-
-    @cached_property
-    def staying(self) -> PassInput:
-        """The same, with the sensor where it stood without them."""
-        return PassInput.of(self.there, self.plain, self.held_points, self._shapes, resettled=False)
-
-    @cached_property
-    def smooth(self) -> PassInput:
-        """Without such effects."""
-        return self.beside([])
-
-    def seen_beside(self, named: list[NamedEffect]) -> list[EdgeEffect]:
-        """The effects where the surface is not smooth that show with some others in the model."""
-        seen = aligned_with(self.there, named, self.plain.index[~self.held_points[self.plain.index]])
-        return _find_edge_effects(seen.measurement, seen.residuals, self.held_points)
-
-    def beside(self, shapes: list[EdgeEffect]) -> PassInput:
-        """Beside some of those."""
-        return PassInput.of(self.there, self.plain, self.held_points, shapes)
-
-
-def best_pass(starts: PassInputs, random: KeyedRandom, left_out: frozenset[tuple[str, bool]]) -> SelectionPass:
-    """What the naming started from in the end, and what it named. left_out: as of `name_effects`.
-
-    What moves the rays everywhere hides, or feigns, effects where the surface is not smooth: those are looked for again beside
-    what was named; and where there seemed to be some, beside what is named without them. A low-pass moves the sensor, or what
-    does so beside it: where the sensor goes along and a term of no effect is left, and no effect explains all by itself, it
-    stays. Fewer effects are the explanation, of those attempts that leave about as little spread: noise, if it is large enough,
-    takes the place of any effect.
+    measurement: the aligned measurement; plain: its residuals; held_out_points: (N,) its points kept for validation.
     """
 
-    def beside(found: SelectionPass) -> SelectionPass:
+    measurement: Measurement
+    plain: Residuals
+    held_out_points: BoolArray
+
+    @cached_property
+    def _edge_effects(self) -> list[EdgeEffect]:
+        return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
+
+    @cached_property
+    def with_edge_effects(self) -> PassInput:
+        """The input with the edge effects that show in the plain residuals, and the pose estimated again beside them."""
+        return self.with_these(self._edge_effects)
+
+    @cached_property
+    def at_initial_pose(self) -> PassInput:
+        """The same edge effects, with the pose that was estimated without them."""
+        return PassInput.of(self.measurement, self.plain, self.held_out_points, self._edge_effects, realigned=False)
+
+    @cached_property
+    def without_edge_effects(self) -> PassInput:
+        """The input without any edge effect."""
+        return self.with_these([])
+
+    def edge_effects_beside(self, named: list[NamedEffect]) -> list[EdgeEffect]:
+        """Return the edge effects that show once some named effects are in the model."""
+        seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
+        return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
+
+    def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
+        """Return the input with the given edge effects."""
+        return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects)
+
+
+def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
+    """Run the selection with several inputs and return the simplest pass that explains the residuals.
+
+    An effect that moves all rays can hide or imitate an edge effect. Edge effects are therefore searched again beside what was
+    named, and, if some were found, also beside what is named without them. Smoothing can shift the estimated pose. If the first
+    pass needs an empirical term and no single effect explains everything, a pass at the initial pose is tried too.
+
+    Among the passes whose noise is close to the lowest, the one of least complexity wins. The noise is compared because enough
+    noise can take the place of any effect.
+
+    Parameters
+    ----------
+    inputs : inputs to choose from.
+    random : source of random numbers of the null distributions.
+    excluded : families that are not tried, as in `select_effects`.
+    """
+
+    def search_edges_again(found: SelectionPass) -> SelectionPass:
         if not found.named:
             return found
-        # rays that are not quite where they are thought to be look like a low-pass
-        feigned = {Smoothing.tag()} - found.shapes
-        shapes = [each for each in starts.seen_beside(found.named) if each.name not in feigned]
-        if {each.name for each in shapes} == found.shapes:
+        # a small error of the rays' directions looks like smoothing
+        imitated = {Smoothing.tag()} - found.edge_effect_names
+        edge_effects = [each for each in inputs.edge_effects_beside(found.named) if each.name not in imitated]
+        if {each.name for each in edge_effects} == found.edge_effect_names:
             return found
-        return SelectionPass.of(starts.beside(shapes), random, left_out)
+        return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
 
-    first = SelectionPass.of(starts.first, random, left_out)
-    found = [beside(first)]
-    if first.shapes and found[0].complexity > _LEAST_COMPLEXITY:
-        smooth = SelectionPass.of(starts.smooth, random, left_out)
-        if smooth.named:
-            found.append(beside(smooth))
-    simple = found[-1].complexity <= _LEAST_COMPLEXITY and found[-1].naming.spreads <= found[0].naming.spreads
-    if Smoothing.tag() in first.shapes and found[0].complexity >= (1, 0) and not simple:
-        found.insert(1, beside(SelectionPass.of(starts.staying, random, left_out)))
-    widest = thresholds().edges.most_relative_noise * min(each.naming.spreads for each in found)
-    return min((each for each in found if each.naming.spreads <= widest), key=lambda each: each.complexity)
+    first = SelectionPass.of(inputs.with_edge_effects, random, excluded)
+    found = [search_edges_again(first)]
+    if first.edge_effect_names and found[0].complexity > _LEAST_COMPLEXITY:
+        without = SelectionPass.of(inputs.without_edge_effects, random, excluded)
+        if without.named:
+            found.append(search_edges_again(without))
+    simple = found[-1].complexity <= _LEAST_COMPLEXITY and found[-1].selection.noise_ratio <= found[0].selection.noise_ratio
+    if Smoothing.tag() in first.edge_effect_names and found[0].complexity >= (1, 0) and not simple:
+        found.insert(1, search_edges_again(SelectionPass.of(inputs.at_initial_pose, random, excluded)))
+    most_noise = thresholds().edges.most_relative_noise * min(each.selection.noise_ratio for each in found)
+    return min((each for each in found if each.selection.noise_ratio <= most_noise), key=lambda each: each.complexity)
 
 
 def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return at most about 60,000 of the rows, evenly spaced."""
     return rows[:: max(len(rows) // _MOST_POINTS, 1)]
 
 
-def _find_edge_effects(measurement: Measurement, residuals: Residuals, held_points: BoolArray) -> list[EdgeEffect]:
-    """Effects where the surface is not smooth that the model does not hold, with the measurement's points that they touch.
+def _find_edge_effects(measurement: Measurement, residuals: Residuals, held_out_points: BoolArray) -> list[EdgeEffect]:
+    """Find edge effects that the model lacks; their `touched` refers to the points of the measurement.
 
-    held_points: of the measurement's points those that have no say.
+    held_out_points: (N,) points of the measurement that must not be used.
     """
-    rough, _, scale = registered(residuals)
+    registered_residuals, _, noise_ratio = registered(residuals)
     found: list[EdgeEffect] = []
-    held_out = held_points[residuals.index]
+    held_out = held_out_points[residuals.index]
     match measurement, residuals:
         case StereoMeasurement(), StereoResiduals():
-            found = find_disparity_edge_effects(measurement, residuals, rough, held_out)
+            found = find_disparity_edge_effects(measurement, residuals, registered_residuals, held_out)
         case TlsMeasurement(), TlsResiduals() if not model_has(measurement, BeamDivergence.tag()):
-            found = find_footprint(measurement, residuals, rough, scale, held_out)
+            found = find_footprint(measurement, residuals, registered_residuals, noise_ratio, held_out)
     touched = np.zeros((len(found), len(measurement.cloud.points)), dtype=bool)
     for row, each in zip(touched, found, strict=True):
         row[residuals.index] = each.touched
@@ -222,30 +275,32 @@ def _find_edge_effects(measurement: Measurement, residuals: Residuals, held_poin
 def _with_edge_effects(
     measurement: Measurement,
     residuals: Residuals,
-    shapes: list[EdgeEffect],
+    edge_effects: list[EdgeEffect],
     touched: BoolArray,
-    trusted: NDArray[np.int64] | None,
+    registration_rows: NDArray[np.int64] | None,
 ) -> tuple[Measurement, Residuals]:
-    """The measurement with these effects in its model, its sensor where its points say that it stood with them, and the residuals
-    of the same points there. touched: (n,) points that the effects move; trusted: rows of the measurement's points that say where
-    the sensor stood, None where it stays."""
-    if not shapes:
+    """Put edge effects into the model and return the measurement with the residuals of the same points.
+
+    The pose is estimated again from `registration_rows`, rows of the measurement's points; None keeps it. touched: (n,) points
+    that the effects move, which then do not count as smooth.
+    """
+    if not edge_effects:
         return measurement, residuals
-    entries = [effect_from_edges(shape).entry for shape in shapes]
-    shaped = measurement.changed(model=with_effects(measurement.model, entries))
-    if trusted is None:
-        found = residuals_of(shaped)
+    entries = [effect_from_edges(shape).entry for shape in edge_effects]
+    modelled = measurement.changed(model=with_effects(measurement.model, entries))
+    if registration_rows is None:
+        found = residuals_of(modelled)
     else:
-        shaped, found, _ = settled(shaped, trusted)
+        modelled, found, _ = settled(modelled, registration_rows)
     place = np.full(len(measurement.cloud.points), -1)
     place[found.index] = np.arange(len(found))
     rows = place[residuals.index]
     known = rows >= 0
     there = residuals.with_rows(known, found.part(rows[known]))
-    return shaped, replace(there, smooth=residuals.smooth & ~touched & known)
+    return modelled, replace(there, smooth=residuals.smooth & ~touched & known)
 
 
 def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
-    """The measurement with the points of some rows of its residuals alone, and their residuals."""
+    """Restrict a measurement and its residuals to some rows of the residuals."""
     part = residuals.part(rows)
     return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)

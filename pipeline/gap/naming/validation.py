@@ -1,4 +1,4 @@
-"""The last step: the gap with the named effects in the model. What makes the model predict worse is taken out again."""
+"""Last step of the diagnosis: measure the gap with the named effects, and drop effects that make the predictions worse."""
 
 from __future__ import annotations
 
@@ -24,11 +24,20 @@ _FEWEST_POINTS = 100
 
 @dataclass(frozen=True)
 class ValidationResult:
-    """The model with some effects, and values of a lower noise, (n,) residuals against it, registered, the pose (6,) of that, and
-    the gap that is left."""
+    """A model with some effects, and the gap that it leaves.
+
+    Attributes
+    ----------
+    named : effects in the model.
+    reduced_noise : lower noise values of the model, by key; empty where its noise was kept.
+    model : the model.
+    value : (n,) registered residuals against it.
+    pose : (6,) pose of that registration, shift (m) and rotation (rad).
+    gap : scores before and after, None where too few points can be scored.
+    """
 
     named: list[NamedEffect]
-    lower: dict[str, float]
+    reduced_noise: dict[str, float]
     model: TlsModel | StereoModel
     value: FloatArray
     pose: FloatArray
@@ -38,14 +47,14 @@ class ValidationResult:
     def is_worse(self) -> bool:
         """Whether the model predicts no better with the effects than without them.
 
-        Of losses that is no judge: a shrub before the held-out blocks has more to say than a few drops.
+        Missing returns are not judged this way: a shrub before the validation blocks outweighs a few drops.
         """
         gap = self.gap
         return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
 
     @property
     def is_clearly_worse(self) -> bool:
-        """Whether that is by more than its uncertainty."""
+        """Whether it predicts worse by more than the uncertainty of the scores."""
         return (
             self.is_worse
             and self.gap is not None
@@ -55,76 +64,90 @@ class ValidationResult:
 
 @dataclass(frozen=True)
 class Validation:
-    """What a gap is measured with.
+    """What is needed to measure the gap for any set of effects.
 
-    measurement: where its sensor stood; residuals: against its model, of which the rows `chosen` register; tested, learned: (n,)
-    points that no step has looked at, and those that naming may; losses: what was found of them, and the pulses that it was not
-    fitted to; reference_sigma: in the observable's unit; largest: predicted sigmas by which points may be off; lower: values of
-    the model's noise that are proposed since it is too large.
+    Attributes
+    ----------
+    measurement : measurement at the estimated pose.
+    residuals : residuals against its model.
+    registration_rows : rows of the residuals from which the pose is estimated.
+    tested : (n,) validation points, which no step has used.
+    training : (n,) points that the selection may use.
+    losses : explanation of the missing returns and the pulses that it was not fitted to, or None.
+    reference_sigma : standard deviation of the reference error, in the observable's unit.
+    most_sigmas : points farther than this many predicted standard deviations from the models are not scored.
+    random : source of random numbers.
+    reduced_noise : lower noise values to propose because the model's noise is too large, by key.
     """
 
     measurement: Measurement
     residuals: Residuals
-    chosen: NDArray[np.int64]
+    registration_rows: NDArray[np.int64]
     tested: BoolArray
-    learned: BoolArray
+    training: BoolArray
     losses: tuple[LossExplanation, BoolArray] | None
     reference_sigma: float
-    largest: float
+    most_sigmas: float
     random: KeyedRandom
-    lower: dict[str, float] = field(default_factory=dict)
+    reduced_noise: dict[str, float] = field(default_factory=dict)
 
     @property
     def pose(self) -> FloatArray:
-        """(6,) by which the model as it is is registered."""
-        return pose_of(self.residuals, self.chosen)
+        """(6,) pose that registers the model without effects."""
+        return pose_of(self.residuals, self.registration_rows)
 
-    def show(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
-        """The gap on points that no step has used, and words for effects that are taken out.
+    def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
+        """Measure the gap on validation points, and drop effects that make the predictions worse.
 
-        As long as it is larger with the effects than without, and some effect does harm on points that may be looked at too, by
-        more than the uncertainty of that, the one goes that does most; where the gap itself is larger by more than its
-        uncertainty one goes in any case. What is described, not named, goes only then. A lower noise is proposed only if it
-        predicts better.
+        While the score is worse with the effects than without, the effect that does most harm on training points is dropped, if
+        that harm exceeds its uncertainty. If the validation score itself is worse by more than its uncertainty, any effect may be
+        dropped; otherwise descriptions of the mean are kept. A lower noise is proposed only if it predicts better.
+
+        Returns
+        -------
+        tuple : the result, and a note for each effect that was dropped.
         """
-        shown, words = self._of(named, self.tested), []
-        if self.lower and shown.is_worse:
-            return replace(self, lower={}).show(named)
-        while shown.is_worse:
-            doubtful = [item for item in _without_losses(shown.named) if shown.is_clearly_worse or _may_be_dropped(item)]
-            harms = [self._harm(shown, item) for item in doubtful]
+        result, words = self._result_of(named, self.tested), []
+        if self.reduced_noise and result.is_worse:
+            return replace(self, reduced_noise={}).validate(named)
+        while result.is_worse:
+            doubtful = [item for item in _without_losses(result.named) if result.is_clearly_worse or _may_be_dropped(item)]
+            harms = [self._harm(result, item) for item in doubtful]
             if max(harms, default=0.0) <= 0:
                 break
             out = doubtful[int(np.argmax(harms))]
-            words.append(f"{out.name} dropped: with it the model predicts worse")
-            shown = self._of([item for item in shown.named if item is not out], self.tested)
-        return shown, words
+            words.append(f"{out.name} dropped: the model predicts worse with it")
+            result = self._result_of([item for item in result.named if item is not out], self.tested)
+        return result, words
 
-    def _harm(self, shown: ValidationResult, item: NamedEffect) -> float:
-        """By how much more than its uncertainty the model predicts the points that may be looked at worse with an effect than
-        without; the same points, since an effect that moves some far may bring others near."""
-        others = [each for each in shown.named if each is not item]
+    def _harm(self, result: ValidationResult, item: NamedEffect) -> float:
+        """By how much more than its uncertainty an effect worsens the predictions of the same training points.
+
+        The same points are compared, because an effect that moves some points far may bring others near.
+        """
+        others = [each for each in result.named if each is not item]
         without = RegisteredModel(self._model(_without_losses(others)), self._registered(others)[1])
         gap = self._gap(
-            shown.named, (without, RegisteredModel(self._model(_without_losses(shown.named)), shown.pose)), self.learned
+            result.named, (without, RegisteredModel(self._model(_without_losses(result.named)), result.pose)), self.training
         )
         return 0.0 if gap is None else gap.after - gap.before - thresholds().verdict.gap_sigmas * gap.error
 
     def _model(self, named: list[NamedEffect]) -> TlsModel | StereoModel:
-        return with_effects(self.measurement.model, [item.entry for item in named], self.lower)
+        return with_effects(self.measurement.model, [item.entry for item in named], self.reduced_noise)
 
-    def _of(self, named: list[NamedEffect], rows: BoolArray) -> ValidationResult:
+    def _result_of(self, named: list[NamedEffect], rows: BoolArray) -> ValidationResult:
         value, pose = self._registered(named)
         versions = RegisteredModel(self.measurement.model, self.pose), RegisteredModel(self._model(_without_losses(named)), pose)
-        return ValidationResult(named, self.lower, self._model(named), value, pose, self._gap(named, versions, rows))
+        return ValidationResult(named, self.reduced_noise, self._model(named), value, pose, self._gap(named, versions, rows))
 
     def _registered(self, named: list[NamedEffect]) -> tuple[FloatArray, FloatArray]:
-        """(n,) residuals of the same points with some effects, NaN where their rays miss the reference; the pose (6,)."""
-        if not (named or self.lower):
+        """(n,) registered residuals of the same points with some effects, NaN where their rays miss the reference, and the pose
+        (6,)."""
+        if not (named or self.reduced_noise):
             return self.residuals.value - self.residuals.pose @ self.pose, self.pose
-        trusted = self.residuals.index[self.chosen]
-        _, found, there = aligned_with(self.measurement, named, trusted, self.lower)
-        rest = pose_of(found, found.smooth & np.isin(found.index, trusted))
+        registered_points = self.residuals.index[self.registration_rows]
+        _, found, there = aligned_with(self.measurement, named, registered_points, self.reduced_noise)
+        rest = pose_of(found, found.smooth & np.isin(found.index, registered_points))
         return found.of_points(found.value - found.pose @ rest, self.residuals.index), there + rest
 
     def _gap(self, named: list[NamedEffect], versions: tuple[RegisteredModel, RegisteredModel], rows: BoolArray) -> Gap | None:
@@ -132,20 +155,21 @@ class Validation:
         if self.losses is not None and missing is not None and named and named[0].name == f"tls.{self.losses[0].name}":
             found, held_out = self.losses
             share = np.full(len(held_out), float(missing.lost.mean()))
-            return measure_losses(missing, share if found.covariate else found.chance, held_out)
+            return measure_losses(missing, share if found.covariate else found.probability, held_out)
         places = np.flatnonzero(rows)
         if len(places) < _FEWEST_POINTS:
             return None
         part = self.residuals.part(places[subsampling(len(places))])
         random = self.random.child("verify")
-        return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.largest, random)
+        return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.most_sigmas, random)
 
 
 def _without_losses(named: list[NamedEffect]) -> list[NamedEffect]:
-    """Those that ranges are scored with: drops return early, which no range on the wall is like."""
+    """The effects that change ranges on the wall; drops return early, which no range on the wall is like."""
     return [item for item in named if item.effect.shows_in != ShowsIn.RETURNS]
 
 
 def _may_be_dropped(item: NamedEffect) -> bool:
-    """Of what is described, only noise: a term on the mean is not exact, and without it nothing would be said of it."""
-    return item.spreads or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)
+    """Whether an effect may be dropped for slight harm. An empirical term on the mean may not: it is inexact, but describes a
+    misfit."""
+    return item.adds_variance or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)

@@ -1,4 +1,4 @@
-"""A beam with a footprint, by the points at edges: their ranges lie between what is near and what is far (mixed pixels)."""
+"""Find the width of a beam from points at edges, whose ranges lie between near and far surface (mixed pixels)."""
 
 from __future__ import annotations
 
@@ -23,54 +23,69 @@ from sensors.signal_chain.beam import Mode
 
 _MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
 _DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
+"""Divergences that are tried first, rad."""
 _REFINEMENT_FACTORS = (1.12, 1.03)
 _MOST_POINTS = 30_000
 _PROFILE_UNCERTAINTY = 0.12
-"""Share by which a divergence is off where the beam's energy is not distributed as the model's is."""
+"""Relative uncertainty of a divergence, because the beam's energy may be distributed differently from the model's."""
 
 _RANDOM = KeyedRandom(0, ("gap", "mean"))
 
 
 def find_footprint(
-    measurement: TlsMeasurement, residuals: TlsResiduals, rough: FloatArray, scale: float, held_out: BoolArray
+    measurement: TlsMeasurement,
+    residuals: TlsResiduals,
+    registered_residuals: FloatArray,
+    noise_ratio: float,
+    held_out: BoolArray,
 ) -> list[EdgeEffect]:
-    """The divergence that points at edges ask for beyond what the noise of angles does there, if any.
+    """Find the beam divergence that explains points at edges better than noise of the angles does.
 
-    rough: (n,) registered residuals, m; scale: sigmas they spread; held_out: (n,) points that have no say.
+    Parameters
+    ----------
+    measurement : aligned scan.
+    residuals : its residuals.
+    registered_residuals : (n,) residuals after a robust pose fit, m.
+    noise_ratio : their standard deviation over the predicted one.
+    held_out : (n,) points that must not be used.
+
+    Returns
+    -------
+    list : one edge effect, or none.
     """
-    sigma, footprint = scale * residuals.sigma, _FootprintSimulation(measurement, residuals)
-    thin = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
-    some = np.flatnonzero(~held_out)[thin]
-    wide = footprint.moved(some, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
-    some = some[np.abs(wide) > sigma[some]]
-    if len(some) < thresholds().edges.footprint_fewest:
+    sigma, footprint = noise_ratio * residuals.sigma, _FootprintSimulation(measurement, residuals)
+    every = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
+    rows = np.flatnonzero(~held_out)[every]
+    widest_shift = footprint.shift(rows, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
+    rows = rows[np.abs(widest_shift) > sigma[rows]]
+    if len(rows) < thresholds().edges.footprint_fewest:
         return []
-    blocks = WallBlocks(WallBlocks.over(residuals.at).number[some])
-    jittered = footprint.moved(some, ("mean",), _equivalent_divergence(measurement.model))["mean"]
-    without = [log_density(rough[some], moved, sigma[some]) for moved in (np.zeros_like(jittered), jittered)]
-    null = np.logaddexp(*without) - np.log(2)  # at a step the one, on a slope that bends the other
-    moved_by = cache(partial(footprint.moved, some, _MODES))
+    blocks = WallBlocks(WallBlocks.over(residuals.at).number[rows])
+    jittered = footprint.shift(rows, ("mean",), _equivalent_divergence(measurement.model))["mean"]
+    without = [log_density(registered_residuals[rows], moved, sigma[rows]) for moved in (np.zeros_like(jittered), jittered)]
+    null = np.logaddexp(*without) - np.log(2)  # the first holds at a step, the second on a curved slope
+    shift_by = cache(partial(footprint.shift, rows, _MODES))
 
     def gains(mode: Mode, divergence_rad: float) -> FloatArray:
-        moved = moved_by(divergence_rad)[mode]
-        return np.asarray(log_density(rough[some], moved, sigma[some]) - null)
+        moved = shift_by(divergence_rad)[mode]
+        return np.asarray(log_density(registered_residuals[rows], moved, sigma[rows]) - null)
 
-    tops = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
-    mode = max(tops, key=lambda each: float(gains(each, tops[each]).sum()))
-    gain = blocks.tested(gains(mode, tops[mode]), thresholds().edges.footprint_block_sigmas)
+    best_divergence = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
+    mode = max(best_divergence, key=lambda each: float(gains(each, best_divergence[each]).sum()))
+    gain = blocks.total_if_agreed(gains(mode, best_divergence[mode]), thresholds().edges.footprint_block_sigmas)
     if gain is None:
         return []
-    divergence = maximise_gain(partial(gains, mode), [tops[mode]], _REFINEMENT_FACTORS)
+    divergence = maximise_gain(partial(gains, mode), [best_divergence[mode]], _REFINEMENT_FACTORS)
     std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE_UNCERTAINTY * divergence))}
-    touched = np.abs(footprint.moved(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
+    touched = np.abs(footprint.shift(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
     return [EdgeEffect(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
 
 
 def _equivalent_divergence(model: TlsModel) -> float:
-    """Divergence of a beam whose energy lies about its axis as a thin one's directions do that have the model's noise, rad.
+    """Divergence (rad) of a beam whose energy spreads as the directions of a thin beam with the model's noise of the angles.
 
-    Such a thin beam records on average what the wide one does that records the mean of its returns. Energy that falls as
-    exp(-8 r^2 / D^2) spreads by D / 4 in each direction.
+    On average such a thin beam records what the wide one records as the mean of its returns. Energy that falls as exp(-8 r^2 /
+    D^2) has a standard deviation of D / 4 in each direction.
     """
     noises = [each for each in model.chain() if isinstance(each, AngleNoise)]
     both = sum(each.azimuth_sigma_rad**2 + each.zenith_sigma_rad**2 for each in noises)
@@ -79,7 +94,7 @@ def _equivalent_divergence(model: TlsModel) -> float:
 
 @dataclass(frozen=True)
 class _FootprintSimulation:
-    """What a beam's divergence does to the ranges of a scan."""
+    """Simulates how a beam's divergence changes the ranges of a scan."""
 
     measurement: TlsMeasurement
     residuals: TlsResiduals
@@ -89,8 +104,8 @@ class _FootprintSimulation:
         """(n,) ranges along the beams' axes, m."""
         return simulate_ranges(self.measurement, mean_model(self.measurement.model), self.residuals.geometry, _RANDOM)
 
-    def moved(self, rows: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
-        """(m,) range of a beam of divergence `angle` less that of its axis, m, for each mode; 0 where either does not return."""
+    def shift(self, rows: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
+        """(m,) range of a beam of divergence `angle` minus that of its axis, m, for each mode; 0 where either does not return."""
         plain = mean_model(self.measurement.model)
         beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle))})
         whole = simulate_modes(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)

@@ -1,7 +1,7 @@
-"""Effects on the shape of a disparity map: outlines that grow, a low-pass, half-occluded strips that are filled.
+"""Find edge effects of a disparity map: edge fattening, smoothing (low-pass), and filled half-occluded strips.
 
-Each is predicted on the reference's own raster; what bears witness is that the measured disparities lie nearer to the shape
-with the effect than to that without, in blocks all over the wall.
+Each effect is predicted on the reference's own raster. It is accepted if the measured disparities are nearer to the prediction
+with the effect than to that without, in wall blocks all over the wall.
 """
 
 from __future__ import annotations
@@ -32,79 +32,95 @@ from sensors.effects.smoothing import Smoothing
 _RADII = (1, 2, 3, 4, 5, 6, 8)
 _STEPS = (1.0, 2.0, 4.0)
 _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
-"""Cells that outlines grow by, at steps so many times the least that is one; standard deviations of the low-pass in cells."""
+"""Radii of edge fattening in cells, depth steps in the smallest one that counts, and standard deviations of the low-pass in
+cells."""
 _REFINEMENT_FACTORS = (1.1, 1.03)
 _FILLED_SHARE, _STRAY_SHARE = 0.9, 0.02
-"""Chances that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
+"""Probability that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
 _EDGE_MARGIN_CELLS, _REGISTRATIONS = 2, 3
+"""Cells beyond the radius of edge fattening that are unpredictable too, and registrations beside a low-pass."""
 _COPY_TOLERANCE = 0.02
-"""Difference of neighbours, in standard deviations of the noise, up to which one is a copy of the other: of 1 % by chance."""
+"""Difference of neighbours, in standard deviations of the noise, up to which one is a copy of the other; 1 % are by chance."""
 _SMOOTHING_UNCERTAINTY = 0.02
-"""Share by which a low-pass is off since the reference is filtered for the rock, at its own cells and up to its own borders."""
+"""Relative uncertainty of a low-pass, because the reference is filtered in place of the rock, at its own cells and borders."""
 
 
 @dataclass(frozen=True)
 class _EdgeData:
-    """residuals: without effects on the shape; raster; disparity: (n,) of the reference; rough: (n,) registered residuals, px;
-    sigma: (n,) their spread; blocks; held_out: (n,) points that have no say; beside: effects that are known."""
+    """What is needed to test an edge effect beside known ones.
+
+    Attributes
+    ----------
+    residuals : residuals without edge effects.
+    raster : raster of the measured disparities.
+    disparity : (n,) disparities of the reference, px.
+    registered_residuals : (n,) residuals after a robust pose fit, px.
+    sigma : (n,) their standard deviations, px.
+    blocks : wall blocks.
+    held_out : (n,) points that must not be used.
+    beside : known edge effects.
+    """
 
     residuals: StereoResiduals
     raster: DisparityRaster
     disparity: FloatArray
-    rough: FloatArray
+    registered_residuals: FloatArray
     sigma: FloatArray
     blocks: WallBlocks
     held_out: BoolArray
     beside: list[Effect]
 
     @cached_property
-    def without(self) -> FloatArray:
-        """(n,) what the known effects alone add to the disparities, px."""
-        return self.moved([])
+    def shift_without(self) -> FloatArray:
+        """(n,) change of the disparities by the known effects alone, px."""
+        return self.shift([])
 
     @cached_property
     def density(self) -> FloatArray:
         """(n,) log density of the residuals with the known effects alone."""
-        return log_density(self.rough, self.without, self.sigma)
+        return log_density(self.registered_residuals, self.shift_without, self.sigma)
 
-    def moved(self, effects: list[Effect]) -> FloatArray:
-        """(n,) what effects beside the known ones add to the disparities, px."""
+    def shift(self, effects: list[Effect]) -> FloatArray:
+        """(n,) change of the disparities by the known effects and further ones, px."""
         return self.raster.moved([*self.beside, *effects], self.disparity)
 
     def gains(self, effect: Effect) -> FloatArray:
-        """(n,) log-likelihood with an effect beside the known ones less that of these alone."""
-        moved = self.moved([effect])
-        counts = (moved != self.without) & ~self.held_out
+        """(n,) log-likelihood ratio of an effect beside the known ones."""
+        shift = self.shift([effect])
+        counts = (shift != self.shift_without) & ~self.held_out
         if isinstance(effect, EdgeFattening):
             clear = np.maximum(thresholds().edges.clear_sigmas * self.sigma, thresholds().edges.clear_step * self.raster.jump_px)
-            counts &= np.abs(moved - self.without) > clear
+            counts &= np.abs(shift - self.shift_without) > clear
         rows = np.flatnonzero(counts)
-        gains = np.zeros(len(moved))
-        gains[rows] = log_density(self.rough[rows], moved[rows], self.sigma[rows]) - self.density[rows]
+        gains = np.zeros(len(shift))
+        gains[rows] = log_density(self.registered_residuals[rows], shift[rows], self.sigma[rows]) - self.density[rows]
         return gains
 
-    def found(self, effect: Effect, std: dict[str, float], gain: float) -> EdgeEffect:
-        """An effect that the points ask for beside the known ones."""
+    def edge_effect(self, effect: Effect, std: dict[str, float], gain: float) -> EdgeEffect:
+        """Return the result for an effect that was accepted beside the known ones."""
         return EdgeEffect(effect, std, gain, _unpredictable_points(effect, self.beside, self.raster, self.residuals))
 
     @property
-    def times_predicted(self) -> float:
-        """How many predicted sigmas the residuals spread."""
+    def noise_ratio(self) -> float:
+        """Observed over predicted standard deviation of the residuals."""
         return float(self.sigma[0] / self.residuals.sigma[0])
 
     def registered_with(self, effect: Effect) -> _EdgeData:
-        """With the registration and the spread that the residuals have where an effect beside the known ones is in the model."""
-        moved = np.nan_to_num(self.moved([effect]))
-        value, _, scale = registered(replace(self.residuals, value=self.residuals.value - moved))
-        return replace(self, rough=value + moved, sigma=scale * self.residuals.sigma)
+        """Repeat the registration and the noise estimate with an effect beside the known ones."""
+        shift = np.nan_to_num(self.shift([effect]))
+        value, _, scale = registered(replace(self.residuals, value=self.residuals.value - shift))
+        return replace(self, registered_residuals=value + shift, sigma=scale * self.residuals.sigma)
 
     def likelier(self, found: list[EdgeEffect]) -> EdgeEffect:
-        """Of effects that may feign each other, the one that explains more of the points that any of them moves clearly."""
-        moved = [self.moved([each.effect]) for each in found]
+        """Return the more likely of effects that can imitate each other, judged by the points that any of them moves clearly."""
+        shift = [self.shift([each.effect]) for each in found]
         least = thresholds().edges.clear_sigmas * self.sigma
-        clear = ~self.held_out & np.any([np.abs(each - self.without) > least for each in moved], axis=0)
-        settled = [self.registered_with(each.effect) for each in found]
-        gains = [log_density(w.rough, each, w.sigma)[clear].sum() for w, each in zip(settled, moved, strict=True)]
+        clear = ~self.held_out & np.any([np.abs(each - self.shift_without) > least for each in shift], axis=0)
+        registered_data = [self.registered_with(each.effect) for each in found]
+        gains = [
+            log_density(w.registered_residuals, each, w.sigma)[clear].sum()
+            for w, each in zip(registered_data, shift, strict=True)
+        ]
         return found[int(np.argmax(gains))]
 
 
@@ -112,31 +128,39 @@ _EffectSearch = Callable[[_EdgeData], EdgeEffect | None]
 
 
 def find_disparity_edge_effects(
-    measurement: StereoMeasurement, residuals: StereoResiduals, rough: FloatArray, held_out: BoolArray
+    measurement: StereoMeasurement, residuals: StereoResiduals, registered_residuals: FloatArray, held_out: BoolArray
 ) -> list[EdgeEffect]:
-    """The effects on the shape that the points ask for, one after another. rough: (n,) registered residuals, px; held_out: (n,)
-    points that have no say.
+    """Find the edge effects that the points support, one after another.
 
-    None where the points are on no raster, or where the model holds the effect already.
+    Parameters
+    ----------
+    measurement : aligned measurement.
+    residuals : its residuals.
+    registered_residuals : (n,) residuals after a robust pose fit, px.
+    held_out : (n,) points that must not be used.
+
+    Returns
+    -------
+    list : effects that the model lacks; empty where the points are on no raster.
     """
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:
         return []
-    scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
-    believed: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+    scale = nmad((registered_residuals / residuals.sigma)[residuals.smooth], 0.0)
+    known_effects: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
     disparity = residuals.geometry.disparity
-    had = raster.moved(believed, disparity)
-    searched, points = raster.searched()
+    known_shift = raster.moved(known_effects, disparity)
+    search_raster, points = raster.searched()
     part = residuals.part(points)
-    witnesses = _EdgeData(
-        replace(part, value=part.value + had[points]),
-        searched,
+    data = _EdgeData(
+        replace(part, value=part.value + known_shift[points]),
+        search_raster,
         part.geometry.disparity,
-        (rough + had)[points],
+        (registered_residuals + known_shift)[points],
         scale * part.sigma,
         WallBlocks.over(part.at),
         held_out[points],
-        believed,
+        known_effects,
     )
     found: list[EdgeEffect] = []
 
@@ -144,41 +168,41 @@ def find_disparity_edge_effects(
         touched = np.any([np.zeros(len(points), dtype=bool), *(each.touched for each in found)], axis=0)
         return _find_smoothing(replace(untouched, held_out=untouched.held_out | touched))
 
-    trials: dict[str, _EffectSearch] = {
+    searches: dict[str, _EffectSearch] = {
         EdgeFattening.tag(): _find_fattening,
         Smoothing.tag(): smoothing,
         OcclusionFill.tag(): _find_filling,
     }
-    for name in {effect.name for effect in believed}:
-        del trials[name]
-    while trials:
-        there = replace(witnesses, beside=[*believed, *(each.effect for each in found)])
-        shapes = zip(trials, map_in_threads(partial(_run_search, there), trials.values()), strict=True)
-        tried = {name: each for name, each in shapes if each is not None}
+    for name in {effect.name for effect in known_effects}:
+        del searches[name]
+    while searches:
+        current = replace(data, beside=[*known_effects, *(each.effect for each in found)])
+        results = zip(searches, map_in_threads(partial(_run_search, current), searches.values()), strict=True)
+        tried = {name: each for name, each in results if each is not None}
         if not tried:
             break
-        feigned = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
-        likely = [there.likelier(feigned)] if feigned else []
-        found.append(max([*likely, *tried.values()], key=lambda each: each.gain))
-        del trials[found[-1].name]
-    if len(points) == len(rough):
+        similar = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
+        likelier = [current.likelier(similar)] if similar else []
+        found.append(max([*likelier, *tried.values()], key=lambda each: each.gain))
+        del searches[found[-1].name]
+    if len(points) == len(registered_residuals):
         return found
-    effects = [*believed, *(each.effect for each in found)]
-    before = (effects[: len(believed) + count] for count in range(len(found)))
+    effects = [*known_effects, *(each.effect for each in found)]
+    before = (effects[: len(known_effects) + count] for count in range(len(found)))
     return [
         replace(each, touched=_unpredictable_points(each.effect, others, raster, residuals))
         for each, others in zip(found, before, strict=True)
     ]
 
 
-def _run_search(witnesses: _EdgeData, trial: _EffectSearch) -> EdgeEffect | None:
-    return trial(witnesses)
+def _run_search(data: _EdgeData, search: _EffectSearch) -> EdgeEffect | None:
+    return search(data)
 
 
 def _unpredictable_points(effect: Effect, beside: list[Effect], raster: DisparityRaster, residuals: StereoResiduals) -> BoolArray:
-    """(n,) points where an effect beside others cannot be predicted to the noise.
+    """(n,) points whose residuals cannot be predicted to the noise beside an effect.
 
-    What fills half-occluded strips fills other gaps too: of those filled points nothing but their neighbours is seen.
+    What fills half-occluded strips fills other gaps too; of those filled points nothing but their neighbours is seen.
     """
     at = residuals.geometry
     match effect:
@@ -190,83 +214,84 @@ def _unpredictable_points(effect: Effect, beside: list[Effect], raster: Disparit
     return raster.filled(beside) | raster.copies(at.found, _COPY_TOLERANCE * float(np.median(residuals.sigma)))
 
 
-def _find_fattening(witnesses: _EdgeData) -> EdgeEffect | None:
-    """Radii are whole cells: any between one and the next does the same. Outlines that do not grow alike make it unsure.
+def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
+    """Find edge fattening. Radii are whole cells, because the radii in between do the same.
 
-    What a matcher takes for a depth step, rather than for a slope that it follows, is in no measurement: several are tried.
+    What a matcher takes for a depth step, rather than for a slope, is not recorded, so several steps are tried. Outlines that do
+    not grow equally make the radius uncertain.
     """
-    raster = witnesses.raster
+    raster = data.raster
 
     def gains(radius: float) -> FloatArray:
-        return there.gains(_fattening_of(int(radius), height, raster)) if radius else np.zeros(len(witnesses.rough))
+        return current.gains(_fattening_of(int(radius), height, raster)) if radius else np.zeros(len(data.registered_residuals))
 
     def gain_of(outline: tuple[int, float]) -> float:
-        return float(witnesses.gains(_fattening_of(*outline, raster)).sum())
+        return float(data.gains(_fattening_of(*outline, raster)).sum())
 
-    there = witnesses
+    current = data
     outlines = [(radius, height) for height in _STEPS for radius in _RADII]
     found = dict(zip(outlines, map_in_threads(gain_of, outlines), strict=True))
     radius, height = max(outlines, key=lambda each: found[each])
-    if witnesses.times_predicted > thresholds().edges.overdispersion:
-        # outlines that grow far spoil the registration and the spread by which points would bear witness of them
-        settled = map_in_threads(lambda each: witnesses.registered_with(_fattening_of(*each, raster)), outlines)
-        far, best = min(zip(outlines, settled, strict=True), key=lambda each: each[1].times_predicted)
-        if best.times_predicted < witnesses.times_predicted / thresholds().edges.overdispersion:
-            (radius, height), there = far, best
-    gain = witnesses.blocks.tested(gains(radius), by_signs=True)  # outlines may stand in few places
+    if data.noise_ratio > thresholds().edges.overdispersion:
+        # strong edge fattening spoils the registration and the noise estimate, and with them the test itself
+        registered_data = map_in_threads(lambda each: data.registered_with(_fattening_of(*each, raster)), outlines)
+        outline, best = min(zip(outlines, registered_data, strict=True), key=lambda each: each[1].noise_ratio)
+        if best.noise_ratio < data.noise_ratio / thresholds().edges.overdispersion:
+            (radius, height), current = outline, best
+    gain = data.blocks.total_if_agreed(gains(radius), by_signs=True)  # depth steps may occur in few places only
     if gain is None:
         return None
-    uneven = min(there.blocks.std(gains, radius, 1.0), float(radius))
-    std = {"radius_px": raster.step * float(np.hypot(np.sqrt(1 / 12), uneven))}
-    return witnesses.found(_fattening_of(radius, height, raster), std, gain)
+    radius_error = min(current.blocks.std(gains, radius, 1.0), float(radius))
+    std = {"radius_px": raster.step * float(np.hypot(np.sqrt(1 / 12), radius_error))}
+    return data.edge_effect(_fattening_of(radius, height, raster), std, gain)
 
 
 def _fattening_of(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening:
-    """radius: cells; height: of a depth step, in the least that is one."""
+    """The effect of a radius in cells and a depth step in units of the smallest one that counts."""
     reach = (radius + 0.5) * raster.step
     return EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.jump_px)
 
 
-def _find_smoothing(witnesses: _EdgeData) -> EdgeEffect | None:
-    """The standard deviation at the top of the likelihood."""
-    step = witnesses.raster.step
+def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:
+    """Find a low-pass, with the standard deviation of largest likelihood."""
+    step = data.raster.step
 
     def gains(sigma: float) -> FloatArray:
-        return witnesses.gains(Smoothing(sigma_px=sigma))
+        return data.gains(Smoothing(sigma_px=sigma))
 
     sigma = maximise_gain(gains, [step * each for each in _SIGMAS], _REFINEMENT_FACTORS)
-    if witnesses.blocks.tested(gains(sigma)) is None:
+    if data.blocks.total_if_agreed(gains(sigma)) is None:
         return None
-    for _ in range(_REGISTRATIONS):  # that of the first trial, and its spread, make up for some of the low-pass
-        witnesses = witnesses.registered_with(Smoothing(sigma_px=sigma))
+    for _ in range(_REGISTRATIONS):  # the first registration and noise estimate absorb part of the low-pass
+        data = data.registered_with(Smoothing(sigma_px=sigma))
         sigma = maximise_gain(gains, [sigma], _REFINEMENT_FACTORS)
-    gain = witnesses.blocks.tested(gains(sigma))
+    gain = data.blocks.total_if_agreed(gains(sigma))
     if gain is None:
         return None
-    std = float(np.hypot(witnesses.blocks.std(gains, sigma), _SMOOTHING_UNCERTAINTY * sigma))
-    return witnesses.found(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain)
+    std = float(np.hypot(data.blocks.std(gains, sigma), _SMOOTHING_UNCERTAINTY * sigma))
+    return data.edge_effect(Smoothing(sigma_px=sigma), {"sigma_px": std}, gain)
 
 
-def _find_filling(witnesses: _EdgeData) -> EdgeEffect | None:
-    """Points where the right camera sees nothing, at the disparity of the background beside them.
+def _find_filling(data: _EdgeData) -> EdgeEffect | None:
+    """Find filled occlusions: points where the right camera sees nothing, at the disparity of the background beside them.
 
-    Without it hardly any of those cells holds a point (up to a fifth, by edges that are not quite where the reference has them).
+    Without the effect few of those cells hold a point, at most a fifth, where edges are not exactly where the reference has them.
     """
-    raster = witnesses.raster
-    points = raster.filled(witnesses.beside)
-    gain = float(witnesses.gains(OcclusionFill(reach_px=1e5))[points].sum())
+    raster = data.raster
+    points = raster.filled(data.beside)
+    gain = float(data.gains(OcclusionFill(reach_px=1e5))[points].sum())
     if points.sum() < thresholds().edges.fewest_filled or gain < thresholds().edges.least_filled_gain:
         return None
-    widths, held = _occluded_strips(raster.after(witnesses.beside), raster)
+    widths, held = _occluded_strips(raster.after(data.beside), raster)
     reach, std = _estimate_reach(widths, held, raster.step)
     narrow = held[widths <= reach / raster.step]
     if narrow.mean() < thresholds().edges.least_filled_share:
         return None
-    return witnesses.found(OcclusionFill(reach_px=reach), {"reach_px": std}, gain)
+    return data.edge_effect(OcclusionFill(reach_px=reach), {"reach_px": std}, gain)
 
 
 def _occluded_strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArray[np.int64], BoolArray]:
-    """Of the half-occluded cells: how wide the strip is in which each lies, in cells, and whether it holds a point."""
+    """Width in cells of the strip of each half-occluded cell, and whether the cell holds a point."""
     held = np.zeros(before.shape, dtype=bool)
     held[raster.row, raster.column] = True
     width = _gap_widths(before)
@@ -275,10 +300,9 @@ def _occluded_strips(before: FloatArray, raster: DisparityRaster) -> tuple[NDArr
 
 
 def _estimate_reach(widths: NDArray[np.int64], held: BoolArray, step: float) -> tuple[float, float]:
-    """Widest strip that is filled and its standard deviation, px: by which strips hold points.
+    """Widest strip that is filled and its standard deviation, px, from which strips hold points.
 
-    Where all of them do, the widest is the least that the reach may be; how much more it is, is known as before: as much as is
-    typical, give or take that (an exponential distribution).
+    If all do, the widest strip is a lower bound. The excess over it has an exponential prior with the typical size as mean.
     """
     tried = np.unique(widths)
     best = int(np.argmax([_log_likelihood(held, widths <= each) for each in tried]))
@@ -290,13 +314,13 @@ def _estimate_reach(widths: NDArray[np.int64], held: BoolArray, step: float) -> 
 
 
 def _log_likelihood(held: BoolArray, filled: BoolArray) -> float:
-    """Of cells that hold points or not, where strips are filled or not."""
+    """Log-likelihood of cells that hold points or not, given which strips are filled."""
     chance = np.where(filled, _FILLED_SHARE, _STRAY_SHARE)
     return float(np.sum(np.log(np.where(held, chance, 1 - chance))))
 
 
 def _gap_widths(disparity: FloatArray) -> NDArray[np.int64]:
-    """(rows, columns) width in cells of the unmatched run between two matched ones in which a cell lies, 0 elsewhere."""
+    """(rows, columns) width in cells of the unmatched run between two matched cells, 0 elsewhere."""
     columns = disparity.shape[1]
     matched, column = ~np.isnan(disparity), np.arange(columns)
     before = np.maximum.accumulate(np.where(matched, column, -1), axis=1)

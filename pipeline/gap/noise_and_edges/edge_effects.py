@@ -1,4 +1,4 @@
-"""Effects that show where the surface is not smooth: what was found, and when blocks all over the wall bear it out."""
+"""Edge effects, which show at depth steps only: their form, and the test that wall blocks agree on them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,19 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 
 _OUTLIER_DENSITY = 1e-3
+"""Density of outliers, which may lie anywhere, beside the Gaussian."""
 _STEP_HEIGHT_UNCERTAINTY = 0.15
-"""Share of what an effect adds by which its height on the reference may be off."""
+"""Relative uncertainty of an effect's shift, because the reference does not show every step exactly."""
 _POINTS_PER_BLOCK = 100.0
 
 
 @dataclass(frozen=True)
 class EdgeEffect:
-    """An effect on the shape. effect: with its values; std: of the parameters; touched: (n,) points where it cannot be predicted
-    to the noise."""
+    """An edge effect that was found.
+
+    effect: the effect with its values; std: standard deviations of the parameters; gain: log-likelihood ratio; touched: (n,)
+    points whose residuals cannot be predicted to the noise beside it.
+    """
 
     effect: Effect
     std: dict[str, float]
@@ -32,28 +36,34 @@ class EdgeEffect:
 
     @property
     def name(self) -> str:
-        """The catalogue's."""
+        """Name of the effect in the catalogue."""
         return self.effect.name
 
 
 @dataclass(frozen=True)
 class WallBlocks:
-    """number: (n,) of the block of the wall in which each point lies."""
+    """Blocks of the wall of about a hundred points each. number: (n,) block of each point."""
 
     number: NDArray[np.int64]
 
     @classmethod
     def over(cls, at: FloatArray) -> WallBlocks:
-        """Of about a hundred points each; at: (n, 2)."""
+        """Divide the wall into blocks. at: (n, 2) places on the wall, m."""
         return cls(patches(at, _POINTS_PER_BLOCK))
 
     def sums(self, gains: FloatArray) -> FloatArray:
-        """Gains (n,) by block."""
+        """Sum gains (n,) by block."""
         return np.asarray(np.bincount(self.number, gains))
 
-    def tested(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
-        """Total of gains (n,), None where they do not convince: blocks all over the wall have to agree, by their sums, or by the
-        signs of these where few of them hold most of the points."""
+    def total_if_agreed(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
+        """Return the total gain if it is large enough and the wall blocks agree on it, else None.
+
+        Parameters
+        ----------
+        gains : (n,) log-likelihood ratio of each point.
+        least_sigmas : how well the blocks must agree, in root sums of squares of their gains; `edges.block_sigmas` where None.
+        by_signs : whether agreement of the signs alone is enough, for effects of which a few blocks hold most of the points.
+        """
         by = thresholds().edges
         total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_gain_of_a_point, by.most_gain_of_a_point))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
@@ -65,9 +75,13 @@ class WallBlocks:
         return total
 
     def std(self, gains: Callable[[float], FloatArray], value: float, width: float | None = None) -> float:
-        """Standard deviation of a value at the top of its gains, by how the blocks' slopes scatter (sandwich).
+        """Standard deviation of a parameter at its maximum, from the scatter of the blocks' scores (sandwich estimator).
 
-        width: on either side, over which slopes are taken; a twentieth of the value where None.
+        Parameters
+        ----------
+        gains : gains (n,) as a function of the parameter.
+        value : the parameter at its maximum.
+        width : half-width of the finite difference; a twentieth of the value where None.
         """
         width = 0.05 * value if width is None else width
         low, middle, high = (self.sums(gains(each)) for each in (value - width, value, value + width))
@@ -75,14 +89,23 @@ class WallBlocks:
         return float(np.linalg.norm(slopes)) / max(-curvature, 1e-12)
 
 
-def log_density(rough: FloatArray, moved: FloatArray, sigma: FloatArray) -> FloatArray:
-    """(n,) log density of residuals that an effect moves by `moved`: Gaussian, with some that may lie anywhere."""
-    spread = np.hypot(sigma, _STEP_HEIGHT_UNCERTAINTY * moved)
-    return np.asarray(np.log(np.exp(-0.5 * ((rough - moved) / spread) ** 2) / spread + _OUTLIER_DENSITY))
+def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: FloatArray) -> FloatArray:
+    """(n,) log density of residuals that an effect shifts: a Gaussian, with outliers that may lie anywhere."""
+    sigma_with_height = np.hypot(sigma, _STEP_HEIGHT_UNCERTAINTY * shift)
+    return np.asarray(
+        np.log(np.exp(-0.5 * ((registered_residuals - shift) / sigma_with_height) ** 2) / sigma_with_height + _OUTLIER_DENSITY)
+    )
 
 
 def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
-    """The value of the largest total gain: on a grid, on finer ones around the best, at the top of a parabola through three."""
+    """Return the value of the largest total gain: on a grid, on finer grids around the best, then by a parabola.
+
+    Parameters
+    ----------
+    gains : gains (n,) as a function of the value.
+    values : first grid.
+    factors : ratios of the finer grids.
+    """
     best = max(values, key=lambda each: float(gains(each).sum()))
     step = 0.0
     for factor in factors:

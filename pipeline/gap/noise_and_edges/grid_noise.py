@@ -1,12 +1,12 @@
-"""White noise of a disparity, or noise on the nodes of a grid: told apart by how neighbours differ.
+"""Tell white from grid-correlated noise of disparities (bilinear between nodes) by the semivariogram.
 
 Half the mean squared difference of two pixels h apart (the semivariogram) is, beyond what the model predicts,
 
     g(h) = w + r^2 (4/9 - B(hx / s) B(hy / s)) + c h^2
 
-w the variance of white noise, r and s the standard deviation and the step of a grid of nodes that is interpolated bilinearly, B
-the cubic B-spline (2/3 at 0, 0 from 2 on: two hat functions convolved), and c h^2 the reference's error, which is smooth. That
-may also be a process of correlation exp(-h^2 / 2 l^2), small where its length l on the wall is short.
+w: variance of white noise; r, s: standard deviation and step of the grid; B: cubic B-spline (2/3 at 0, 0 from 2 on: two hat
+functions convolved); c h^2: error of the reference, which is smooth. That error may also be a process of correlation exp(-h^2 / 2
+l^2), which is small if its length l on the wall is short.
 """
 
 from __future__ import annotations
@@ -30,23 +30,32 @@ from sensors.models.sensor_model import StereoModel
 
 _LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _LONGEST_LAG_PX = (256.0, 128.0, 64.0)
-"""Of a lag: the first that enough blocks of the wall have pairs of."""
+"""Longest lag, px: the first for which enough wall blocks contain pairs."""
 _GRID_STEPS_PX = tuple(8.0 * 2 ** (quarter / 4) for quarter in range(17))
 _POINTS_PER_BLOCK = 400.0
 _FEWEST_BLOCKS, _FEWEST_LAGS = 12, 3
 _CLIP = 4.5
 _RIDGE, _SHRINKAGE_PER_LAG = 0.02, 0.2
-"""Share of the covariance of lags added to its diagonal: always, and times lags per block of the wall: few blocks mistake it."""
+"""Shares of the covariance of lags that are added to its diagonal: one always, one times the number of lags per wall block,
+because a covariance of few blocks is inexact."""
 _DRAWS = 1999
 _RELATIVE_LENGTHS = tuple(2 ** (half / 2) for half in range(-4, 9))
-"""Of correlation that the reference's error is tried with, times the one from which on it may be large."""
+"""Correlation lengths of the reference error that are tried, in units of `grid_noise.reference_length`."""
 
 
 @dataclass(frozen=True)
 class _Variogram:
-    """step: px of the raster, along its coarser axis; lag: (k, 2) px; blocks: (k, b) px^2 less what the model predicts, of each
-    block of the wall times its share of all points; root: (k, k) whitens their sum (root @ value has unit variance); distance_m:
-    (k,) of the lags on the wall; unit_m: metres of depth per px of disparity."""
+    """Empirical semivariogram in excess of the model.
+
+    Attributes
+    ----------
+    step : step of the raster along its coarser axis, px.
+    lag : (k, 2) lags, px.
+    blocks : (k, b) contribution of each of b wall blocks, px^2, weighted by its share of the points.
+    root : (k, k) whitens their sum: root @ value has unit variance.
+    distance_m : (k,) lags on the wall, m.
+    unit_m : depth of one px of disparity, m.
+    """
 
     step: float
     lag: FloatArray
@@ -57,35 +66,36 @@ class _Variogram:
 
     @property
     def value(self) -> FloatArray:
-        """(k,) of all blocks, px^2."""
+        """(k,) semivariogram of all blocks, px^2."""
         return np.asarray(self.blocks.sum(axis=1))
 
-    def fitted(self, form: FloatArray) -> _VariogramFit:
-        """A form (k,) beside the reference's error, both at least 0, and that no more than there may be."""
-        columns, value = self.root @ np.stack([form, self._smooth], axis=1), self.root @ self.value
+    def fitted(self, shape: FloatArray) -> _VariogramFit:
+        """Fit a shape (k,) beside a smooth error of the reference, both not negative, the latter bounded."""
+        columns, value = self.root @ np.stack([shape, self._smooth], axis=1), self.root @ self.value
         weights = np.linalg.pinv(columns)
         smooth = float(weights[1] @ value)
-        most = self._variance(thresholds().grid_noise.reference_error)
-        if not 0 <= smooth <= most:
-            value = value - np.clip(smooth, 0, most) * columns[:, 1]
+        largest = self._variance(thresholds().grid_noise.reference_error)
+        if not 0 <= smooth <= largest:
+            value = value - np.clip(smooth, 0, largest) * columns[:, 1]
             columns = columns[:, :1]
             weights = np.linalg.pinv(columns)
         best = weights @ value
-        square = float(np.sum((value - columns @ best) ** 2))
+        chi2 = float(np.sum((value - columns @ best) ** 2))
         shares = weights[0] @ self.root @ self.blocks
-        worse = np.sqrt(max(square / (len(value) - columns.shape[1]), 1.0))  # than a form of the right kind would fit
-        error = max(worse * float(np.linalg.norm(weights[0])), float(np.linalg.norm(shares - shares.mean())))
-        return _VariogramFit(square, float(best[0]), error, shares)
+        misfit_factor = np.sqrt(max(chi2 / (len(value) - columns.shape[1]), 1.0))  # larger than 1 if no shape fits
+        error = max(misfit_factor * float(np.linalg.norm(weights[0])), float(np.linalg.norm(shares - shares.mean())))
+        return _VariogramFit(chi2, float(best[0]), error, shares)
 
     def p_value(self, random: KeyedRandom) -> float:
-        """Of the largest variance of nodes over its error, whichever the step, by signs drawn block by block: (1 + b) / (1 + N).
+        """Return the p-value (1 + b) / (1 + N) of the largest grid variance over its error, for any step, with signs flipped by
+        wall block.
 
-        Blocks of noise that the model holds deviate to either side alike. Lags have the weights that their own scatter gives
-        them: weights by the covariance of so few blocks would fit just these.
+        Blocks of noise that the model contains deviate to both sides alike. Lags are weighted by their own scatter, because
+        weights from the covariance of so few blocks would be fitted to these very blocks.
         """
         size = np.linalg.norm(self.blocks, axis=1)
         forms = (np.stack([_grid_semivariogram(self.lag, step), self._smooth], axis=1) for _, step in self._trials)
-        weights = np.stack([np.linalg.pinv(form / size[:, None])[0] / size for form in forms])
+        weights = np.stack([np.linalg.pinv(shape / size[:, None])[0] / size for shape in forms])
         shares = weights @ self.blocks
         shares /= np.linalg.norm(shares, axis=1, keepdims=True)
         signs = random.child("nodes").generator().choice([-1.0, 1.0], size=(shares.shape[1], _DRAWS))
@@ -94,58 +104,63 @@ class _Variogram:
 
     @property
     def _trials(self) -> list[tuple[_VariogramFit, float]]:
-        """Grids of nodes and their steps, px, that the raster is not too coarse for."""
+        """Fits of grids and their steps, px, for which the raster is fine enough."""
         finest = thresholds().grid_noise.finest_grid * self.step
         return [(self.fitted(_grid_semivariogram(self.lag, step)), step) for step in _GRID_STEPS_PX if step >= finest]
 
     @property
     def _smooth(self) -> FloatArray:
-        """(k,) form of the reference's error."""
+        """(k,) semivariogram of a smooth error of the reference, scaled to 1."""
         found = np.sum(self.lag**2, axis=1)
         return np.asarray(found / found.max())
 
     @property
-    def plain_square(self) -> float:
+    def chi2_without_grid(self) -> float:
         """chi^2 of white noise, or of a smooth error of the reference."""
-        white = self.fitted(np.ones(len(self.lag))).square
-        return min(white, self._square_of(self._smooth, thresholds().grid_noise.reference_error))
+        white = self.fitted(np.ones(len(self.lag))).chi2
+        return min(white, self._chi2_of(self._smooth, thresholds().grid_noise.reference_error))
 
     @property
-    def reference_square(self) -> float:
-        """chi^2 of the best form without nodes: errors of the reference of all lengths too, small where they are short."""
+    def chi2_of_reference_error(self) -> float:
+        """chi^2 of the best fit without grid noise. Errors of the reference of all lengths are tried; short ones have a lower
+        bound."""
         by = thresholds().grid_noise
-        square = self.plain_square
+        chi2 = self.chi2_without_grid
         for length in _RELATIVE_LENGTHS:
-            form = 1 - np.exp(-0.5 * (self.distance_m / (length * by.reference_length)) ** 2)
-            most = by.reference_error if length >= 1 else by.short_reference_error
-            square = min(square, self._square_of(form, most))
-        return square
+            shape = 1 - np.exp(-0.5 * (self.distance_m / (length * by.reference_length)) ** 2)
+            largest = by.reference_error if length >= 1 else by.short_reference_error
+            chi2 = min(chi2, self._chi2_of(shape, largest))
+        return chi2
 
-    def _square_of(self, form: FloatArray, most_m: float) -> float:
-        """chi^2 of an error of the reference (k,) alone, of a standard deviation of so much at the most."""
-        column, value = self.root @ form, self.root @ self.value
+    def _chi2_of(self, shape: FloatArray, most_m: float) -> float:
+        """chi^2 of an error of the reference (k,) alone, with a bounded standard deviation."""
+        column, value = self.root @ shape, self.root @ self.value
         return float(np.sum((value - np.clip(column @ value / (column @ column), 0, self._variance(most_m)) * column) ** 2))
 
     def _variance(self, error_m: float) -> float:
-        """px^2 of an error along the depth."""
+        """px^2 of an error along the depth, m."""
         return (error_m / self.unit_m) ** 2
 
-    def best_nodes(self) -> tuple[_VariogramFit, float, list[float]] | None:
-        """The grid of nodes in the middle of those that fit best, its step, px, and their steps; None where all are too fine."""
+    def best_grid(self) -> tuple[_VariogramFit, float, list[float]] | None:
+        """Return the fit in the middle of those that are best, its step, px, and the steps of all of them; None where all are too
+        fine."""
         trials = self._trials
         if not trials:
             return None
-        least = min(form.square for form, _ in trials)
-        near = [trial for trial in trials if trial[0].square < least + 1]
+        least = min(fit.chi2 for fit, _ in trials)
+        near = [trial for trial in trials if trial[0].chi2 < least + 1]
         return *near[len(near) // 2], [step for _, step in near]
 
 
 @dataclass(frozen=True)
 class _VariogramFit:
-    """A form of the semivariogram fitted. square: chi^2; variance and its standard deviation, px^2; blocks: (b,) shares of the
-    variance."""
+    """A fitted semivariogram.
 
-    square: float
+    chi2: chi^2 of the fit; variance, error: variance and its standard deviation, px^2; blocks: (b,) contributions to the
+    variance.
+    """
+
+    chi2: float
     variance: float
     error: float
     blocks: FloatArray
@@ -154,10 +169,17 @@ class _VariogramFit:
 def separate_white_and_grid_noise(
     found: list[VarianceTerm], part: StereoResiduals, value: FloatArray, model: StereoModel
 ) -> list[VarianceTerm]:
-    """Noise that was taken for white, named by how neighbours differ; a class of both where that does not tell.
+    """Decide by the semivariogram whether noise terms are white or grid-correlated; both become one class where it does not tell.
 
-    Noise on nodes seems to change with any covariate, as few of them have one value of it: it goes before an empirical term.
-    value: (n,) residuals without the mean effects found.
+    Grid-correlated noise seems to vary with any covariate, as few nodes have one value of it. It therefore replaces an empirical
+    term.
+
+    Parameters
+    ----------
+    found : noise terms that were taken for white noise.
+    part : residuals.
+    value : (n,) residuals after the systematic effects, px.
+    model : sensor model.
     """
     named = [_name_noise(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
     return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
@@ -166,78 +188,88 @@ def separate_white_and_grid_noise(
 def find_grid_noise(
     part: StereoResiduals, value: FloatArray, model: StereoModel, random: KeyedRandom
 ) -> tuple[VarianceTerm | None, str]:
-    """Noise on nodes so far apart that the points around one do not differ by it; None and words where the reference may be wrong
-    by as much, None and "" where there is none.
+    """Find grid-correlated noise whose nodes lie so far apart that points around one node do not differ by it.
 
-    value: (n,) residuals without the mean effects found.
+    Parameters
+    ----------
+    part : residuals.
+    value : (n,) residuals after the systematic effects, px.
+    model : sensor model.
+    random : source of random numbers of the null distribution.
+
+    Returns
+    -------
+    tuple : the noise term or None, and a note where the reference may be the cause ("" otherwise).
     """
     variogram = _variogram(part, value, model)
-    best = None if variogram is None else variogram.best_nodes()
+    best = None if variogram is None else variogram.best_grid()
     if variogram is None or best is None:
         return None, ""
-    form, step, near = best
+    fit, step, near = best
     by = thresholds().grid_noise
-    if form.square >= variogram.plain_square - by.least_gain or form.variance <= by.least_sigmas * form.error:
+    if fit.chi2 >= variogram.chi2_without_grid - by.least_gain or fit.variance <= by.least_sigmas * fit.error:
         return None, ""
-    without = variogram.reference_square
-    if form.square >= without - by.least_gain:
-        return None, _describe_reference_error(form, step, variogram.unit_m)
+    without = variogram.chi2_of_reference_error
+    if fit.chi2 >= without - by.least_gain:
+        return None, _describe_reference_error(fit, step, variogram.unit_m)
     name, p_value = RegularizationNoise.tag(), variogram.p_value(random)
-    found = VarianceTerm(name, name, (), p_value, (without - form.square) / 2, {}, {}, False, np.zeros(len(part)))
-    return _as_grid_noise(found, form, step, near), ""
+    found = VarianceTerm(name, name, (), p_value, (without - fit.chi2) / 2, {}, {}, False, np.zeros(len(part)))
+    return _as_grid_noise(found, fit, step, near), ""
 
 
-def _describe_reference_error(form: _VariogramFit, step: float, unit_m: float) -> str:
-    """Words for an error that the reference may have."""
-    sigma = np.sqrt(RegularizationNoise(sigma_px=1.0).total_variance * form.variance)
+def _describe_reference_error(fit: _VariogramFit, step: float, unit_m: float) -> str:
+    """Note on an error that the reference may have."""
+    sigma = np.sqrt(RegularizationNoise(sigma_px=1.0).total_variance * fit.variance)
     return (
-        f"disparities share an error of {sigma:.2g} px over some {step:.0f} px ({form.variance / form.error:.2g} standard "
-        f"deviations): a reference that is wrong by {1e3 * sigma * unit_m:.2g} mm, alike over as much of the wall, would show "
-        "the same, so this is taken for its error; a better reference would tell"
+        f"disparities share an error of {sigma:.2g} px over about {step:.0f} px ({fit.variance / fit.error:.2g} standard "
+        f"deviations). An error of the reference of {1e3 * sigma * unit_m:.2g} mm, correlated over as much of the wall, would "
+        "look the same, so it is attributed to the reference; a better reference would separate the two"
     )
 
 
 def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, model: StereoModel) -> VarianceTerm:
+    """The term of white noise, of grid noise, or of white noise with grid noise in its class."""
     both = replace(white, alike=tuple(sorted({*white.alike, RegularizationNoise.tag()})))
     variogram = _variogram(part, value, model)
     if variogram is None:
         return both
-    plain = variogram.fitted(np.ones(len(variogram.lag)))
-    if plain.variance > 0:
-        both = _with_variance(both, plain, 1.0)
+    white_fit = variogram.fitted(np.ones(len(variogram.lag)))
+    if white_fit.variance > 0:
+        both = _with_variance(both, white_fit, 1.0)
     resolved = (
         thresholds().grid_noise.finest_grid * variogram.step <= _GRID_STEPS_PX[0]
-    )  # else a grid may be too fine for this raster to tell
+    )  # otherwise a grid may be too fine for this raster
     white = replace(both, alike=white.alike) if resolved else both
-    best = variogram.best_nodes()
-    if best is None or plain.square < best[0].square - thresholds().grid_noise.margin:
+    best = variogram.best_grid()
+    if best is None or white_fit.chi2 < best[0].chi2 - thresholds().grid_noise.margin:
         return white
-    if best[0].variance <= 0 or plain.square < best[0].square + thresholds().grid_noise.margin:
+    if best[0].variance <= 0 or white_fit.chi2 < best[0].chi2 + thresholds().grid_noise.margin:
         return both
-    nodes = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), alike=())
-    return _as_grid_noise(nodes, *best)
+    grid = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), alike=())
+    return _as_grid_noise(grid, *best)
 
 
-def _as_grid_noise(found: VarianceTerm, form: _VariogramFit, step: float, near: list[float]) -> VarianceTerm:
-    """With the parameters of a grid of nodes."""
-    nodes = _with_variance(found, form, RegularizationNoise(sigma_px=1.0).total_variance)
-    parameters, std = {**nodes.parameters, "step_px": step}, {**nodes.std, "step_px": max(float(np.std(near)), 0.2 * step)}
-    return replace(nodes, parameters=parameters, std=std)
+def _as_grid_noise(found: VarianceTerm, fit: _VariogramFit, step: float, near: list[float]) -> VarianceTerm:
+    """The noise term with the parameters of a grid."""
+    grid = _with_variance(found, fit, RegularizationNoise(sigma_px=1.0).total_variance)
+    parameters, std = {**grid.parameters, "step_px": step}, {**grid.std, "step_px": max(float(np.std(near)), 0.2 * step)}
+    return replace(grid, parameters=parameters, std=std)
 
 
-def _with_variance(found: VarianceTerm, form: _VariogramFit, share: float) -> VarianceTerm:
-    """With the standard deviation sigma_px that a variance with its error gives. share: of it that a disparity has on average."""
-    sigma = float(np.sqrt(form.variance))
+def _with_variance(found: VarianceTerm, fit: _VariogramFit, share: float) -> VarianceTerm:
+    """The noise term with the standard deviation sigma_px of a fitted variance. share: mean share of it that a disparity has."""
+    sigma = float(np.sqrt(fit.variance))
     return replace(
         found,
         parameters={"sigma_px": sigma},
-        std={"sigma_px": form.error / (2 * sigma)},
-        variance=np.full(len(found.variance), share * form.variance),
+        std={"sigma_px": fit.error / (2 * sigma)},
+        variance=np.full(len(found.variance), share * fit.variance),
     )
 
 
 def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> _Variogram | None:
-    """Along rows and columns, with its covariance by blocks of the wall; None where the pixels are on no raster."""
+    """Compute the semivariogram along rows and columns, with its covariance from wall blocks; None where the pixels are on no
+    raster."""
     g = part.geometry
     steps = [step for step in (spacing(g.v), spacing(g.u)) if step is not None]
     if len(steps) < 2:
@@ -264,7 +296,9 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     covariance = left @ left.T / (1 - np.sum(weight**2)) * np.sum(weight**2)
     covariance += (_RIDGE + _SHRINKAGE_PER_LAG * len(mean) / means.shape[1]) * np.diag(np.diag(covariance))
     offsets = np.array([[lag * steps[axis] * (axis == 1), lag * steps[axis] * (axis == 0)] for axis, lag in lags])
-    white = max(float(np.median(part.sigma**2)) - model.variance, 0.0)  # of what was found apart, such as a locking
+    white = max(
+        float(np.median(part.sigma**2)) - model.variance, 0.0
+    )  # variance of effects that were found separately, such as pixel locking
     blocks = (means - (model.semivariogram(offsets) + white)[:, None]) * weight
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     on_wall = np.linalg.norm(offsets, axis=1) * _wall_per_px(part)
@@ -272,13 +306,13 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
 
 
 def _wall_per_px(part: StereoResiduals) -> float:
-    """Metres on the wall per px of the image, along rows and columns together."""
+    """Metres on the wall per px of the image, mean of rows and columns."""
     g = part.geometry
     return float(np.sqrt(np.prod(np.std(part.at, axis=0)) / (np.std(g.u) * np.std(g.v))))
 
 
 def _usable_lags(pairs: FloatArray, length: FloatArray) -> BoolArray:
-    """(k,) lags that are short enough for a dozen blocks of the wall to have pairs (k, b) of all of them. length: (k,) px."""
+    """(k,) lags short enough for a dozen wall blocks to have pairs (k, b) of all of them. length: (k,) px."""
     for longest in _LONGEST_LAG_PX[:-1]:
         near = length <= longest
         if (pairs[near] > 0).all(axis=0).sum() >= _FEWEST_BLOCKS:
@@ -289,7 +323,7 @@ def _usable_lags(pairs: FloatArray, length: FloatArray) -> BoolArray:
 def _pairs_by_block(
     raster: FloatArray, block: NDArray[np.int64], lag: int, axis: int, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """(count,) pairs and half their squared differences, by the block of the first of each pair."""
+    """(count,) pairs and half their squared differences, by the wall block of the first of each pair."""
     first, second = (raster[:-lag], raster[lag:]) if axis == 0 else (raster[:, :-lag], raster[:, lag:])
     there = block[:-lag] if axis == 0 else block[:, :-lag]
     half = 0.5 * (first - second) ** 2
@@ -301,5 +335,5 @@ def _pairs_by_block(
 
 
 def _grid_semivariogram(lag: FloatArray, step: float) -> FloatArray:
-    """(k,) semivariogram of a grid of nodes of variance 1."""
+    """(k,) semivariogram of grid noise whose nodes have variance 1."""
     return RegularizationNoise(sigma_px=1.0, step_px=step).semivariogram(lag)

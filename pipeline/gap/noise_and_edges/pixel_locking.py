@@ -1,12 +1,12 @@
-"""Pixel locking by the measured disparities alone: they crowd around the matched image's pixels, whatever the noise.
+"""Find pixel locking from the measured disparities alone: they crowd around the pixels of the matched image, whatever the noise.
 
-If d' = x + A sin(2 pi x / n + phase) and x is spread over many pixels, the mean of exp(2 pi i d' / n) is -J1(2 pi A / n)
-exp(-i phase) (Jacobi-Anger), also where x holds noise that would average the sine away in the residuals. The k-th multiple of the
-angle gives |Jk(2 pi k A / n)|; what blurs the disparities by s after the locking takes exp(-2 (pi k s / n)^2) of it.
+If d' = x + A sin(2 pi x / n + phase) and x is distributed over many pixels, the mean of exp(2 pi i d' / n) is -J1(2 pi A / n)
+exp(-i phase) (Jacobi-Anger). This also holds where noise in x would average the sine away in the residuals. The k-th multiple of
+the angle gives |Jk(2 pi k A / n)|. Noise of standard deviation s after the locking multiplies it by exp(-2 (pi k s / n)^2).
 
-The rectification in which the disparities were found is not part of a measurement. Another one has another principal distance and
-may be turned about the base by an angle w, so that d' = s d / (1 + y tan w), d counted from that of a point at
-infinity, y the tangent of a row's angle to the axis.
+The rectification in which the disparities were matched is not part of a measurement. Another rectification has another principal
+distance and may be rotated about the base by an angle w, so that d' = s d / (1 + y tan w). Here d is counted from the disparity
+of a point at infinity, and y is the tangent of a row's angle to the axis.
 """
 
 from __future__ import annotations
@@ -21,27 +21,36 @@ from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
+"""Pixels of the matched image in pixels of the full one."""
 _SCALE_UNKNOWN, _TILT_UNKNOWN = 0.03, 0.1
-"""By how much the principal distance of the matcher's rectification may be another, and its turn about the base, rad."""
+"""Relative uncertainty of the principal distance of the matcher's rectification, and uncertainty of its rotation about the base,
+rad."""
 _SHAPE_BAND = 0.18
-"""Frequencies about that of whole pixels, as a share of it, at which what crowds is the wall's shape."""
+"""Relative half-width of the band around the pixel frequency in which crowding of the reference counts as the wall's shape."""
 _BINS_A_CYCLE, _STEPS_A_CYCLE = 8, 4
+"""Bins and trial frequencies for each cycle."""
 _MOST_BINS = 4096
 _LARGEST_AMPLITUDE = 0.6
-"""Amplitude in matched pixels."""
+"""Largest amplitude that is tried, in matched pixels."""
 _PROFILE_HALF_WIDTH = 0.06
-"""Matched pixels about the best amplitude over which its spread is taken: twice that of one that noise nearly hides."""
+"""Half-width in matched pixels of the profile likelihood from which the standard deviation is taken: twice the smallest amplitude
+that shows in the noise."""
 _NOISE_UNCERTAINTY, _LEAST_NOISE_SHARE = 0.1, 0.01
-"""Share by which the noise may be another than predicted and measured; of the measured variance, what is noise at least."""
+"""Relative uncertainty of the noise; least share of the measured variance that is noise."""
 _MULTIPLES = np.arange(1, 5)
 _FOLDING, _LARGE_AMPLITUDE, _HARMONIC_MISFIT = 1 / (2 * np.pi), 0.3, 0.02
+"""Amplitude from which disparities fold over; amplitude that is large; chi^2 share by which a small amplitude may fit worse,
+because a matcher's error is not exactly a sine."""
 _MOST_POINTS = 60_000
 
 
 @dataclass(frozen=True)
 class Locking:
-    """amplitude_px, std_px; period_px: n; phase_rad of the disparities that were given; tilt_rad: turn about the base of
-    the rectification in which they were found; gain in log-likelihood."""
+    """Pixel locking that was found.
+
+    amplitude_px, std_px: amplitude and its standard deviation; period_px: size of a matched pixel n; phase_rad: phase of the
+    given disparities; tilt_rad: rotation of the matcher's rectification about the base; gain: log-likelihood ratio.
+    """
 
     amplitude_px: float
     std_px: float
@@ -53,18 +62,22 @@ class Locking:
 
 @dataclass(frozen=True)
 class NoiseBounds:
-    """Standard deviations, px, of the noise that a model predicts, and of what was measured about the surface as known, noise and
-    locking together. Of small amplitudes the first multiple alone shows, whose size the noise changes as they do."""
+    """What is known about the matching noise beside the locking, px.
+
+    predicted: standard deviation by the model; measured: standard deviation about the reference, noise and locking together. For
+    small amplitudes only the first multiple shows, and noise changes its size as the amplitude does; so the noise must be
+    bounded.
+    """
 
     predicted: float
     measured: float
 
-    def in_pixels(self, frequency: float) -> NoiseBounds:
-        """In matched pixels, of so many a px."""
+    def in_matched_pixels(self, frequency: float) -> NoiseBounds:
+        """Convert to matched pixels. frequency: matched pixels in one px."""
         return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
-    def blurs(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """From and to which the noise may be beside each amplitude, px."""
+    def range_beside(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest standard deviation of the noise beside each amplitude (k,), px."""
         left = np.sqrt(np.maximum(self.measured**2 - amplitude**2 / 2, _LEAST_NOISE_SHARE * self.measured**2))
         return (1 - _NOISE_UNCERTAINTY) * np.minimum(left, self.predicted), (1 + _NOISE_UNCERTAINTY) * np.maximum(
             left, self.predicted
@@ -76,40 +89,46 @@ def find_locking(
     reference: FloatArray,
     tangent: FloatArray | float = 0.0,
     infinity: FloatArray | float = 0.0,
-    spread: NoiseBounds | None = None,
+    noise: NoiseBounds | None = None,
 ) -> Locking | None:
-    """The locking that measured disparities (n,), px, show, if any: n |R|^2 is exponential where there is none (Rayleigh).
+    """Find the pixel locking that measured disparities show; None if chance would make as much crowding.
 
-    reference: (n,) disparities of the surface as known; what crowds there too, by more than chance, is its shape; tangent: (n,)
-    of the angle between a point's rectified row and the axis; infinity: disparity of a point at infinity; spread: None where the
-    noise may be anything.
+    Without locking, n |R|^2 of the mean phasor R is exponentially distributed (Rayleigh test).
+
+    Parameters
+    ----------
+    disparity : (n,) measured disparities, px.
+    reference : (n,) disparities of the reference, px. What crowds there, beyond chance, is the wall's shape.
+    tangent : (n,) tangent of the angle between a point's rectified row and the axis.
+    infinity : disparity of a point at infinity, px.
+    noise : bounds of the matching noise; None if it may be anything.
     """
-    thin = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
-    far = np.broadcast_to(infinity, disparity.shape)[thin]
-    some, known, rows = disparity[thin] - far, reference[thin] - far, np.broadcast_to(tangent, disparity.shape)[thin]
-    count, reach = len(some), float(np.ptp(np.quantile(some, [0.02, 0.98])))
+    every = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
+    far = np.broadcast_to(infinity, disparity.shape)[every]
+    disparities, known, rows = disparity[every] - far, reference[every] - far, np.broadcast_to(tangent, disparity.shape)[every]
+    count, reach = len(disparities), float(np.ptp(np.quantile(disparities, [0.02, 0.98])))
     best: tuple[float, float, float, float] | None = None
     for reduction in _REDUCTIONS:
         if reach < thresholds().locking.fewest_cycles * reduction:
             continue
         whole = 1 / reduction
-        frequency, tilt, _, tries = _strongest_crowding(some, rows, whole, _SCALE_UNKNOWN)
-        _, _, crowded, tries_beside = _strongest_crowding(known, rows, whole, _SHAPE_BAND)
-        shape = np.sqrt(max(crowded**2 - np.log(tries_beside) / count, 0.0))
-        frequency, tilt = _refine_frequency(some, rows, frequency, tilt)
-        crowds = _crowding(some, rows, frequency, tilt)
-        gain = count * max(crowds - thresholds().locking.crowding_ratio * shape, 0.0) ** 2
+        frequency, tilt, _, tries = _strongest_crowding(disparities, rows, whole, _SCALE_UNKNOWN)
+        _, _, strength_of_reference, tries_beside = _strongest_crowding(known, rows, whole, _SHAPE_BAND)
+        shape = np.sqrt(max(strength_of_reference**2 - np.log(tries_beside) / count, 0.0))
+        frequency, tilt = _refine_frequency(disparities, rows, frequency, tilt)
+        strength_found = _crowding(disparities, rows, frequency, tilt)
+        gain = count * max(strength_found - thresholds().locking.crowding_ratio * shape, 0.0) ** 2
         if best is None or gain > best[0]:
             best = gain, frequency, tilt, tries
     if best is None:
         return None
     gain, frequency, tilt, tries = best
-    by_chance = min(1.0, len(_REDUCTIONS) * tries * float(np.exp(-gain)))
-    if by_chance > thresholds().locking.significance:
+    p_value = min(1.0, len(_REDUCTIONS) * tries * float(np.exp(-gain)))
+    if p_value > thresholds().locking.significance:
         return None
-    pixels = frequency * (some / (1 + np.tan(tilt) * rows) + far)
+    pixels = frequency * (disparities / (1 + np.tan(tilt) * rows) + far)
     strength = np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES])
-    share, error = _amplitude(strength, count, None if spread is None else spread.in_pixels(frequency))
+    share, error = _amplitude(strength, count, None if noise is None else noise.in_matched_pixels(frequency))
     first = complex(np.exp(2j * np.pi * pixels).mean())
     phase = float(np.angle(-np.conj(first) * np.sign(j1(2 * np.pi * share))))
     return Locking(share / frequency, error / frequency, 1 / frequency, phase, tilt, float(gain))
@@ -118,10 +137,11 @@ def find_locking(
 def _strongest_crowding(
     disparity: FloatArray, tangent: FloatArray, whole: float, share: float
 ) -> tuple[float, float, float, float]:
-    """Frequency (1/px) within a share of `whole`, and tilt, at which disparities crowd most; how much; how many were tried.
+    """Return the frequency (1/px) within a share of `whole`, and the tilt, at which disparities crowd most; how much; number of
+    trials.
 
-    The mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phases of whole pixels, in
-    frequencies that are low beside those: the phases are gathered in bins of an eighth of their shortest cycle.
+    The mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phasors of whole pixels.
+    Its frequencies are low, so the phasors are gathered in bins of an eighth of their shortest cycle.
     """
     phasor = np.exp(2j * np.pi * whole * disparity)
     axes = [disparity - disparity.mean(), disparity * tangent]
@@ -145,71 +165,76 @@ def _strongest_crowding(
 
 
 def _crowding(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> float:
+    """Mean resultant length of the phases."""
     return float(abs(np.exp(2j * np.pi * frequency * disparity / (1 + np.tan(tilt) * tangent)).mean()))
 
 
 def _refine_frequency(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> tuple[float, float]:
-    """Frequency and tilt at the top of the crowding."""
+    """Frequency and tilt at the maximum of the crowding."""
     unit = 1 / float(np.ptp(disparity)), 1 / (frequency * max(float(np.ptp(disparity * tangent)), 1e-9))
 
-    def less(at: FloatArray) -> float:
+    def negative_strength(at: FloatArray) -> float:
         if np.abs(at).max() > 1:
             return 0.0
         return -_crowding(disparity, tangent, frequency + at[0] * unit[0], tilt + at[1] * unit[1])
 
-    top = minimize(less, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": [[0, 0], [0.1, 0], [0, 0.1]]}).x
+    top = minimize(
+        negative_strength, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": [[0, 0], [0.1, 0], [0, 0.1]]}
+    ).x
     return frequency + top[0] * unit[0], tilt + top[1] * unit[1]
 
 
-def _amplitude(strength: FloatArray, count: int, spread: NoiseBounds | None) -> tuple[float, float]:
-    """Amplitude and its standard deviation, matched pixels, from the mean of each multiple: least squares over blur and it.
+def _amplitude(strength: FloatArray, count: int, noise: NoiseBounds | None) -> tuple[float, float]:
+    """Amplitude and its standard deviation, matched pixels: least squares over amplitude and noise from the mean of each
+    multiple.
 
-    spread: in matched pixels.
+    noise: in matched pixels.
     """
 
-    def square(share: FloatArray, blur: FloatArray) -> FloatArray:
+    def chi2(share: FloatArray, blur: FloatArray) -> FloatArray:
         harmonics = np.abs(jv(_MULTIPLES, 2 * np.pi * _MULTIPLES * share[:, None, None]))
         predicted = harmonics * np.exp(-2 * (np.pi * _MULTIPLES * blur[None, :, None]) ** 2)
         found = np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
-        if spread is None:
+        if noise is None:
             return found
-        least, most = spread.blurs(share)
+        least, most = noise.range_beside(share)
         beyond = np.maximum(least[:, None] - blur, 0) + np.maximum(blur - most[:, None], 0)
-        return np.asarray(found + (beyond / (_NOISE_UNCERTAINTY * spread.predicted)) ** 2)
+        return np.asarray(found + (beyond / (_NOISE_UNCERTAINTY * noise.predicted)) ** 2)
 
     largest = thresholds().locking.most_noise
     shares, blurs = np.linspace(0.002, _LARGEST_AMPLITUDE, 400), np.linspace(0.0, largest, 60)
-    coarse = square(shares, blurs)
+    coarse = chi2(shares, blurs)
     row = _plausible_minimum(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)
     for width in (0.01, 0.002):
         column = int(np.argmin(coarse[row]))
         shares = shares[row] + np.linspace(-width, width, 81)
         blurs = np.maximum(blurs[column] + np.linspace(-width, width, 41), 0.0)
-        coarse = square(shares, blurs)
+        coarse = chi2(shares, blurs)
         row = int(np.argmin(coarse.min(axis=1)))
     best = float(coarse.min())
-    # its spread, the blur free within what is allowed
+    # standard deviation of the amplitude, with the noise free within its bounds
     around = np.maximum(shares[row] + np.linspace(-_PROFILE_HALF_WIDTH, _PROFILE_HALF_WIDTH, 201), 0.0)
-    profile = square(around, np.linspace(0.0, largest, 200)).min(axis=1)
+    profile = chi2(around, np.linspace(0.0, largest, 200)).min(axis=1)
     weight = np.exp(-0.5 * (profile - profile.min()) / max(best, 1.0))
     weight /= weight.sum()
     mean = float(weight @ around)
     return mean, float(np.sqrt(weight @ (around - mean) ** 2 + 1e-8))
 
 
-def _plausible_minimum(shares: FloatArray, square: FloatArray, whole: float) -> int:
-    """Row of the amplitude that is meant, of the minima of chi^2: Bessel functions come back to the same values.
+def _plausible_minimum(shares: FloatArray, chi2: FloatArray, whole: float) -> int:
+    """Choose among the minima of chi^2 the row of the plausible amplitude, because Bessel functions repeat their values.
 
-    whole: chi^2 of no locking. Of amplitudes that fit alike it is the least; one that folds disparities over, from 1 / 2 pi on,
-    has to fit well, and one beyond `_FAR` gives way to a small one that leaves as little as a matcher's curve is no sine.
+    Of amplitudes that fit equally well the smallest is taken. An amplitude that folds disparities over, from 1 / 2 pi on, must
+    fit well. A large one gives way to a small one that leaves as little as a matcher's deviation from a sine. whole: chi^2
+    without locking.
     """
-    lowest = (square <= np.append(square[1:], np.inf)) & (square <= np.append(np.inf, square[:-1]))
-    rows = np.flatnonzero(lowest & (square < square.min() + thresholds().locking.equal_fit))
+    lowest = (chi2 <= np.append(chi2[1:], np.inf)) & (chi2 <= np.append(np.inf, chi2[:-1]))
+    rows = np.flatnonzero(lowest & (chi2 < chi2.min() + thresholds().locking.equal_fit))
     unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
     if len(unfolded):
-        small = int(unfolded[np.argmin(square[unfolded])])
-        if square.min() > thresholds().locking.good_fit or (
-            shares[rows[0]] > _LARGE_AMPLITUDE and square[small] < _HARMONIC_MISFIT * whole
+        small = int(unfolded[np.argmin(chi2[unfolded])])
+        if chi2.min() > thresholds().locking.good_fit or (
+            shares[rows[0]] > _LARGE_AMPLITUDE and chi2[small] < _HARMONIC_MISFIT * whole
         ):
             return small
     return int(rows[0])

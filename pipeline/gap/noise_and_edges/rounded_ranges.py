@@ -1,4 +1,4 @@
-"""Steps in the recorded ranges: a comb in their histogram, which is a line in its Fourier transform."""
+"""Find the step to which ranges were rounded: a comb in their histogram, which is a line in its Fourier transform."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 
 _BIN_M = 1e-5
+"""Width of a bin of the histogram, m."""
 _SMALLEST_STEP_M, _LARGEST_STEP_M = 5e-5, 0.05
 
 
 @dataclass(frozen=True)
 class RangeStep:
-    """step_m of the recorded ranges; std_m: by the grid it was searched on; strength: mean resultant length modulo the step."""
+    """Step of the recorded ranges.
+
+    step_m: step; std_m: its standard deviation, from the search grid; strength: mean resultant length of the ranges modulo the
+    step.
+    """
 
     step_m: float
     std_m: float
@@ -23,9 +28,9 @@ class RangeStep:
 
 
 def find_range_step(ranges: FloatArray) -> RangeStep | None:
-    """The step to which ranges (n,), m, are rounded (multiples of it, from 0), if any.
+    """Find the step to which ranges (n,), m, are rounded, as multiples counted from 0; None if they are not.
 
-    Where a file holds coordinates in steps of its own, ranges computed from them are smooth again.
+    Where a file stores coordinates with a step of its own, the ranges computed from them are smooth again and nothing is found.
     """
     low, reach = float(ranges.min()), float(np.ptp(ranges))
     if len(ranges) < 200 or reach < 20 * _LARGEST_STEP_M:
@@ -38,7 +43,7 @@ def find_range_step(ranges: FloatArray) -> RangeStep | None:
     candidates = np.flatnonzero(allowed & (strength > thresholds().quantization.least_resultant))
     if not len(candidates):
         return None
-    first = candidates[0]  # the fundamental; its multiples come later
+    first = candidates[0]  # the fundamental frequency; its multiples are higher
     near = slice(first, first + int(0.1 * first) + 2)
     peak = first + int(np.argmax(strength[near]))
     step = _refine_step(ranges, 1 / float(frequency[peak]), reach)
@@ -47,9 +52,9 @@ def find_range_step(ranges: FloatArray) -> RangeStep | None:
 
 
 def _refine_step(ranges: FloatArray, step: float, reach: float) -> float:
-    """The step of the largest resultant at phase 0: multiples are counted from range 0, which fixes the step far better."""
-    some = ranges[:: max(len(ranges) // 4000, 1)]
+    """Maximise the resultant at phase 0: multiples are counted from range 0, which determines the step far better."""
+    few_ranges = ranges[:: max(len(ranges) // 4000, 1)]
     for width in (step**2 / reach, 0.05 * step**2 / float(ranges.max())):
         trial = step + np.linspace(-width, width, 401)
-        step = float(trial[np.argmax([np.cos(2 * np.pi * some / each).mean() for each in trial])])
+        step = float(trial[np.argmax([np.cos(2 * np.pi * few_ranges / each).mean() for each in trial])])
     return step

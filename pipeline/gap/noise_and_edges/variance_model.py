@@ -1,4 +1,7 @@
-"""Which effects explain the spread: the Gaussian likelihood of deviations within cells, sigma_i^2 = model + theta f_k(i)."""
+"""Fit the variance model: which noise terms explain the squared deviations within cells, by the Gaussian likelihood.
+
+sigma_i^2 = predicted variance + sum_k theta_k f_k(i), theta_k >= 0, for candidate terms f_k of the catalogue.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +22,32 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn
 
 DRAWS = 1999
+"""Number of sign flips of the null distribution."""
 _LEAST_REMAINING_VARIANCE = 0.3
-"""Share of a point's variance that its cell's plane must leave."""
+"""Least share of a point's variance that the plane of its cell must leave."""
 _LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
-"""Share of a point's variance that counts as its own where a model says there is none; draws of noise that neighbours share."""
+"""Least share of a point's variance that counts as white noise; number of simulations of correlated noise."""
 _BINS = 8
 _CLIP_SIGMAS = 12.0
-"""Sigmas at which a far residual is cut off."""
+"""Standard deviations at which outliers are clipped."""
 _HIGHEST_QUANTILE = 0.999
-"""Quantile of a form of the variance beyond which it is held."""
+"""Quantile of a candidate's variance above which it is clipped."""
 _FISHER_ROUNDS = 25
 
 
 @dataclass(frozen=True)
 class VarianceCandidate:
-    """variance: (n, k) forms that are scaled by theta (k,); parameters: their square roots times `scale`, by name; cost: free
-    parameters; fixed: values that tell variants apart."""
+    """A candidate noise term.
+
+    Attributes
+    ----------
+    name : name of the effect.
+    variance : (n, k) variance at its typical sizes, to be scaled by theta (k,).
+    scale : typical sizes: a parameter is scale * sqrt(theta).
+    names : names of the parameters.
+    cost : number of free parameters.
+    fixed : values that tell variants of the effect apart.
+    """
 
     name: str
     variance: FloatArray
@@ -44,11 +57,11 @@ class VarianceCandidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """The effect's values."""
+        """Return the effect's parameters for theta (k,)."""
         return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
 
-    def errors(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Their standard deviations, from those of theta; of one that is 0, what it may be."""
+    def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
+        """Return standard deviations of the parameters from those of theta; for a parameter of 0 its possible size."""
         root = np.sqrt(theta)
         std = np.where(theta > error, error / np.maximum(2 * root, 1e-300), np.sqrt(error))
         return dict(zip(self.names, map(float, std * np.array(self.scale)), strict=True))
@@ -56,10 +69,18 @@ class VarianceCandidate:
 
 @dataclass(frozen=True)
 class VarianceTerm:
-    """An effect on the spread.
+    """A noise term that was found.
 
-    effect: the catalogue's that comes nearest, which carries an empirical one; std: of the parameters by the curvature of the
-    likelihood; variance: (n,) that it adds.
+    Attributes
+    ----------
+    name : name of the effect, or what an empirical term depends on.
+    effect : effect of the catalogue that is nearest, which also carries an empirical term.
+    alike : other effects of its equivalence class.
+    p_value : p-value from the null distribution.
+    gain : log-likelihood ratio.
+    parameters, std : values and their standard deviations, from the curvature of the likelihood.
+    empirical : whether no effect of the catalogue fits.
+    variance : (n,) variance that it adds.
     """
 
     name: str
@@ -72,14 +93,14 @@ class VarianceTerm:
     empirical: bool
     variance: FloatArray
 
-    def everywhere(self, count: int) -> VarianceTerm:
-        """The same of `count` points: what is no function of the place adds alike to all."""
+    def with_constant_variance(self, count: int) -> VarianceTerm:
+        """Return the term for `count` points with its mean variance, for noise that does not depend on place."""
         return replace(self, variance=np.full(count, float(self.variance.mean())))
 
 
 @dataclass(frozen=True)
 class VarianceScore:
-    """What one form of the spread gains in log-likelihood over the model; score: less what it costs; empirical: of no effect."""
+    """Result of one candidate: its log-likelihood ratio `gain`, and `score`, the same minus its number of parameters."""
 
     name: str
     gain: float
@@ -88,9 +109,16 @@ class VarianceScore:
 
 
 def standardised_deviations(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
-    """(n,) deviations from the cells' planes over the predicted spread, of unit variance if the model is right; NaN outside.
+    """Return deviations from the cells' planes over the predicted standard deviation, (n,), NaN outside of cells.
 
-    A plane in each cell takes away what the reference's error, correlated over metres, does within it.
+    They have unit variance if the model is right. The plane in each cell removes the reference error, which is correlated over
+    metres.
+
+    Parameters
+    ----------
+    residuals : residuals with their predicted standard deviations.
+    cells : cells of the wall.
+    value : (n,) residuals after the systematic effects.
     """
     inside = cells.cell >= 0
     cell = cells.cell[inside]
@@ -115,7 +143,7 @@ def standardised_deviations(residuals: Residuals, cells: Cells, value: FloatArra
 
 
 def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
-    """The catalogue's forms of the variance of single points, by what is recorded; without noise that neighbours share."""
+    """Return the candidate noise terms that the recorded fields allow, without noise that neighbours share."""
     found = []
     for effect in residuals.candidates:
         if effect.shows_in == ShowsIn.SPREAD and not effect.shared and effect.known(residuals.geometry):
@@ -127,7 +155,8 @@ def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
 
 
 def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]) -> VarianceCandidate:
-    """Of the effect at its typical sizes, one column for each of them; a few extreme points must not carry a form alone."""
+    """The candidate of an effect, one column for each typical size. Extreme values are clipped, so that a few points cannot
+    decide."""
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
     columns = np.minimum(columns, np.quantile(columns, _HIGHEST_QUANTILE, axis=0))
@@ -136,56 +165,67 @@ def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]
 
 
 def fit_variance_model(
-    residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom, left_out: frozenset[str] = frozenset()
+    residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom, excluded: frozenset[str] = frozenset()
 ) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
-    """The effects that the spread asks for, at most two, all that were tried, best first, and words for a spread of no effect.
+    """Find the noise terms that explain the squared deviations, at most two.
 
-    value: (n,) residuals without the mean effects found; left_out: effects that are no candidates.
+    Parameters
+    ----------
+    residuals : residuals with their predicted standard deviations.
+    cells : cells of the wall.
+    value : (n,) residuals after the systematic effects.
+    random : source of random numbers of the null distribution.
+    excluded : names of effects that are not tried.
+
+    Returns
+    -------
+    tuple : the noise terms, all candidates that were tried, best first, and a note on variance that no effect explains ("" if
+        none).
     """
-    candidates = [each for each in variance_candidates(residuals) if each.name not in left_out]
+    candidates = [each for each in variance_candidates(residuals) if each.name not in excluded]
     if not candidates:
         return [], [], ""
-    weighed, predicted = residuals, residuals.sigma**2 * _expected_mean_square(residuals, cells, random)
-    for again in (True, False):
-        # noisy points move a cell's plane, and with that what its quiet points show, unless they have the weight they deserve
-        z = standardised_deviations(weighed, cells, value)
-        kept = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
-        squared = (z * weighed.sigma)[kept] ** 2 / predicted[kept]
-        forms = [candidate.variance[kept] / predicted[kept, None] for candidate in candidates]
-        singles = [_JointFit.fitted(squared, forms, [number], candidates) for number in range(len(forms))]
+    weighted, predicted = residuals, residuals.sigma**2 * _expected_mean_square(residuals, cells, random)
+    for first_round in (True, False):
+        # in the second round points have the weight of their fitted noise, as noisy points would shift the plane of their cell
+        z = standardised_deviations(weighted, cells, value)
+        used = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
+        squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
+        shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
+        singles = [_JointFit.fitted(squares, shapes, [number], candidates) for number in range(len(shapes))]
         best = max(singles, key=lambda fit: fit.score)
-        if again:
+        if first_round:
             added = candidates[best.members[0]].variance @ best.theta[0]
-            weighed = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
-    excess = float(np.mean(best.added(forms)))
-    block = block_numbers(residuals.at[kept], cells.side_m)
-    p_value = null_p_value(squared, [form.sum(axis=1) for form in forms], block, random)
+            weighted = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
+    excess = float(np.mean(best.added(shapes)))
+    block = block_numbers(residuals.at[used], cells.side_m)
+    p_value = null_p_value(squares, [shape.sum(axis=1) for shape in shapes], block, random)
     tried = [VarianceScore(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     by = thresholds().variance
     if best.gain < by.least_gain or p_value > by.significance or excess < by.least_excess:
         return [], tried, ""
-    # of disparities `stereo_noise` looks at neighbours, which noise on nodes moves alike too
-    between = _unshared_share(residuals, value, kept, best.added(forms)) if residuals.sensor == "tls" else 1.0
-    if between < by.least_unshared_share:
-        return [], tried, _describe_shared_variance(excess, between, residuals.sigma)
+    # for disparities `grid_noise` compares neighbours, because grid-correlated noise moves them alike too
+    unshared = _unshared_share(residuals, value, used, best.added(shapes)) if residuals.sensor == "tls" else 1.0
+    if unshared < by.least_unshared_share:
+        return [], tried, _describe_shared_variance(excess, unshared, residuals.sigma)
     pairs = [
-        _JointFit.fitted(squared, forms, [first, second], candidates)
-        for first, second in combinations(range(len(forms)), 2)
+        _JointFit.fitted(squares, shapes, [first, second], candidates)
+        for first, second in combinations(range(len(shapes)), 2)
         if candidates[first].name != candidates[second].name
     ]
     pair = max(pairs, key=lambda fit: fit.score, default=best)
-    free_name, free_score, free = _best_binned_variance(squared, {name: v[kept] for name, v in residuals.covariates.items()})
-    # where one effect leaves something over, a second of the catalogue comes before a form of no effect
+    free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
+    # where one effect leaves a misfit, a second one of the catalogue is preferred to a binned variance
     ahead = max(by.nonparametric_margin, by.class_share * best.gain)
     needed = by.second_gain if free_score > best.score + ahead else by.least_gain
-    agreed = pair.score > best.score + needed and _blocks_agree(squared, best.added(forms), pair.added(forms), block)
+    agreed = pair.score > best.score + needed and _blocks_agree(squares, best.added(shapes), pair.added(shapes), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    more = free_score > chosen.score + ahead and _blocks_prefer_binned(squared, chosen.added(forms), free, block)
-    empirical = more and free_score > chosen.score + by.nonparametric_share * chosen.gain
-    words = f"the spread varies along {free_name} beyond that: no effect of the catalogue explains that part" if more else ""
+    free_fits_better = free_score > chosen.score + ahead and _blocks_prefer_binned(squares, chosen.added(shapes), free, block)
+    empirical = free_fits_better and free_score > chosen.score + by.nonparametric_share * chosen.gain
+    note = f"the noise also varies with {free_name}, which no effect of the catalogue explains" if free_fits_better else ""
     if empirical:
-        chosen, words = best, ""
+        chosen, note = best, ""
     tried = sorted([*tried, VarianceScore(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
     margin = max(by.class_margin, by.class_share * chosen.gain)
     found = []
@@ -195,11 +235,11 @@ def fit_variance_model(
         near = {candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
         alike = near - {candidates[each].name for each in chosen.members}
         parameters = candidate.parameters(theta)
-        std = candidate.errors(theta, chosen.error[place])
+        std = candidate.standard_deviations(theta, chosen.error[place])
         gain = chosen.gain - max(
             (fit.gain for fit in singles if fit.members != (number,) and fit.members[0] in chosen.members), default=0.0
         )
-        name = f"spread by {free_name}" if empirical else candidate.name
+        name = f"variance by {free_name}" if empirical else candidate.name
         found.append(
             VarianceTerm(
                 name,
@@ -213,57 +253,61 @@ def fit_variance_model(
                 candidate.variance @ theta,
             )
         )
-    return found, tried, words
+    return found, tried, note
 
 
-def _describe_shared_variance(excess: float, between: float, sigma: FloatArray) -> str:
-    """Words for a spread that neighbours share, which is no noise. excess: added variance over the predicted one."""
-    times, more = float(np.sqrt(1 + excess)), 1e3 * float(np.median(sigma)) * float(np.sqrt(excess))
-    shared = 100 * min(max(1 - between, 0.0), 1.0)
+def _describe_shared_variance(excess: float, unshared: float, sigma: FloatArray) -> str:
+    """Note on variance that neighbours share, which is no sensor noise. excess: added variance over the predicted one."""
+    ratio, excess_mm = float(np.sqrt(1 + excess)), 1e3 * float(np.median(sigma)) * float(np.sqrt(excess))
+    shared_percent = 100 * min(max(1 - unshared, 0.0), 1.0)
     return (
-        f"the residuals spread {times:.2g} times what the model predicts ({more:.2g} mm more), and neighbours share {shared:.0f} "
-        "% of that: an error of the reference, a change of the scene or wrong coordinates, not noise of the sensor"
+        f"the residuals have {ratio:.2g} times the predicted standard deviation ({excess_mm:.2g} mm more), and neighbours share "
+        f"{shared_percent:.0f} % of the excess: an error of the reference, a change of the scene or wrong coordinates, not noise "
+        "of the sensor"
     )
 
 
-def _unshared_share(residuals: Residuals, value: FloatArray, kept: BoolArray, added: FloatArray) -> float:
-    """Share of an added variance, of the points `kept` and over the predicted one, that differences of neighbours show."""
-    part = residuals.part(kept)
-    value, predicted = value[kept], part.sigma**2
+def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, added: FloatArray) -> float:
+    """Share of an added variance that shows in the differences of neighbours, from the points `used`. added: over the predicted
+    variance."""
+    part = residuals.part(used)
+    value, predicted = value[used], part.sigma**2
     other = cKDTree(part.at).query(part.at, k=2)[1][:, 1]
     variance = predicted + predicted[other] - 2 * part.shared_with(other)
-    more = (added * predicted + (added * predicted)[other]) / variance
-    weight = more / (1 + more) ** 2
-    return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * more))
+    total = (added * predicted + (added * predicted)[other]) / variance
+    weight = total / (1 + total) ** 2
+    return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * total))
 
 
 @dataclass(frozen=True)
 class NoiseRatio:
-    """How many of the predicted standard deviations residuals really spread within cells. below: whether blocks all over the wall
-    agree that it is less."""
+    """Observed over predicted standard deviation of the residuals within cells.
+
+    value: the ratio; clearly_below: whether wall blocks agree that it is below 1.
+    """
 
     value: float
-    below: bool
+    clearly_below: bool
 
     @classmethod
     def of(cls, residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> NoiseRatio:
-        """Of residuals (n,) without the effects on the mean; a few that are far off do not make it more."""
+        """Compute it from residuals (n,) after the systematic effects; outliers are clipped."""
         z = standardised_deviations(residuals, cells, value)
-        kept = np.isfinite(z)
-        squared = np.minimum(z[kept] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
-        means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
+        used = np.isfinite(z)
+        squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
+        means = np.bincount(np.unique(block_numbers(residuals.at[used], cells.side_m), return_inverse=True)[1], squares - 1)
         below = float(means.sum()) < -thresholds().variance.block_sigmas * float(np.linalg.norm(means))
-        return cls(float(np.sqrt(squared.mean())), below)
+        return cls(float(np.sqrt(squares.mean())), below)
 
     @property
-    def share(self) -> float:
-        """The same where it is clearly less than 1, else 1: no effect takes noise away, the model's own is too large."""
-        return self.value if self.below and self.value < thresholds().variance.excess_noise_ratio else 1.0
+    def at_most_one(self) -> float:
+        """The ratio where it is clearly below 1, else 1. No effect removes noise, so the model's own noise is too large there."""
+        return self.value if self.clearly_below and self.value < thresholds().variance.excess_noise_ratio else 1.0
 
 
 def _expected_mean_square(residuals: Residuals, cells: Cells, random: KeyedRandom) -> float:
-    """Mean square of standardised deviations from cells where the model is right: of noise that neighbours share, planes take
-    away more than of white noise, by draws of it."""
+    """Mean square of standardised deviations if the model is right, by simulation: planes absorb more correlated than white
+    noise."""
     field = residuals.shared_noise.field(len(residuals))
     if not field.weights.shape[1]:
         return 1.0
@@ -277,7 +321,7 @@ def _expected_mean_square(residuals: Residuals, cells: Cells, random: KeyedRando
 
 
 def _best_variants(tried: list[VarianceScore]) -> list[VarianceScore]:
-    """One of each name: of an effect with variants the one that scores most."""
+    """The best variant of each effect."""
     best: dict[str, VarianceScore] = {}
     for item in tried:
         if item.name not in best or item.score > best[item.name].score:
@@ -287,7 +331,11 @@ def _best_variants(tried: list[VarianceScore]) -> list[VarianceScore]:
 
 @dataclass(frozen=True)
 class _JointFit:
-    """Some candidates fitted together. theta, error: of each; gain in log-likelihood over the model; score: less cost."""
+    """Some candidates fitted together.
+
+    members: numbers of the candidates; theta, error: coefficients of each and their standard deviations; gain: log-likelihood
+    ratio; score: gain minus the number of parameters.
+    """
 
     members: tuple[int, ...]
     theta: tuple[FloatArray, ...]
@@ -297,65 +345,76 @@ class _JointFit:
 
     @classmethod
     def fitted(
-        cls, squared: FloatArray, forms: list[FloatArray], members: list[int], candidates: list[VarianceCandidate]
+        cls, squares: FloatArray, shapes: list[FloatArray], members: list[int], candidates: list[VarianceCandidate]
     ) -> _JointFit:
-        """By Fisher scoring on 1 + sum theta f, theta at least 0."""
-        columns = np.concatenate([forms[number] for number in members], axis=1)
+        """Fit 1 + sum theta f to the squared deviations by Fisher scoring, theta >= 0."""
+        columns = np.concatenate([shapes[number] for number in members], axis=1)
         scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
         columns = columns * scale
-        theta = np.full(len(scale), max(float(np.mean(squared)) - 1, 1e-3) / len(scale))
+        theta = np.full(len(scale), max(float(np.mean(squares)) - 1, 1e-3) / len(scale))
         information = np.eye(len(scale))
         for _ in range(_FISHER_ROUNDS):
             total = 1 + columns @ theta
-            slope = 0.5 * columns.T @ ((squared - total) / total**2)
+            slope = 0.5 * columns.T @ ((squares - total) / total**2)
             information = 0.5 * (columns / total[:, None] ** 2).T @ columns
             free = (theta > 0) | (slope > 0)
             step = np.zeros(len(theta))
             step[free] = np.linalg.lstsq(information[np.ix_(free, free)], slope[free], rcond=1e-10)[0]
             theta = np.maximum(theta + step, 0.0)
-        gain = _log_likelihood_gain(squared, columns @ theta)
+        gain = _log_likelihood_gain(squares, columns @ theta)
         error = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
-        ends = np.cumsum([forms[number].shape[1] for number in members])[:-1]
+        ends = np.cumsum([shapes[number].shape[1] for number in members])[:-1]
         score = gain - sum(candidates[number].cost for number in members)
         return cls(tuple(members), tuple(np.split(theta * scale, ends)), tuple(np.split(error * scale, ends)), gain, score)
 
-    def added(self, forms: list[FloatArray]) -> FloatArray:
-        """(n,) variance that it adds, over the predicted one."""
-        return np.asarray(sum(forms[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))
+    def added(self, shapes: list[FloatArray]) -> FloatArray:
+        """(n,) added variance over the predicted one."""
+        return np.asarray(sum(shapes[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))
 
 
 def _replaces_only(fit: _JointFit, chosen: _JointFit, number: int) -> bool:
-    """Whether a fit has another form in place of one of the chosen."""
+    """Whether a fit differs from the chosen one in one candidate only."""
     return number not in fit.members and set(chosen.members) - {number} <= set(fit.members)
 
 
-def _blocks_agree(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
-    """Whether the gain of one variance over another is common to the blocks and not due to a few."""
-    gain, sigmas = _gain_over(squared, first, second, block)
+def _blocks_agree(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
+    """Whether wall blocks agree that one variance fits better than another, so that the gain is not due to a few blocks."""
+    gain, sigmas = _gain_over(squares, first, second, block)
     return gain > 0 and sigmas > thresholds().variance.block_sigmas
 
 
-def _blocks_prefer_binned(squared: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
-    """The same of a free form, which only has to say that the named one does not fit."""
-    gain, sigmas = _gain_over(squared, first, free, block)
+def _blocks_prefer_binned(squares: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
+    """Whether wall blocks agree that a binned variance fits better, which only has to show that the named one does not fit."""
+    gain, sigmas = _gain_over(squares, first, free, block)
     return gain > thresholds().variance.nonparametric_gain and sigmas > thresholds().variance.nonparametric_block_sigmas
 
 
-def _gain_over(squared: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
-    """Gain in log-likelihood of one variance over another, and how many times it is that of blocks with signs drawn at random."""
-    terms = 0.5 * (squared * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
+def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
+    """Log-likelihood ratio of one variance over another, and the same over the root sum of squares of the blocks'
+    contributions."""
+    terms = 0.5 * (squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
     sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
     return float(sums.sum()), float(sums.sum() / max(float(np.linalg.norm(sums)), 1e-300))
 
 
-def _log_likelihood_gain(squared: FloatArray, added: FloatArray) -> float:
-    return float(0.5 * np.sum(squared * added / (1 + added) - np.log1p(added)))
+def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
+    """Log-likelihood ratio of an added variance (n,)."""
+    return float(0.5 * np.sum(squares * added / (1 + added) - np.log1p(added)))
 
 
-def null_p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Of the largest standardised score over the forms, by signs drawn block by block: (1 + b) / (1 + N)."""
+def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
+    """Return the p-value (1 + b) / (1 + N) of the largest standardised score over the candidates, with signs flipped by wall
+    block.
+
+    Parameters
+    ----------
+    squares : (n,) squared deviations over the predicted variance.
+    shapes : (n,) candidate variances over the predicted one.
+    block : (n,) wall block of each point.
+    random : source of random numbers.
+    """
     _, number = np.unique(block, return_inverse=True)
-    scores = np.stack([np.bincount(number, (squared - 1) * form) for form in forms])
+    scores = np.stack([np.bincount(number, (squares - 1) * shape) for shape in shapes])
     size = np.sqrt(np.sum(scores**2, axis=1))
     signs = random.child("spread").generator().choice([-1.0, 1.0], size=(scores.shape[1], DRAWS))
     largest = np.max(scores @ signs / size[:, None], axis=0)
@@ -364,61 +423,65 @@ def null_p_value(squared: FloatArray, forms: list[FloatArray], block: NDArray[np
 
 @dataclass(frozen=True)
 class HeavyTails:
-    """Residuals farther out than normal noise of the predicted spread leaves them.
+    """Outliers beyond those of normal noise.
 
-    share: of all residuals, beyond `beyond` predicted sigmas; sigma: to how many predicted ones they raise the standard
-    deviation; gain: in log-likelihood, of that share being distributed so widely; even: whether they lie all over the wall, as an
-    instrument's own do, and not in parts of it, as at edges, in plants or where something moved.
+    Attributes
+    ----------
+    share : share of all residuals beyond `limit_sigmas` predicted standard deviations.
+    sigma : standard deviation that they add, over the predicted one.
+    gain : log-likelihood ratio of a mixture with this share of wider noise.
+    uniform : whether they lie all over the wall, as the instrument's own do. Edges, plants and moved rock leave them in parts of
+        it.
     """
 
     share: float
-    beyond: float
+    limit_sigmas: float
     sigma: float
     gain: float
-    even: bool
+    uniform: bool
 
     @property
-    def words(self) -> str:
-        """As the report notes it."""
-        where = "all over the wall" if self.even else "in parts of the wall, as edges, plants and what moved leave them"
-        return f"{100 * self.share:.2g} % of the points lie beyond {self.beyond:g} predicted sigmas, {where}"
+    def note(self) -> str:
+        """The note of the report."""
+        where = "all over the wall" if self.uniform else "in parts of the wall, as at edges, plants or moved rock"
+        return f"{100 * self.share:.2g} % of the points lie beyond {self.limit_sigmas:g} predicted standard deviations, {where}"
 
 
 def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | None:
-    """What lies farther out than it should, None where that is no more than normal noise and small faults of a reference leave.
+    """Find heavy tails; None where there are no more outliers than normal noise and small faults of a reference leave.
 
-    z: (n,) residuals over the spread that all effects together predict; of normal ones 6e-5 lie beyond 4.
+    z: (n,) residuals over the standard deviation that all effects together predict. Of normal noise, 6e-5 lie beyond 4.
     """
     by = thresholds().variance
-    far = np.abs(z) > by.tail_sigmas
-    share = float(far.mean())
+    outlying = np.abs(z) > by.tail_sigmas
+    share = float(outlying.mean())
     if share < by.most_tail_share:
         return None
     square = np.minimum(z**2, _CLIP_SIGMAS**2)
-    wide = max(float(square[far].mean()), 1.0)
-    mixed = np.log(1 - share + share / np.sqrt(wide) * np.exp(0.5 * square * (1 - 1 / wide)))
+    tail_variance = max(float(square[outlying].mean()), 1.0)
+    mixed = np.log(1 - share + share / np.sqrt(tail_variance) * np.exp(0.5 * square * (1 - 1 / tail_variance)))
     sigma = float(np.sqrt(max(float(square.mean()) - 1, 0.0)))
-    return HeavyTails(share, by.tail_sigmas, sigma, float(mixed.sum()), _unevenness(far, block) < by.most_tail_unevenness)
+    return HeavyTails(share, by.tail_sigmas, sigma, float(mixed.sum()), _unevenness(outlying, block) < by.most_tail_unevenness)
 
 
-def _unevenness(far: BoolArray, block: NDArray[np.int64]) -> float:
-    """How much the share of far points differs between blocks beyond chance: its standard deviation over its mean."""
+def _unevenness(outlying: BoolArray, block: NDArray[np.int64]) -> float:
+    """Standard deviation over mean of the blocks' shares of outliers, beyond chance."""
     _, number = np.unique(block, return_inverse=True)
-    expected = np.bincount(number) * far.mean()
-    beyond_chance = np.sum((np.bincount(number, far) - expected) ** 2 - expected * (1 - far.mean()))
+    expected = np.bincount(number) * outlying.mean()
+    beyond_chance = np.sum((np.bincount(number, outlying) - expected) ** 2 - expected * (1 - outlying.mean()))
     return float(np.sqrt(max(float(beyond_chance), 0.0) / np.sum(expected**2)))
 
 
-def _best_binned_variance(squared: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
-    """The covariate along which a variance free in each of some bins explains most, its score, and what it adds (n,)."""
-    best: tuple[str, float, FloatArray] = ("", -np.inf, np.zeros(len(squared)))
+def _best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
+    """The covariate along which a variance free in each bin explains most, its score, and the variance that it adds (n,)."""
+    best: tuple[str, float, FloatArray] = ("", -np.inf, np.zeros(len(squares)))
     for name, values in covariates.items():
         if name in ("edge_step", "line"):
             continue
         edges = np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1])
         group = np.searchsorted(edges, values)
         count = np.maximum(np.bincount(group, minlength=_BINS), 1)
-        variance = np.maximum(np.bincount(group, squared, _BINS) / count, 1e-9)
+        variance = np.maximum(np.bincount(group, squares, _BINS) / count, 1e-9)
         score = float(0.5 * np.sum(count * (variance - 1 - np.log(variance)))) - _BINS
         if score > best[1]:
             best = name, score, (variance - 1)[group]

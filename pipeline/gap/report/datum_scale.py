@@ -1,4 +1,4 @@
-"""The scale of a cloud whose cameras are not known, against the reference's: part of its datum, as shift and turn are."""
+"""Estimate the scale of a cloud without cameras against the reference's; it is part of the datum, like shift and rotation."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, datum_cov
 
 _FEWEST_POINTS = 100
 _SIGNIFICANT_SIGMAS = 3.0
-"""Standard deviations from which on a scale is said to be wrong."""
+"""Standard deviations from which on a scale is reported as wrong."""
 
 
 @dataclass(frozen=True)
 class DatumScale:
-    """By how much a cloud is larger than the reference, with its standard deviation, ppm."""
+    """By how much a cloud is larger than the reference, and its standard deviation, ppm."""
 
     ppm: float
     std_ppm: float
 
     @property
     def words(self) -> str:
-        """A sentence."""
+        """The result as a sentence."""
         std = f"\N{PLUS-MINUS SIGN} {self.std_ppm:.0f} ppm"
         if abs(self.ppm) < _SIGNIFICANT_SIGMAS * self.std_ppm:
-            return f"Its scale agrees with the reference's as far as the relief tells ({self.ppm:+.0f} {std})."
+            return f"Its scale agrees with that of the reference, as far as the relief shows ({self.ppm:+.0f} {std})."
         which = "larger" if self.ppm > 0 else "smaller"
         return (
             f"The cloud is {abs(self.ppm):.0f} {std} {which} than the reference: one of the two has a wrong scale. "
-            "That was taken off with the pose."
+            "The difference was removed with the pose."
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As gap.json holds it."""
+        """Return the scale as gap.json holds it."""
         return {"value": self.ppm, "std": self.std_ppm}
 
 
 def estimate_scale(found: GapDiagnosis) -> DatumScale | None:
-    """Of a surface without cameras; None of what has no scale of its own, or too few points."""
+    """Estimate the scale of a surface without cameras; None for other measurements and where there are too few points."""
     residuals = found.residuals
     if not isinstance(residuals, SurfaceResiduals) or not residuals.datum[6].any():
         return None

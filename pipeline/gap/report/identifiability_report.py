@@ -1,4 +1,5 @@
-"""The files of an identifiability analysis: identifiability.json, report.html and a picture of the matrix for each sensor."""
+"""Write the files of an identifiability analysis: identifiability.json, report.html and a figure of the matrix for each
+sensor."""
 
 from __future__ import annotations
 
@@ -19,13 +20,13 @@ from pipeline.report.provenance import versions
 
 _INSTRUMENTS = {"stereo": "Stereo pair", "tls": "Laser scanner"}
 _WORTHWHILE_RATIO = 0.8
-"""A further measurement is worth naming where it lowers the value that is named to this share."""
+"""An additional measurement is shown if it lowers the size from which an effect can be named to this share."""
 _NEVER = "never"
 
 
 @dataclass(frozen=True)
 class _Row:
-    """One effect of the page's table."""
+    """One row of the page's table of effects."""
 
     name: str
     parameter: str
@@ -37,7 +38,7 @@ class _Row:
 
 
 def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
-    """Write the files of one analysis per sensor into `out`; returns report.html."""
+    """Write the files of one analysis per sensor into `out` and return the path of report.html."""
     record = {"schema": 1, "surveys": [each.to_dict() for each in found], "versions": versions()}
     write_json(out / "identifiability.json", record)
     pictures = {each.sensor: matrix_figure(list(each.names), each.cosines, each.survival) for each in found}
@@ -56,28 +57,29 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
 
 
 def summarise(found: Identifiability) -> str:
-    """What the analysis says, in plain words."""
+    """Return what the analysis says, as a paragraph."""
     weak = [name for name, share in zip(found.names, found.survival, strict=True) if share < 0.1]
     pairs = found.pairs()
     parts = [f"{_INSTRUMENTS[found.sensor]}, {found.points:,} points on smooth parts of the wall."]
     if weak:
-        parts.append(f"A shift or turn of the sensor takes up more than 90 % of {join_words(weak)}.")
+        parts.append(f"A shift or rotation of the sensor absorbs more than 90 % of {join_words(weak)}.")
     if pairs:
         a, b = pairs[0]
         parts.append(
             f"{len(pairs)} pairs of effects look alike (cosine of at least {ALIKE:g}), most of all {found.names[a]} and"
-            f" {found.names[b]} ({found.cosines[a, b]:.3f}): from this survey alone the two cannot be named apart."
+            f" {found.names[b]} ({found.cosines[a, b]:.3f}): this survey alone cannot tell the two apart."
         )
         counts = {e.name: sum(bool(e.cosines[pair] < ALIKE) for pair in pairs) for e in found.extensions}
         best = max(counts, key=lambda name: counts[name])
-        verb = f"would part {counts[best]} of the {len(pairs)}" if counts[best] else "would part any of them"
+        verb = f"would separate {counts[best]} of the {len(pairs)}" if counts[best] else "would separate any of them"
         parts.append(f"{'None of the further measurements' if not counts[best] else best.capitalize()} {verb}.")
     else:
-        parts.append("No two effects on the mean look alike.")
+        parts.append("No two systematic effects look alike.")
     return " ".join(parts)
 
 
 def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:
+    """What the template shows of one analysis."""
     return {
         "instrument": _INSTRUMENTS[found.sensor],
         "words": summarise(found),

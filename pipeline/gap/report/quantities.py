@@ -1,4 +1,4 @@
-"""Parameters as people read them: a value and its standard deviation in a unit that suits them, with no digit too many."""
+"""Format parameters for readers: value and standard deviation in a suitable unit, without insignificant digits."""
 
 from __future__ import annotations
 
@@ -10,18 +10,25 @@ _UNITS = {
     "px": (("px", 1.0, 1e-4),),
     "ppm": (("ppm", 1.0, 1e-2),),
 }
-"""By the suffix of a key: units, the smallest first, how many go into the key's own, and the finest step that is printed."""
+"""By the suffix of a key: units from the smallest, their number in one of the key's unit, and the smallest step that is
+printed."""
 _LARGEST_NUMBER = 1000.0
-"""From so many of a unit on the next larger one serves."""
+"""From this number on the next larger unit is used."""
 _DIGITS = 5
 """Significant digits of a value without a unit of its own."""
 
 
 def format_with_std(key: str, value: float, std: float | None = None) -> str:
-    """`4.02 ± 0.05 mm`: a parameter, in the unit that the suffix of its key names, and its standard deviation.
+    """Format a parameter with its standard deviation, such as `4.02 ± 0.05 mm`.
 
-    The deviation has one significant digit, two where the first is 1, and the value ends where it does; a deviation below the
-    finest step that is printed is `< 0.001 mm`. Without a deviation a value has four significant digits.
+    The standard deviation has one significant digit, two where the first is 1, and the value ends at the same digit. A standard
+    deviation below the smallest step that is printed becomes `< 0.001 mm`. Without one, the value has four significant digits.
+
+    Parameters
+    ----------
+    key : key of the parameter, whose suffix names its unit.
+    value : value in that unit.
+    std : standard deviation in that unit, if known.
     """
     unit, factor, step = _choose_unit(key, value, std)
     value *= factor
@@ -38,7 +45,8 @@ def format_with_std(key: str, value: float, std: float | None = None) -> str:
 
 
 def _choose_unit(key: str, value: float, std: float | None) -> tuple[str, float, float | None]:
-    """Name of a unit, how many go into the key's own, and the finest step in it; None: by the value's digits."""
+    """Name of a unit, its number in one of the key's unit, and the smallest step in it; None for the step: by the digits of the
+    value."""
     choice = _UNITS.get(key.rpartition("_")[2])
     if choice is None:
         return "", 1.0, None
@@ -47,14 +55,14 @@ def _choose_unit(key: str, value: float, std: float | None) -> tuple[str, float,
 
 
 def _round_to_step(value: float, step: float) -> str:
-    """A value rounded to a step that is a power of ten."""
+    """Format a value rounded to a step that is a power of ten."""
     digits = -_exponent(step)
     text = f"{round(value, digits) + 0.0:.{max(digits, 0)}f}"
     return text if len(text.lstrip("-")) < 12 else f"{value:.{_DIGITS}g}"
 
 
 def _exponent(value: float) -> int:
-    """Of the first significant digit."""
+    """Decimal exponent of the first significant digit."""
     return int(f"{abs(value):e}".partition("e")[2])
 
 

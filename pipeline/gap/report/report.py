@@ -1,4 +1,4 @@
-"""The files of a diagnosis: gap.json, the model after, points before and after, report and pictures."""
+"""Write the files of a diagnosis: gap.json, the model after, points before and after, report and figures."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from pipeline.gap.report.wording import (
     format_value,
     outcome,
     round_entry,
-    spread_outcome,
     title,
+    variance_outcome,
     verdict_in_words,
 )
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
@@ -39,10 +39,11 @@ from pipeline.report.page import p_value_in_words, template
 from scene.geometry.mesh import FloatArray
 
 _MOST_TRIED = 25
+"""Most explanations that the report lists."""
 
 
 def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    """gap.json, by the thresholds of the diagnosis."""
+    """Return the content of gap.json."""
     with use_thresholds(found.thresholds):
         return _to_dict(found, measurement)
 
@@ -68,7 +69,7 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
 
 
 def _scale_entry(found: GapDiagnosis) -> dict[str, Any]:
-    """Of a surface without cameras; null where its relief does not tell."""
+    """Entry of the scale, for a surface without cameras; null where its relief does not show it."""
     if not isinstance(found.residuals, SurfaceResiduals):
         return {}
     scale = estimate_scale(found)
@@ -76,16 +77,16 @@ def _scale_entry(found: GapDiagnosis) -> dict[str, Any]:
 
 
 def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
-    """A set-up's pose (6,), wall frame, in the world frame."""
+    """The pose (6,) of a set-up, converted from the wall frame to the world frame."""
     axes = measurement.frame.rotation
     return {"translation_m": (axes.T @ pose[:3]).tolist(), "rotation_rad": (axes.T @ pose[3:]).tolist()}
 
 
 def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
-    """Write all files of a diagnosis into `out`, once all pictures are drawn; returns report.html.
+    """Write all files of a diagnosis into `out` and return the path of report.html. Nothing is written if a figure fails.
 
-    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one; of
-    several effects before.laz holds what each takes away by itself, `effect_1_m` ..., in the order of gap.json.
+    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one. With
+    several effects, before.laz also holds what each removes alone, `effect_1_m`, ..., in the order of gap.json.
     """
     with use_thresholds(found.thresholds):
         parts = contributions(found, measurement) if len(found.effects) > 1 else np.empty((0, len(found.before)))
@@ -107,7 +108,7 @@ def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Pa
 
 
 def summarise(found: GapDiagnosis) -> str:
-    """The verdict in some lines of text."""
+    """Return the verdict and the main numbers in a few lines of text."""
     with use_thresholds(found.thresholds):
         return _summary(found)
 
@@ -124,24 +125,24 @@ def _summary(found: GapDiagnosis) -> str:
         regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
         lines.append(f"  set aside: {regions} where the scene itself moved")
     if found.gap is not None:
-        factor, unit = found.gap.shown
+        factor, unit = found.gap.display_unit
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
-        lines.append(f"  gap {scores}: {describe_closing(found.gap, found.mended)}")
+        lines.append(f"  gap {scores}: {describe_closing(found.gap, found.model_changed)}")
     if found.verdict == "no_gap" and found.remaining.get("note"):
         lines.append(f"  note: {found.remaining['note']}")
     return "\n".join(lines)
 
 
 def _describe_needed_data(found: GapDiagnosis) -> str:
-    """What insufficient_data asks for."""
+    """What to measure if the verdict is insufficient_data."""
     if found.evidence.much_moved:
         return (
             "stable_areas in measurement.yaml (boxes or polygons, wall frame, m) where nothing moved, or a reference of the same "
-            "time; what moved is measured as a difference of two epochs, not as an effect of the sensor."
+            "time. Movements of the rock are measured as a difference of two epochs, not as an effect of the sensor."
         )
     return (
         f"at least {found.thresholds.points.fewest} points on smooth rock of stable ground, spread over the wall: scan or match "
-        "more densely, take in more of the wall, or widen stable_areas (wall frame, m) where they leave out what did not move."
+        "more densely, include more of the wall, or enlarge stable_areas (wall frame, m) where they exclude stable rock."
     )
 
 
@@ -174,7 +175,7 @@ def _render_page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
         where=rows,
         tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
         more=max(len(tried) - _MOST_TRIED, 0),
-        spread_tried=[(item, spread_outcome(found, item)) for item in found.spread_tried],
+        variance_tried=[(item, variance_outcome(found, item)) for item in found.variance_tried],
         added=_yaml({"effects": [round_entry(effect.entry) for effect in found.effects]}),
         model=_yaml(after),
         number=format_number,
@@ -188,5 +189,5 @@ def _render_page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
 
 
 def _yaml(content: dict[str, Any]) -> str:
-    """Lists of numbers stand in lines, not one number below another."""
+    """YAML in which lists of numbers stay on one line."""
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
