@@ -231,10 +231,9 @@ who wonder whether a default decides their case. `--set` changes a threshold for
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
 Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
-points of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose answer
-(verdict or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the run, is not
-listed.
-"-" means that the value is not allowed, or that the time was up.
+points of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose
+answer (verdict or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the
+run, is not listed. "-" means that the value is not allowed, or that the time was up.
 
 A few cases show which thresholds are near an edge, not how often they decide."""
 

@@ -71,7 +71,7 @@ class ChangedRegion:
     score : float
         A detector's, NaN without one.
     marks : tuple of str
-        "edge", "vegetation", "thin": what may have feigned the change.
+        "edge", "vegetation", "thin": what may have feigned the change; "insignificant": a detector's that noise may explain.
     identity : int
         Number of the event; 0 as yet unknown.
     """
@@ -151,7 +151,8 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
     if not known.any():
         return None
     kind: Kind = "missing" if window[known].mean() >= 0 else "added"
-    return replace(_measured(known, row, column, kind, change), score=score)
+    region = replace(_measured(known, row, column, kind, change), score=score)
+    return region if region.significance >= _SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.records.result_records import RUN_FILE, read_run
-from pipeline.measurement.reference import DEMS, from_dem, is_cloud
+from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
 from pipeline.measurement.scans import read_scans
 from pipeline.monitor.options import MonitorOptions
 from pipeline.monitor.times import EpochTime, check_order, time_of
@@ -192,7 +192,7 @@ def _of_run(source: EpochSource, run: dict[str, Any]) -> EpochData:
 def _read_file(path: Path, options: MonitorOptions) -> EpochData:
     suffix = path.suffix.lower()
     if suffix in DEMS:
-        found = from_dem(path, options.unit)
+        found = reference_from_dem(path, options.unit)
         above = found.mesh.vertices.mean(axis=0) + np.array([0.0, 0.0, _BEFORE_M])
         return EpochData(found.mesh.vertices, found.mesh, above, "", found.words)
     if not is_cloud(path):

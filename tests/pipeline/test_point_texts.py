@@ -206,7 +206,7 @@ def test_missing_values_are_left_out_with_a_word(tmp_path: Path) -> None:
     many = "".join(f"{x} {y} {z}\n" for x, y, z in rng.uniform(0, 9, (200, 3)))
     (scan,) = read_scans(written(tmp_path, many + "nan nan nan\n" * 7))
     assert len(scan.cloud.points) == 200
-    assert "7 points that are no numbers are left out" in scan.words
+    assert "7 points with coordinates that are not numbers are left out" in scan.words
 
 
 def test_a_binary_file_with_a_suffix_of_text_is_named(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from pipeline.gap.report.covariate_ranking import inliers, quantile_bins, standa
 from pipeline.gap.report.wording import covariate_with_unit
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, sigma_of
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.report.figures import COLOURS, dress_map
+from pipeline.report.figures import COLOURS, label_map_axes
 from pipeline.report.pictures import png
 from pipeline.report.plain_text import power_of_ten
 from scene.geometry.mesh import FloatArray
@@ -64,7 +64,7 @@ def maps_figure(found: GapDiagnosis) -> bytes:
     for panel in panels.ravel():
         panel.set_facecolor("0.85")
         panel.set_anchor("N")  # if centred, the title of a low map could lie outside of the figure
-        dress_map(panel, pixels.extent[0], pixels.extent[2])
+        label_map_axes(panel, pixels.extent[0], pixels.extent[2])
         panel.label_outer()
         for change in found.changes:
             corner, opposite = change.bounds[:, :2]

@@ -13,7 +13,7 @@ from pipeline.gap.noise_and_edges.variance_model import VarianceScore
 from pipeline.gap.report.datum_scale import estimate_scale
 from pipeline.gap.report.quantities import format_with_std
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
-from pipeline.report.page import true_minus
+from pipeline.report.page import with_minus_sign
 from sensors.effects.base import ShowsIn
 from sensors.effects.surface_empirical import SurfaceEmpirical
 
@@ -190,7 +190,7 @@ def format_number(value: float, digits: int = 4) -> str:
 
 def format_decimal(value: float) -> str:
     """Format a number with one decimal, or without decimals from ten thousand on."""
-    return true_minus(value, 1) if abs(value) < 9999.95 else format_number(value, 5)
+    return with_minus_sign(value, 1) if abs(value) < 9999.95 else format_number(value, 5)
 
 
 def round_entry(value: Any) -> Any:
