@@ -140,7 +140,7 @@ def test_a_sensor_stands_on_the_earth(values: dict[str, float]) -> None:
         ("train a --out used", "add --resume to continue"),
         ("train a --out out --resume", "start a training without --resume"),
         ("detect baseline a.tif a.tif --out out", "is given 2 times"),
-        ("gap a --out a.xyz/out", "cannot be a folder to write into"),
+        ("gap a --out a.xyz/out", "cannot be used as a folder"),
         ("train a --out used --resume", "there is no training"),
         ("compare a.xyz --epochs=", "--epochs is empty"),
     ],

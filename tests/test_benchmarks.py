@@ -35,7 +35,7 @@ ELSEWHERE = {
     "gap_injections/run": "tests/test_gap_injections.py",
     "gap_judge/run": "tests/test_gap_judge.py",
     "gap_thresholds": "tests/test_varied.py",
-    "readers/draw": "tests/test_readers.py",
+    "readers/draw": "tests/test_generated_pages.py",
     "field_reports/run": "tests/test_field_reports.py",
     **dict.fromkeys(
         ("detector", "detector_ablation", "detector_curve", "detector_drawn", "detector_mirrored", "detector_table"),

@@ -264,7 +264,7 @@ class Diagnosis:
 
     def summary(self) -> str:
         """Return the verdict as a few lines of text."""
-        return report.summary(self.found)
+        return report.summarise(self.found)
 
     def plot(self, kind: str = "maps") -> Picture:
         """Return a figure of the report (maps, profiles, gap, identifiability), or the residuals over the wall (before,
@@ -291,7 +291,7 @@ class Diagnosis:
 
     def write(self, out: Path | str) -> Path:
         """Write the folder that `scarpsim gap` writes; return its report.html."""
-        return report.write(Path(out), self.found, self.measurement.held)
+        return report.write_report(Path(out), self.found, self.measurement.held)
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}, {len(self.found.effects)} effects>"

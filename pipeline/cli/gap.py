@@ -88,12 +88,12 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     """Diagnose a measurement and write the report."""
     from pipeline.formats.measurements.measurement import read_measurement
-    from pipeline.gap.decisions import read_decisions
     from pipeline.gap.naming.workflow import STEPS, diagnose
-    from pipeline.gap.report.report import summary, write
+    from pipeline.gap.report.report import summarise, write_report
+    from pipeline.gap.thresholds import read_thresholds
     from pipeline.report.progress import shown_progress
 
-    decisions = read_decisions(arguments.overrides)
+    thresholds = read_thresholds(arguments.overrides)
     weights = {**STEPS, "report": 2.0}
     steps = iter(weights)
     with shown_progress(quiet=arguments.quiet) as progress, ExitStack() as stage:
@@ -105,14 +105,14 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:
         progress.plan(weights)
         begin_next()
         measurement = read_measurement(_measurement_folder(arguments, out))
-        found = diagnose(measurement, arguments.seed, begin_next, decisions)
-        report = write(out, found, measurement)
-    return CommandOutput(f"{summary(found)}\nreport: {report}", record_document(report, "gap.json"))
+        found = diagnose(measurement, arguments.seed, begin_next, thresholds)
+        report = write_report(out, found, measurement)
+    return CommandOutput(f"{summarise(found)}\nreport: {report}", record_document(report, "gap.json"))
 
 
 def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     """Report which effects the geometry of a measurement or config can tell apart."""
-    from pipeline.gap.report.identifiability_report import in_words, write_identifiability
+    from pipeline.gap.report.identifiability_report import summarise, write_identifiability
     from pipeline.gap.survey.identifiability import identifiability, table
     from pipeline.gap.survey.surveys import surveys
 
@@ -121,5 +121,5 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     wanted = surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
-    told = "\n\n".join(f"{in_words(each)}\n{table(each)}" for each in found)
+    told = "\n\n".join(f"{summarise(each)}\n{table(each)}" for each in found)
     return CommandOutput(f"{told}\nreport: {report}", record_document(report, "identifiability.json"))

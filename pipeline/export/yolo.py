@@ -86,7 +86,9 @@ def _default_limit(sets: dict[str, Tiles], folder: Path) -> float:
     noise = [value for value in said if type(value) in (int, float) and 0 < value < math.inf]
     if not noise:
         raise InputError(
-            "says nothing of its images' noise", where=str(folder), remedy="give the grey values' end with --limit-m"
+            "none of its images states its noise, which sets the limit of the grey scale",
+            where=str(folder),
+            remedy="set that limit with --limit-m",
         )
     return _SIGMAS * float(np.median(noise))
 

@@ -80,7 +80,7 @@ def variogram(
     Raises
     ------
     InputError
-        If fewer than two pixels have data, or none are far enough apart.
+        If fewer than two pixels have data, or no two of them lie within the largest lag.
     """
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
@@ -124,7 +124,7 @@ def _averaged(
         along, across = (np.abs(column), row) if direction == "x" else (row, np.abs(column))
         wanted &= across <= _SECTOR * along
     if not wanted.any():
-        raise InputError("no pixels with data are far enough apart", where="variogram", remedy="raise the largest lag")
+        raise InputError(f"no two pixels with data lie within {reach:g} m", where="variogram", remedy="raise the largest lag")
     edges = np.geomspace(0.5, max(reach / gsd_m, 1.0) * (1 + 1e-6), _LAGS + 1) * gsd_m
     number = np.clip(np.searchsorted(edges, distance[wanted], side="right") - 1, 0, _LAGS - 1)
     count = np.bincount(number, pairs[wanted], _LAGS).astype(np.float64)

@@ -151,7 +151,7 @@ def test_an_opencv_coefficient_without_counterpart_is_named(tmp_path: Path, plac
 def test_colmap_refuses_models_beyond_ours(tmp_path: Path) -> None:
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     for line, what in (
-        ("1 OPENCV_FISHEYE 640 480 500 500 320 240 0 0 0 0", "OPENCV_FISHEYE is not covered"),
+        ("1 OPENCV_FISHEYE 640 480 500 500 320 240 0 0 0 0", "OPENCV_FISHEYE is not supported"),
         ("1 FULL_OPENCV 640 480 500 500 320 240 0 0 0 0 0 0.5 0 0", "k4 = 0.5"),
         ("1 PINHOLE 640 480 500 500 320", "needs width, height and fx, fy, cx, cy"),
         ("2 PINHOLE 640 480 500 500 320 240", "names the camera 1"),
@@ -232,7 +232,7 @@ def test_a_camera_of_a_rig_is_no_unaligned_one(tmp_path: Path) -> None:
         (">2.5<", ">-2.5<", "scale -2.5"),
         ("<document", "<!DOCTYPE x><document", "entities"),
         ("</document>", "", "not valid XML"),
-        ("document", "calibration", "no Metashape camera XML"),
+        ("document", "calibration", "not a Metashape camera XML"),
         ("<k1>-0.05</k1>", "<k1>-0.05</k1><p3>0.001</p3>", "lens parameter p3 = 0.001"),
         (
             "0 0 0 1</transform></camera>",
@@ -319,7 +319,7 @@ def test_depth_and_normal_maps_of_colmap(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_map(tmp_path / "d.bin"), depth)
     np.testing.assert_array_equal(read_map(tmp_path / "n.bin"), normals)
     (tmp_path / "d.bin").write_bytes(b"4&3&1&short")
-    with pytest.raises(InputError, match="no whole depth"):
+    with pytest.raises(InputError, match="not a complete depth"):
         read_map(tmp_path / "d.bin")
 
 

@@ -96,10 +96,10 @@ def sweeps(azimuth: list[float], zenith: list[float]) -> Callable[[Path], None]:
 
 BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "no files": (changed(points=[]), "names no file"),
-    "step of the pattern": (sweeps([0.9, 2.3, 1e-12], [0.8, 1.7, 0.01]), "pulses, for"),
+    "step of the pattern": (sweeps([0.9, 2.3, 1e-12], [0.8, 1.7, 0.01]), "pulses for"),
     "pattern in degrees": (sweeps([50.0, 130.0, 0.7], [45.0, 95.0, 0.7]), "angles are in radians"),
     "zenith beyond nadir": (sweeps([0.9, 2.3, 0.012], [0.8, 5.0, 0.012]), "straight down"),
-    "elevation for zenith": (sweeps([0.9, 2.3, 0.012], [0.0, 0.7, 0.012]), "'pattern' holds"),
+    "elevation for zenith": (sweeps([0.9, 2.3, 0.012], [0.0, 0.7, 0.012]), "'pattern' contains"),
     "world taken for scanner": (in_world, "`frame: world`"),
     "scanner taken for world": (changed(frame="world"), "`frame: scanner`"),
     "no noise": (silent, "range_sigma_m"),
@@ -107,8 +107,8 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "scale 0": (header(SCALE_AT, 0.0), "scale factors"),
     "scale infinite": (header(SCALE_AT, float("inf")), "scale factors"),
     "offset 1e9": (header(OFFSET_AT, 1e9), "states a box from"),
-    "one point 5000 times": (put(lambda points: np.repeat(points[:1], 5000, axis=0)), "are the same one"),
-    "one point 3 times": (put(lambda points: np.repeat(points[:1], 3, axis=0)), "are the same one"),
+    "one point 5000 times": (put(lambda points: np.repeat(points[:1], 5000, axis=0)), "are at the same place"),
+    "one point 3 times": (put(lambda points: np.repeat(points[:1], 3, axis=0)), "are at the same place"),
     "on one line": (put(lambda points: points[0] + np.linspace(0, 1, 500)[:, None] * (points[900] - points[0])), "on one line"),
     "negative intensity": (put(lambda points: np.column_stack([points, -np.ones(len(points))])), "intensities from -1 to -1"),
     "huge intensity": (put(lambda points: np.column_stack([points, np.full(len(points), 1e300)])), "relative received power"),

@@ -99,7 +99,7 @@ def test_references_of_points_ask_for_planes(tmp_path: Path) -> None:
 
 def test_planes_are_not_asked_for_where_nothing_looks_at_them() -> None:
     values = {"sensor": "stereo", "reference": "a.ply", "points": "b.ply", "model": "model.yaml", "incidence": "planes"}
-    with pytest.raises(InputError, match="of laser scans; leave it out"):
+    with pytest.raises(InputError, match="for laser scans only; remove it"):
         parse(MeasurementConfig, values, "measurement.yaml")
 
 

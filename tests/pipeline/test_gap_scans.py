@@ -127,7 +127,7 @@ def test_an_ambiguous_effect_is_named_with_both_faces(tmp_path: Path) -> None:
     ("keys", "said"),
     [
         ({"scanners": [{"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}]}, "1 poses for 2 files"),
-        ({"scanner": {"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}}, "stands instead of 'scanner'"),
+        ({"scanner": {"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}}, "replaces 'scanner'"),
         ({"scanners": [{"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist(), "face": 3}] * 2}, "face"),
     ],
 )

@@ -221,7 +221,7 @@ BAD = {
     "half": "half needs scans",
     "cameras too": "whose cameras are not at hand",
     "a model in pixels": "a model whose noise is in metres",
-    "cameras in the model": "the model holds focal_length",
+    "cameras in the model": "the model has focal_length",
 }
 
 
