@@ -68,7 +68,7 @@ class Points(np.ndarray[Any, Any]):
             write_xyz(path, cloud)
         else:
             raise InputError(
-                f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".laz .copc.laz .las .ply .pcd .xyz"
+                f"the format '{path.suffix}' is unknown", where=str(path), allowed=".laz .copc.laz .las .ply .pcd .xyz"
             )
         return path
 
