@@ -29,7 +29,7 @@ from pipeline.change.difference import raster_grid
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import load_config
 from pipeline.report.progress import Progress
-from pipeline.run.acquisition import look, reconstruct
+from pipeline.run.acquisition import acquire, reconstruct
 from pipeline.run.site import prepare_site
 from scene.common.backend import dr
 from scene.common.keyed_random import KeyedRandom
@@ -71,7 +71,7 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
     true = np.exp(random.child("truth").generator().uniform(low, high))
     real = replace(site, sensor=replace(instrument, model=fitted.model(true)))
     caster = RayCaster(site.mesh)
-    grid = raster_grid(reconstruct(config, look(config, real, caster, random.child("grid"))).bounds, config.difference)
+    grid = raster_grid(reconstruct(config, acquire(config, real, caster, random.child("grid"))).bounds, config.difference)
     maps = np.stack([noise_map(config, real, real, caster, random.child("map", epoch), grid) for epoch in range(EPOCHS)])
     names = tuple(f"epoch {epoch}" for epoch in range(EPOCHS))
     inputs = CalibrationInputs(names, grid, maps, ~np.isnan(maps).any(axis=0), False, site, False)

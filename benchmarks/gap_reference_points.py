@@ -25,7 +25,7 @@ from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import write_laz
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.report.in_words import values as in_words
+from pipeline.gap.report.wording import format_parameters as in_words
 from pipeline.measurement.build import build
 from pipeline.measurement.request import Request
 

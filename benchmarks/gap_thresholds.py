@@ -25,9 +25,9 @@ from benchmarks.gap_challenge.cases import Case, make, plan
 from benchmarks.gap_challenge.score import score
 from benchmarks.varied import Setting, Varied
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.decisions import Decisions
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
+from pipeline.gap.thresholds import Thresholds
 
 Json = dict[str, Any]
 FACTORS = (0.7, 1.4)
@@ -35,7 +35,7 @@ WRONGS = ("false alarm", "wrong name", "missed", "not answered unknown", "called
 
 
 class _Watched:
-    """Decisions whose values are `Varied`: which were asked for, and which would have decided otherwise."""
+    """Thresholds whose values are `Varied`: which were asked for, and which would have decided otherwise."""
 
     def __init__(self, values: Any, prefix: str, asked: set[str], matters: set[Setting]) -> None:
         self._values, self._prefix, self._asked, self._matters = values, prefix, asked, matters
@@ -61,27 +61,27 @@ def _others(key: str) -> dict[Setting, Any]:
 
 def keys() -> list[str]:
     """All thresholds, as group.key."""
-    return [f"{group}.{key}" for group, values in Decisions().model_dump().items() for key in values]
+    return [f"{group}.{key}" for group, values in Thresholds().model_dump().items() for key in values]
 
 
-def scaled(key: str, factor: float) -> Decisions | None:
-    """The usual decisions with one of them so many times as large; None where it may not be, or where whole numbers stay."""
+def scaled(key: str, factor: float) -> Thresholds | None:
+    """The usual thresholds with one of them so many times as large; None where it may not be, or where whole numbers stay."""
     group, name = key.split(".")
-    values = Decisions().model_dump()
+    values = Thresholds().model_dump()
     old = values[group][name]
     new = max(round(factor * old), 1) if isinstance(old, int) else factor * old
     values[group][name] = new
     try:
-        return None if new == old else Decisions.model_validate(values)
+        return None if new == old else Thresholds.model_validate(values)
     except ValidationError:
         return None
 
 
-def answer(folder: Path, decisions: Any) -> Json:
+def answer(folder: Path, thresholds: Any) -> Json:
     """gap.json, or what went wrong."""
     measurement = read_measurement(folder)
     try:
-        return to_dict(diagnose(measurement, decisions=decisions), measurement)
+        return to_dict(diagnose(measurement, thresholds=thresholds), measurement)
     except Exception as error:
         return {"error": repr(error)}
 
@@ -123,12 +123,12 @@ def work(cases: list[Case], out: Path, minutes: float, *, everything: bool = Fal
 
 
 def _usual(folder: Path) -> Json:
-    """gap.json with the usual decisions, watched: which were asked for and which make a difference is noted beside it."""
+    """gap.json with the usual thresholds, watched: which were asked for and which make a difference is noted beside it."""
     asked: set[str] = set()
     matters: set[Setting] = set()
     measurement = read_measurement(folder / "case")
-    watched: Any = _Watched(Decisions(), "", asked, matters)
-    found = to_dict(diagnose(measurement, decisions=watched), measurement)
+    watched: Any = _Watched(Thresholds(), "", asked, matters)
+    found = to_dict(diagnose(measurement, thresholds=watched), measurement)
     (folder / "asked.json").write_text(json.dumps({"asked": sorted(asked), "matters": sorted(matters)}))
     return found
 
@@ -170,7 +170,7 @@ def table(cases: list[Case], out: Path) -> str:
     for key in keys():
         if key in cells:
             group, name = key.split(".")
-            value = getattr(getattr(Decisions(), group), name)
+            value = getattr(getattr(Thresholds(), group), name)
             lines.append(f"| `{key}` | {value:g} | " + " | ".join(_side(cells[key].get(factor, [])) for factor in FACTORS) + " |")
     return "\n".join(lines)
 
@@ -230,10 +230,10 @@ who wonder whether a default decides their case. `--set` changes a threshold for
 
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
-Each threshold of `pipeline/gap/decisions.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand points
-of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose answer (verdict
-or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the run, is not listed.
-"-" means that the value is not allowed, or that the time was up.
+Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
+points of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose
+answer (verdict or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the
+run, is not listed. "-" means that the value is not allowed, or that the time was up.
 
 A few cases show which thresholds are near an edge, not how often they decide."""
 

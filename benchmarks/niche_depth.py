@@ -18,7 +18,7 @@ from documents import printed, write_between
 from scipy import ndimage
 from upper_bound import DOCUMENT, WALL, Niches, observed
 
-from pipeline.change.annotate import STANDS_OUT
+from pipeline.change.annotate import DETECTABLE_SNR
 from pipeline.config.bundled import bundled_config
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import planned_epochs, simulation_of
@@ -80,7 +80,7 @@ def rows(extent: dict[str, float], maps: int) -> Iterator[str]:
     yield "|---" * len(heads) + "|"
     for case in CASES:
         found = niches(config, case, extent, maps)
-        shares = [np.mean([ratio > STANDS_OUT for each in found[noise] for ratio in each.ratios]) for noise in config.noise]
+        shares = [np.mean([ratio > DETECTABLE_SNR for each in found[noise] for ratio in each.ratios]) for noise in config.noise]
         every = [each for level in found.values() for each in level]
         depth, rise = (np.median([one for each in every for one in getattr(each, name)]) for name in ("depths", "rise"))
         placement, spacing, sigma = case

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from documents import printed, write_between
 
-from pipeline.change.annotate import STANDS_OUT, AnnotationConfig, block_annotations
+from pipeline.change.annotate import DETECTABLE_SNR, AnnotationConfig, block_annotations
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig
 from pipeline.dataset.config import load_dataset_config
@@ -51,7 +51,7 @@ def rows(width_m: float, height_m: float) -> Iterator[str]:
                 rockfall = simulation.rockfall.model_copy(update={"placement": placement})
                 way = {"wall": wall, "rockfall": rockfall, "reconstruction": reconstruction, "depth_map": depth_map}
                 found = observed(simulation.model_copy(update=way), config.sizes[size].blocks_per_m2)
-                shares.append(f"{100 * np.mean(np.array(found.ratios) > STANDS_OUT):.0f} %")
+                shares.append(f"{100 * np.mean(np.array(found.ratios) > DETECTABLE_SNR):.0f} %")
                 depths += found.depths
                 filled += found.filled
             name = f"{reconstruction}, {depth_map}" if reconstruction == "direct" else reconstruction

@@ -29,10 +29,10 @@ from pipeline.formats.measurements.measurement import Measurement, StereoMeasure
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.report.covariate_ranking import bins, where
+from pipeline.gap.report.covariate_ranking import quantile_bins, rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
-from pipeline.gap.report.in_words import paragraph
-from pipeline.gap.report.report import summary
+from pipeline.gap.report.report import summarise
+from pipeline.gap.report.wording import paragraph
 from pipeline.gap.residuals.registration import residuals_of
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
@@ -159,7 +159,7 @@ def _other_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_], lost
 
 def _explained(x: FloatArray, values: FloatArray) -> float:
     """Share of the variance of the values that lies between bins of x."""
-    edges, group = bins(x, _BINS)
+    edges, group = quantile_bins(x, _BINS)
     return _explained_by(group, values) if len(edges) > 2 else 0.0
 
 
@@ -359,8 +359,8 @@ def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
         f"**Given when**: {verdict.when}",
         f"**What to do**: {verdict.what_to_do}",
         f"## Example\n\n{verdict.case} Made by the tests' generator; this page is by `docs/make_gap_pages.py`.",
-        f"> {paragraph(found, where(found))}",
-        f"```text\n{summary(found)}\n```",
+        f"> {paragraph(found, rank_disagreements(found))}",
+        f"```text\n{summarise(found)}\n```",
         *pictures,
         "[From symptom to cause](symptoms.md)",
     ]
@@ -377,7 +377,7 @@ def make_verdicts(wanted: list[str]) -> None:
             verdict.make(Path(folder))
             found = diagnose(read_measurement(Path(folder)))
         if found.verdict != name:
-            raise SystemExit(f"the example of {name} is {found.verdict}: {summary(found)}")
+            raise SystemExit(f"the example of {name} is {found.verdict}: {summarise(found)}")
         (FOLDER / f"{name}.md").write_text(verdict_page(name, verdict, found))
         if found.gap is not None:
             (FOLDER / "images" / f"verdict_{name}.png").write_bytes(small_png(maps_figure(found)))

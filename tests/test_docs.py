@@ -93,8 +93,8 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
         assert not without_words.search(text), f"{page}: a picture without alternative text"
 
 
-CHECKED_ELSEWHERE = ("add_effect", "add_sensor", "add_wall_style", "export", "plan_survey", "plug_ins", "view")
-"""How-tos whose commands and code other tests check (test_docs_commands.py, test_plug_ins.py, api/test_building.py)."""
+CHECKED_ELSEWHERE = ("add_effect", "add_sensor", "add_wall_style", "export", "monitor", "plan_survey", "plug_ins", "view")
+"""How-tos whose commands and code other tests check (test_docs_commands.py, monitor/, test_plug_ins.py, api/test_building.py)."""
 
 
 def test_every_how_to_has_its_picture() -> None:

@@ -191,6 +191,11 @@ RESOLVED = (
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
 PARSED = (
+    "scarpsim view april",
+    "scarpsim monitor march.laz april.laz --out april",
+    "scarpsim monitor scans/2026-*.laz --workers 2 --out year",
+    "scarpsim monitor scans/2026-*.laz --workers 2 --out year --resume",
+    "scarpsim monitor reference.laz --follow incoming --out live",
     "scarpsim calibrate my_measurement --out calibration",
     "scarpsim dataset verify sets/small",
     "scarpsim dataset verify sets/small --report-only",
@@ -235,6 +240,7 @@ PARSED = (
 """Work on results alone: their words are parsed."""
 
 NAMED = (
+    "scarpsim monitor",
     "scarpsim --help",
     "scarpsim COMMAND --help",
     "scarpsim schema KIND",

@@ -103,7 +103,7 @@ def not_understood(text: str, where: str) -> str:
     problem = f"states a coordinate system that is not understood: '{text:.60}'"
     if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):
         remedy = "export the file with its EPSG code or valid WKT"
-        raise InputError(f"{problem}, which mentions '{word[0]}'", where=where, remedy=remedy)
+        raise InputError(f"{problem}, and names the unit '{word[0]}'", where=where, remedy=remedy)
     return f"the file {problem}; its coordinates are read as metres"
 
 

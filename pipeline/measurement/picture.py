@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from pipeline.report.figures import FAMILY, SEQUENTIAL, dress, png_bytes
+from pipeline.report.figures import FAMILY, SEQUENTIAL, label_axes, png_bytes
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from sensors.signal_chain.polar import polar
 
@@ -46,7 +46,7 @@ def picture(
         _fan(above, few, here)
     above.set_aspect("equal", adjustable="datalim")
     shift = "" if not origin.any() else f" less {origin[0]:,.0f}", f" less {origin[1]:,.0f}" if origin.any() else ""
-    dress(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
+    label_axes(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
     above.set_title("from above")
     for handle in above.legend(loc="best", fontsize=8).legend_handles:
         if isinstance(handle, PathCollection):
@@ -56,7 +56,7 @@ def picture(
     azimuth = middle + np.angle(np.exp(1j * (azimuth - middle)))
     dots = seen.scatter(np.degrees(azimuth), np.degrees(zenith), c=distance, s=0.8, cmap=SEQUENTIAL, linewidths=0)
     seen.invert_yaxis()
-    dress(seen, "azimuth, degrees", "zenith angle, degrees")
+    label_axes(seen, "azimuth, degrees", "zenith angle, degrees")
     seen.set_title("as the sensor sees it" if sensor else "seen from in front of the wall")
     figure.colorbar(dots, ax=seen, label="range, m" if sensor else "distance from there, m")
     figure.suptitle(title)

@@ -37,6 +37,8 @@ _THIN_PX = 1.2
 """Area over length of the outline, pixels, below which a region is a thin line."""
 _MARGIN_PX = 2
 """Pixels without data in bays of a region that are at most twice as wide are counted to it."""
+_ISLAND = 0.3
+"""Share of the largest part of a mask below which another part is no part of the outline."""
 _EDGE_PX = 5
 """Side of the square about a pixel in which an edge of the rock would be spread."""
 _GAP_SHARE, _RIM_SHARE = 1.0, 1.3
@@ -69,7 +71,7 @@ class ChangedRegion:
     score : float
         A detector's, NaN without one.
     marks : tuple of str
-        "edge", "vegetation", "thin": what may have feigned the change.
+        "edge", "vegetation", "thin": what may have feigned the change; "insignificant": a detector's that noise may explain.
     identity : int
         Number of the event; 0 as yet unknown.
     """
@@ -149,7 +151,8 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
     if not known.any():
         return None
     kind: Kind = "missing" if window[known].mean() >= 0 else "added"
-    return replace(_measured(known, row, column, kind, change), score=score)
+    region = replace(_measured(known, row, column, kind, change), score=score)
+    return region if region.significance >= _SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
@@ -190,7 +193,7 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     rim = whole & ~ndimage.binary_erosion(whole)
     rough = _GAP_SHARE * depth[whole & ~mask].sum(), _RIM_SHARE * np.abs(depth[rim]).sum()
     deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
-    inner = whole & (depth >= deepest / 2)
+    inner = _without_islands(whole & (depth >= deepest / 2))
     rows, columns = np.nonzero(inner)
     return ChangedRegion(
         kind=kind,
@@ -210,6 +213,16 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
         significance=float(depth[mask].mean()) / max(noise, 1e-9),
         marks=_marks(mask, window, sign, change),
     )
+
+
+def _without_islands(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Drop parts of a mask that are much smaller than its largest one."""
+    labels, count = ndimage.label(mask, np.ones((3, 3)))
+    if count < 2:
+        return mask
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return np.asarray((sizes >= _ISLAND * sizes.max())[labels] & mask)
 
 
 def _padded(mask: NDArray[np.bool_], row: int, column: int, shape: tuple[int, ...]) -> tuple[int, int, NDArray[np.bool_]]:

@@ -20,7 +20,7 @@ _CELL_M, _POINTS_A_CELL, _ROUNDS = 0.5, 3.0, 3
 """Side of the cells by which the area that has points is counted: at first, m, then in distances of the points; and how often."""
 _POINTS_APART = 1.5
 """Pixel side over the mean distance of neighbouring points: 3 x 3 pixels then hold some twenty points."""
-_MOST_COUNTED = 3_000_000
+_MOST_COUNTED = 300_000
 _ROUND = np.array([1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 _MOST_PIXELS = 60_000_000
 _FINEST_M = 0.002

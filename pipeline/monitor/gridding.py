@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
-_REACH = 1
-"""Pixels to each side from which points are taken."""
 _FEWEST = 4
 """Points that a plane needs, one more than it has parameters."""
 _MOST_LEVERAGE = 1.0
@@ -28,7 +26,7 @@ _MOST_LEVERAGE = 1.0
 _PRIOR_POINTS = 4.0
 """Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
 _CHUNK = 2_000_000
-"""Points of which sums are taken at a time."""
+"""Points of which sums are taken at a time; as many as the raster has pixels, where that is more."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +73,9 @@ def gridded(points: FloatArray, grid: Grid) -> HeightRaster:
 def _moments(points: FloatArray, grid: Grid) -> FloatArray:
     """(10, h, w) sums over the points of each pixel: 1, u, v, z, uu, uv, vv, uz, vz, zz; u and v in pixels from its centre."""
     sums = np.zeros((10, grid.height * grid.width))
-    for start in range(0, len(points), _CHUNK):
-        x, y, z = points[start : start + _CHUNK].T
+    chunk = max(_CHUNK, sums.shape[1])
+    for start in range(0, len(points), chunk):
+        x, y, z = points[start : start + chunk].T
         column, row = (x - grid.x_min) / grid.gsd, (grid.y_max - y) / grid.gsd
         inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
         column, row, z = column[inside], row[inside], z[inside]
@@ -111,14 +110,13 @@ def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
 
 
 def _about_each_pixel(sums: FloatArray) -> FloatArray:
-    """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one."""
-    height, width = sums.shape[1:]
-    total = np.zeros_like(sums)
-    for down in range(-_REACH, _REACH + 1):
-        for right in range(-_REACH, _REACH + 1):
-            here = np.s_[:, max(-down, 0) : height - max(down, 0), max(-right, 0) : width - max(right, 0)]
-            there = np.s_[:, max(down, 0) : height - max(-down, 0), max(right, 0) : width - max(-right, 0)]
-            total[here] += _shifted(sums[there], float(right), float(-down))
+    """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one: first along rows, then columns."""
+    along = sums.copy()
+    along[:, :, :-1] += _shifted(sums[:, :, 1:], 1.0, 0.0)
+    along[:, :, 1:] += _shifted(sums[:, :, :-1], -1.0, 0.0)
+    total = along.copy()
+    total[:, :-1] += _shifted(along[:, 1:], 0.0, -1.0)
+    total[:, 1:] += _shifted(along[:, :-1], 0.0, 1.0)
     return total
 
 

@@ -58,5 +58,5 @@ def compared_in_words(measured_m: float, predicted_m: float) -> str:
         return f"{told}. They agree within a third."
     return (
         f"{told}. They disagree by more than a third: relief between the points, or an effect that the model lacks. "
-        "Find out with `scarpsim gap` on the scan and the reference, and fit the noise with `scarpsim calibrate`."
+        "Find out with scarpsim gap on the scan and the reference, and fit the noise with scarpsim calibrate."
     )

@@ -17,7 +17,7 @@ from pipeline.formats.files.atomic import write_json, write_text
 from pipeline.formats.files.plain_json import without_nan
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import LazHeader, write_laz
-from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.formats.records.geopackage import write_geopackage
 from pipeline.monitor.events import ChangedRegion
 from pipeline.monitor.options import MonitorOptions
@@ -105,6 +105,7 @@ def write_results(result: Result) -> None:
     from pipeline.monitor.report import write_report
 
     rows = result.rows()
+    write_geotiff(result.folder / "reference.tif", result.site.reference.raster.height, result.site.grid)
     _write_table(result.folder / "events.csv", rows)
     grid, heights = result.site.grid, result.site.reference.raster.height
     outlines = [in_survey(region, grid, heights, result.site.frame) for epoch in result.epochs for region in epoch.regions]

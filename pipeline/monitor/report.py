@@ -13,7 +13,7 @@ from pipeline.monitor.magnitude import PowerLaw, fit_power_law
 from pipeline.monitor.model import compared_in_words
 from pipeline.monitor.products import Followed, Result, event_raster
 from pipeline.monitor.significance import NORMAL_95
-from pipeline.report.figures import blocks_figure, difference_figure, dress, hillshade_figure, png_bytes
+from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import template
 
@@ -59,7 +59,7 @@ def headline(result: Result) -> list[str]:
         parts = [_kind_in_words(epoch, kind) for kind in ("missing", "added")]
         found = "; ".join(part for part in parts if part) or "no change beyond the level of detection"
         marked = sum(bool(region.marks) for region in epoch.regions)
-        doubtful = f" {marked} of them may be vegetation or edges (see the marks)." if marked else ""
+        doubtful = f" {marked} of them have a mark: something else may have feigned the change." if marked else ""
         told.append(
             f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. A pixel shows changes from "
             f"{1e3 * epoch.record.level_m:.1f} mm on (95 %).{doubtful}"
@@ -137,7 +137,7 @@ def _volumes_figure(result: Result) -> bytes:
         axes.errorbar(
             places, volumes, NORMAL_95 * np.sqrt(variances), color=colour, marker="o", markersize=3, capsize=2, label=kind
         )
-    dress(axes, "time (UTC)" if timed else "epoch", "volume against the reference [m³]")
+    label_axes(axes, "time (UTC)" if timed else "epoch", "volume against the reference [m³]")
     axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)
 
@@ -149,6 +149,6 @@ def _law_figure(volumes: list[float], law: PowerLaw) -> bytes:
     axes.loglog(ordered, np.arange(len(ordered), 0, -1), "o", markersize=3, color="0.3", label="rockfalls")
     line = np.geomspace(law.smallest_m3, ordered[-1], 50)
     axes.loglog(line, law.count * (line / law.smallest_m3) ** -law.exponent, color="#b2182b", label=f"V^-{law.exponent:.2f}")
-    dress(axes, "volume V [m³]", "rockfalls larger than V")
+    label_axes(axes, "volume V [m³]", "rockfalls larger than V")
     axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

@@ -204,7 +204,7 @@ OF_TRUTH = {
     "no size": (_change("images", "width", ...), "image 1: 'width' is missing"),
     "a size of nothing": (_change("images", "height", 0), "image 1: 'height'"),
     "an image too large": (_change("images", "width", 10**7), "image 1: has 48 x 10000000 px; allowed: at most 250,000,000 px"),
-    "no image": (lambda content: content.update(images=[]), "names no image"),
+    "no image": (lambda content: content.update(images=[]), "its list 'images' is empty"),
 }
 OF_DETECTIONS = {
     "no score": (_change("annotations", "score", ..., 1), "without a score"),

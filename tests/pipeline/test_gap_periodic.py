@@ -14,8 +14,8 @@ from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated, twice_a_pixel
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.signatures import _searched, mean_families
-from pipeline.gap.naming.entries import Estimate, from_mean
-from pipeline.gap.naming.families import families_of
+from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.named_effects import Estimate, effect_from_estimate
 from pipeline.gap.residuals.disparity_raster import cell_px, spacing
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.registration import residuals_of
@@ -85,7 +85,7 @@ def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least:
     _, estimate = best(found, [])
     assert estimate.candidate.form == FOLDED
     assert estimate.candidate.columns.shape[1] == (10 if period == PERIOD else 22)
-    entry = from_mean(estimate, found).entry
+    entry = effect_from_estimate(estimate, found).entry
     assert entry["along"]["period"] == pytest.approx(period, rel=0.01)
     effect = DisparityEmpirical.model_validate(entry)
     curve = interpolate_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
@@ -106,7 +106,7 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
     found = residuals(error)
     _, estimate = best(found, [*repeated("image_x", column, STRIDE)])
     assert estimate.candidate.form == f"{REPEATED} {lines}"
-    entry = from_mean(estimate, found).entry
+    entry = effect_from_estimate(estimate, found).entry
     assert entry["along"]["period"] == lines * STRIDE
     effect = DisparityEmpirical.model_validate(entry)
     curve = interpolate_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
@@ -122,7 +122,7 @@ def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: flo
     error = 0.1 * np.sin(4 * np.pi * scale * disparity + 0.7)
     found = replace(residuals(error), covariates={"image_x": PIXELS[:, 0], "image_y": PIXELS[:, 1], "disparity": disparity})
     _, estimate = best(found, [*free_forms("disparity", disparity), *twice_a_pixel("disparity", disparity)])
-    entry = from_mean(estimate, found).entry
+    entry = effect_from_estimate(estimate, found).entry
     assert entry["covariate"] == "disparity"
     assert entry["along"]["period"] == pytest.approx(0.5 / scale, rel=1e-3)
     effect = DisparityEmpirical.model_validate(entry)
@@ -137,7 +137,7 @@ def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_p
     make(Case(0, (3, 1), "none", "stereo", (), points, 6_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")
     found = residuals_of(measurement)
-    waves = [each for each in families_of(measurement, found) if isinstance(each, SineGrid) and each.name == "image_x"]
+    waves = [each for each in candidate_families(measurement, found) if isinstance(each, SineGrid) and each.name == "image_x"]
     shortest = float(found.covariates["image_x"].std()) / max(float(each.frequencies[-1]) for each in waves)
     reach, step = float(np.ptp(found.covariates["image_x"])), spacing(found.covariates["image_x"])
     assert step is not None

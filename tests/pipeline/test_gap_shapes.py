@@ -16,14 +16,14 @@ from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_judge.cases import build, schedule
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
-from pipeline.gap.naming import naming as steps
-from pipeline.gap.naming.entries import with_effects
-from pipeline.gap.naming.families import families_of
-from pipeline.gap.other.mixed_pixels import find_footprint
-from pipeline.gap.other.shapes import WallBlocks
-from pipeline.gap.other.spread import find_spread
-from pipeline.gap.other.stereo_noise import find_nodes, told_apart
-from pipeline.gap.other.stereo_shapes import find_shapes
+from pipeline.gap.naming import effect_selection as steps
+from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.named_effects import with_effects
+from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
+from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
+from pipeline.gap.noise_and_edges.edge_effects import WallBlocks
+from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
+from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
 from pipeline.gap.residuals import disparity_raster, stereo_residuals
 from pipeline.gap.residuals.cells import Cells
 from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing
@@ -54,7 +54,8 @@ def shapes_of(case: Made) -> dict[str, Any]:
     """The effects on the shape of disparities, by name."""
     there, residuals, _ = case
     return {
-        each.name: each for each in find_shapes(there, residuals, registered(residuals)[0], np.zeros(len(residuals), dtype=bool))
+        each.name: each
+        for each in find_disparity_edge_effects(there, residuals, registered(residuals)[0], np.zeros(len(residuals), dtype=bool))
     }
 
 
@@ -241,7 +242,7 @@ def test_a_wall_without_effects_shows_no_shape(tmp_path: Path, seed: int) -> Non
 
 def test_points_that_are_held_out_have_no_say(tmp_path: Path) -> None:
     there, residuals, _ = made(tmp_path, "stereo", ("smoothing",), 1)
-    assert not find_shapes(there, residuals, registered(residuals)[0], np.ones(len(residuals), dtype=bool))
+    assert not find_disparity_edge_effects(there, residuals, registered(residuals)[0], np.ones(len(residuals), dtype=bool))
 
 
 @pytest.mark.parametrize("seed", [2, 3])
@@ -299,9 +300,9 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
     assert step is not None
     part = residuals.part(residuals.smooth & (np.rint((row - row.min()) / step) % every == 0))
     value = registered(part)[0]
-    spread, _, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
-    (found,) = told_apart(spread, part, value, there.model)
+    (found,) = separate_white_and_grid_noise(spread, part, value, there.model)
     assert found.name == kind
     # of 64 px nodes there are some 80 on the wall: their own standard deviation varies by 8 %
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
@@ -313,10 +314,10 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
     there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
     part = residuals.part(residuals.smooth)
     value = registered(part)[0]
-    spread, _, _ = find_spread(part, Cells.over(part.at), value, KeyedRandom(1))
+    spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     described = [replace(each, name="spread by disparity", empirical=True) for each in spread]
-    (found,) = told_apart(described, part, value, there.model)
+    (found,) = separate_white_and_grid_noise(described, part, value, there.model)
     assert found.empirical == empirical
     assert found.name == ("spread by disparity" if empirical else kind)
 
@@ -326,7 +327,7 @@ def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_shoul
     there, residuals, truth = made(tmp_path, "stereo", ("regularization_noise",), 8)
     part = residuals.part(residuals.smooth)
     assert isinstance(there.model, StereoModel)
-    found, _ = find_nodes(part, registered(part)[0], there.model, KeyedRandom(1))
+    found, _ = find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))
     assert found is not None
     assert found.parameters["step_px"] == pytest.approx(truth["step_px"], rel=0.5)
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
@@ -334,7 +335,7 @@ def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_shoul
 
 
 def _few_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    return [each for each in families_of(measurement, part) if isinstance(each, Candidate)][:3]
+    return [each for each in candidate_families(measurement, part) if isinstance(each, Candidate)][:3]
 
 
 def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -348,9 +349,11 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
     nodes = 0.4 * np.random.default_rng(5).standard_normal([len(line) for line in lines])
     part = replace(part, value=part.value + RectBivariateSpline(*lines, nodes, kx=1, ky=1)(x, y, grid=False))
     monkeypatch.setattr(
-        steps, "families_of", lambda *known: [each for each in families_of(*known) if isinstance(each, Candidate)][:3]
+        steps,
+        "candidate_families",
+        lambda *known: [each for each in candidate_families(*known) if isinstance(each, Candidate)][:3],
     )
-    named, naming = steps.name_effects(there, part, registered(part)[2], KeyedRandom(1))
+    named, naming = steps.select_effects(there, part, registered(part)[2], KeyedRandom(1))
     assert [item.name for item in named] == ["stereo.regularization_noise"]
     assert naming.p_value is not None
     assert naming.p_value > 0.01
@@ -364,7 +367,7 @@ def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, se
     there, residuals, _ = made(tmp_path, "stereo", (), seed)
     part = residuals.part(residuals.smooth)
     assert isinstance(there.model, StereoModel)
-    assert find_nodes(part, registered(part)[0], there.model, KeyedRandom(1))[0] is None
+    assert find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))[0] is None
 
 
 @pytest.mark.parametrize(("off_m", "length_m", "found"), [(0.012, 0.8, False), (0.015, 0.3, True), (0.0, 0.3, False)])
@@ -380,6 +383,6 @@ def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_ma
     field = np.sqrt(2 / 400) * np.cos(part.at @ k.T + phase).sum(axis=1)
     part = replace(part, value=part.value + off_m * field / part.unit_m)
     assert isinstance(there.model, StereoModel)
-    nodes, words = find_nodes(part, registered(part)[0], there.model, KeyedRandom(1))
+    nodes, words = find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))
     assert (nodes is not None) == found
     assert ("taken for its error" in words) == (off_m > 0 and not found)

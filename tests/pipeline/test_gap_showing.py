@@ -11,9 +11,9 @@ import pytest
 from gap_cases import Array, Scan, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verification import Showing
-from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.validation import Validation
 from pipeline.gap.residuals.cells import Cells, held_out_blocks
 from pipeline.gap.residuals.registration import settled
 from scene.common.keyed_random import KeyedRandom
@@ -24,12 +24,12 @@ def _biased(coefficient_m: float) -> Callable[[Scan], Array]:
     return lambda scan: scan.R + coefficient_m * (1 / scan.cos_i - 1)
 
 
-def _showing(folder: Path, ranges: Callable[[Scan], Array]) -> Showing:
+def _showing(folder: Path, ranges: Callable[[Scan], Array]) -> Validation:
     """What a gap is measured with, of a scan with some ranges."""
     write_scan(folder, 8, ranges=ranges, step_rad=0.007)
     there, residuals, _ = settled(read_measurement(folder))
     held_out = held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
-    return Showing(
+    return Validation(
         measurement=there,
         residuals=residuals,
         chosen=np.flatnonzero(residuals.smooth & ~held_out),
@@ -42,8 +42,8 @@ def _showing(folder: Path, ranges: Callable[[Scan], Array]) -> Showing:
     )
 
 
-def _named(name: str, key: str, value: float) -> Named:
-    return Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
+def _named(name: str, key: str, value: float) -> NamedEffect:
+    return NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
 
 
 def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> None:
@@ -93,11 +93,11 @@ def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.Mon
     showing = _showing(tmp_path, _biased(0.003))
     with_it, alone = {True: (0.009, 0.011), False: (0.007, 0.003)}, {True: (0.001, 0.001), False: (0.001, 0.001)}
 
-    def scored(self: Showing, named: list[Named], versions: object, rows: np.ndarray) -> Gap:
+    def scored(self: Validation, named: list[NamedEffect], versions: object, rows: np.ndarray) -> Gap:
         before, after = (with_it if named else alone)[rows is showing.tested]
         return Gap(before, after, floor=0.0006, error=0.0075, floor_error=0.0075, points=100)
 
-    monkeypatch.setattr(Showing, "_gap", scored)
+    monkeypatch.setattr(Validation, "_gap", scored)
     effect = _named("range_incidence_bias", "coefficient_m", 0.003)
     shown, words = showing.show([effect])
     assert shown.named == [effect]
@@ -116,7 +116,7 @@ def test_a_few_points_far_off_do_not_stand_for_the_wall(tmp_path: Path) -> None:
     showing = _showing(tmp_path, moved)
     along = {"low": middle - half, "high": middle + half}
     strip = {"name": "range_empirical", "covariate": "azimuth", "along": along, "values_m": [[0.0, *[0.3] * 30, 0.0]]}
-    described = Named("tls.range_empirical", "empirical", strip, {}, (), 0.001, 10.0)
+    described = NamedEffect("tls.range_empirical", "empirical", strip, {}, (), 0.001, 10.0)
     shown, _ = showing.show([_named("range_incidence_bias", "coefficient_m", 0.01), described])
     assert shown.gap is not None
     assert shown.gap.after < shown.gap.before < 0.012

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from pipeline.gap.decisions import Decisions
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, verdict_of
-from pipeline.gap.naming.verify import Gap
-from pipeline.gap.report.in_words import paragraph, title
-from pipeline.gap.report.report import summary
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.verdict import Evidence, note_excess_noise, note_moved_wall, reduced_noise, verdict_of
+from pipeline.gap.report.report import summarise
+from pipeline.gap.report.wording import paragraph, title
+from pipeline.gap.thresholds import Thresholds
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 ERROR = 0.0001
@@ -36,8 +36,8 @@ ROWS = [
 ]
 
 
-def _effect(name: str, kind: str = "physical", alike: tuple[str, ...] = ()) -> Named:
-    return Named(name, kind, {"name": name.partition(".")[2], "sigma_m": 0.01}, {}, alike, 0.002, 20.0)
+def _effect(name: str, kind: str = "physical", alike: tuple[str, ...] = ()) -> NamedEffect:
+    return NamedEffect(name, kind, {"name": name.partition(".")[2], "sigma_m": 0.01}, {}, alike, 0.002, 20.0)
 
 
 NAMED = [
@@ -50,7 +50,7 @@ NAMED = [
 ]
 
 
-DECISIONS = Decisions()
+THRESHOLDS = Thresholds()
 
 
 class _Residuals(list[int]):
@@ -61,10 +61,10 @@ class _Residuals(list[int]):
 class _Found:
     """What the words of a diagnosis are made of."""
 
-    effects: tuple[Named, ...]
+    effects: tuple[NamedEffect, ...]
     evidence: Evidence
     changes: tuple[Any, ...] = ()
-    decisions: Decisions = DECISIONS
+    thresholds: Thresholds = THRESHOLDS
     residuals: _Residuals = field(default_factory=lambda: _Residuals(range(1000)))
 
     @property
@@ -77,8 +77,8 @@ class _Found:
 
     @property
     def remaining(self) -> dict[str, Any]:
-        lower = lower_noise(TlsModel(), self.evidence.spread)
-        note = "; ".join(too_noisy(self.evidence.spread, lower))
+        lower = reduced_noise(TlsModel(), self.evidence.spread)
+        note = "; ".join(note_excess_noise(self.evidence.spread, lower))
         return {"p_value": self.evidence.p_value, "note": note, "lower_noise": lower}
 
     @property
@@ -95,7 +95,7 @@ def _every() -> Iterator[tuple[Any, Evidence, str]]:
             continue
         found: Any = _Found(named, Evidence(gap, p_value, spread, far, wide=wide))
         for row in ROWS:
-            yield found, found.evidence, f"{title(found)}. {paragraph(found, [row])} {summary(found)}"
+            yield found, found.evidence, f"{title(found)}. {paragraph(found, [row])} {summarise(found)}"
 
 
 def test_no_gap_needs_a_gap_at_the_floor_and_a_p_value_that_does_not_reject() -> None:
@@ -185,14 +185,14 @@ def test_too_much_noise_is_said_with_less_that_would_do() -> None:
 def test_a_wall_much_of_which_moved_says_nothing_of_the_sensor(gap: Gap | None, p_value: float | None) -> None:
     """Nothing is named then; 30 % of the wall are much."""
     found: Any = _Found((), Evidence(gap, p_value, moved=0.41))
-    said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summary(found)} {'; '.join(much_moved(found.evidence, False))}"
+    said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summarise(found)} {'; '.join(note_moved_wall(found.evidence, False))}"
     assert found.verdict == "insufficient_data"
     assert "41 % of the points lie off the reference together with their neighbours" in said
     assert "name stable_areas" in said
     assert "too few" not in said.lower()
     assert verdict_of((), Evidence(gap, p_value, moved=0.29)) == verdict_of((), Evidence(gap, p_value))
-    assert much_moved(Evidence(gap, p_value, moved=0.29), False) == []
-    assert "are not stable" in much_moved(found.evidence, True)[0]
+    assert note_moved_wall(Evidence(gap, p_value, moved=0.29), False) == []
+    assert "are not stable" in note_moved_wall(found.evidence, True)[0]
 
 
 def test_nothing_found_and_nothing_measured_is_no_answer() -> None:
@@ -209,8 +209,8 @@ def test_nothing_found_and_nothing_measured_is_no_answer() -> None:
     ],
 )
 def test_all_noise_is_lowered_alike(model: TlsModel | StereoModel, expected: dict[str, float]) -> None:
-    assert lower_noise(model, 0.5) == pytest.approx(expected)
-    assert lower_noise(model, 1.0) == {}
+    assert reduced_noise(model, 0.5) == pytest.approx(expected)
+    assert reduced_noise(model, 1.0) == {}
 
 
 @pytest.mark.parametrize(("error", "open_still"), [(0.0001, True), (0.004, False)])

@@ -108,7 +108,7 @@ def read_coco(path: Path, *, masks: bool = True) -> Coco:
         if not isinstance(content.get(name), list):
             raise _no_coco(path, f"'{name}' is {'not a list' if name in content else 'missing'}")
     if not content["images"]:
-        raise InputError("names no image", where=str(path), remedy="use the annotations of these maps")
+        raise InputError("its list 'images' is empty", where=str(path), remedy="give the annotations of the maps that are meant")
     images = [entry for entry, _ in _parsed(_Image, content["images"], "image", path)]
     for image in images:
         _check_pixels(image, path)

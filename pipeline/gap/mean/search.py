@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import FOLDED, OVERTONES, PLACE, REPEATED, Candidate, Explanation, SineGrid, harmonics
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanFit
 from pipeline.gap.mean.null_gains import NullGains
 from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
@@ -63,7 +63,7 @@ class MeanSearch:
             best = int(np.argmax(gains))
             candidate = families.plain[rows[best]] if best < len(rows) else families.sine(sines[best - len(rows)])
             gain = float(gains[best])
-            slight = gain < decided().mean.practical_share * alone.get((candidate.name, candidate.empirical), 0.0)
+            slight = gain < thresholds().mean.least_relative_gain * alone.get((candidate.name, candidate.empirical), 0.0)
             found.append(Tried(candidate.name, candidate.empirical, gain - self._null.penalty(name), gain, candidate, slight))
         return tuple(sorted(found, key=lambda item: -item.score))
 
@@ -121,7 +121,7 @@ class MeanSearch:
         covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
         parts = form.name.split(" and ")
         alike = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
-        return {name for name, row in zip(covariates, alike, strict=False) if row.max() > decided().mean.kin}
+        return {name for name, row in zip(covariates, alike, strict=False) if row.max() > thresholds().mean.same_covariate}
 
     def folded(self, members: Members, form: Tried) -> Tried:
         """What is periodic in its plainest form beside some effects.
@@ -137,7 +137,7 @@ class MeanSearch:
 
     def _of_fewest_lines(self, members: Members, form: Tried) -> Tried:
         alike = [each for each in self.tried(members) if each.candidate.form.startswith(REPEATED) and each.name == form.name]
-        good = [each for each in alike if each.score > form.score - decided().mean.free_margin]
+        good = [each for each in alike if each.score > form.score - thresholds().mean.nonparametric_margin]
         return min(good, key=lambda each: each.candidate.period)
 
     def _as_wave(self, members: Members, form: Tried) -> Tried:
@@ -166,7 +166,7 @@ class MeanSearch:
             return replace(form, candidate=both, gain=form.gain + gain, score=form.score + score)
 
         best = max(map(with_overtones, OVERTONES), key=lambda each: each.score)
-        return best if best.score >= form.score + decided().mean.free_margin else form
+        return best if best.score >= form.score + thresholds().mean.nonparametric_margin else form
 
     def may_be_the_reference(self, members: Members, form: Tried) -> bool:
         """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave.
@@ -176,9 +176,9 @@ class MeanSearch:
         if form.candidate.form != "wave":
             return False
         size, fit = self._said(form, members)
-        most = decided().nodes.reference_error / float(np.median(self.design.residuals.unit_m))
+        most = thresholds().grid_noise.reference_error / float(np.median(self.design.residuals.unit_m))
         error = min(float(np.sqrt(fit.at.ratio)) * self.design.model.typical_sigma, most)
-        return size < decided().mean.wave_sigmas * error
+        return size < thresholds().mean.least_wave_sigmas * error
 
     def size(self, item: Tried) -> float:
         """Standard deviation of what an explanation by itself says, in the observable's unit."""
@@ -197,7 +197,7 @@ class MeanSearch:
         gains = fixed[:, 0] - plain[0]
         found = [(gain, each) for gain, each in zip(gains, self.design.families.plain, strict=True) if not each.empirical]
         ranked = sorted(found, key=lambda item: -item[0])
-        least = max(decided().mean.leading_share * ranked[0][0], decided().mean.leading_gain) if ranked else 0.0
+        least = max(thresholds().mean.refit_share * ranked[0][0], thresholds().mean.refit_gain) if ranked else 0.0
         return [each for gain, each in ranked if gain >= least][:_MOST_LEADING]
 
     def alone(self, candidate: Candidate) -> Chosen:

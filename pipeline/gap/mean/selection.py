@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import PLACE, SURFACE, Candidate
+from pipeline.gap.thresholds import thresholds
 from sensors.effects.range_offset import RangeOffset
 
 _WIDTH = 5
@@ -81,15 +81,15 @@ class _Set:
         free = [item for item in self.tried if item.empirical and not (item.slight or item.name.startswith(PLACE))]
         found = [item for item in free if _stands_out(item, decoy)]
         plain = next((item for item in found if item.candidate.form != SURFACE), None)
-        by = decided().mean
-        if plain is None or found[0].score > max(plain.score + by.free_margin, by.surface_ratio * plain.score):
+        by = thresholds().mean
+        if plain is None or found[0].score > max(plain.score + by.nonparametric_margin, by.surface_ratio * plain.score):
             return found[0] if found else None
         return plain
 
 
 def class_margin(gain: float) -> float:
     """Within which of a score, of so large a gain, others belong to its class: signatures are exact to a share of the gain."""
-    return max(decided().mean.class_margin, decided().mean.class_share * gain)
+    return max(thresholds().mean.class_margin, thresholds().mean.class_share * gain)
 
 
 def _in_its_place(names: frozenset[str], name: str, margin: float, scores: Scores) -> list[str]:
@@ -101,15 +101,15 @@ def _in_its_place(names: frozenset[str], name: str, margin: float, scores: Score
 
 def _weak(form: Tried | None) -> float:
     """Score of a free form that is too weak to be said, and that a weak effect of the catalogue has to do better than; else 0."""
-    return form.score if form is not None and form.score < decided().mean.least_free_score else 0.0
+    return form.score if form is not None and form.score < thresholds().mean.least_nonparametric_score else 0.0
 
 
 def _stands_out(item: Tried, decoy: float) -> bool:
     """Whether a free form does better than mere places, of which the best scores `decoy`."""
-    by = decided().mean
+    by = thresholds().mean
     if item.candidate.form == SURFACE:
-        return item.score > max(decoy + by.free_margin, by.least_surface_score)
-    least = (by.wave_ratio if item.candidate.form == "wave" else 1.0) * decoy + by.free_margin
+        return item.score > max(decoy + by.nonparametric_margin, by.least_surface_score)
+    least = (by.null_wave_ratio if item.candidate.form == "wave" else 1.0) * decoy + by.nonparametric_margin
     return item.name in _NOT_PLACES or item.score > least
 
 
@@ -145,7 +145,7 @@ class Choice:
         """Explanations, and what was tried beside all of them."""
         empty = _Set((), 0.0, self.search.tried(()))
         levels, scores = [[empty]], Scores()
-        while len(levels) <= decided().mean.most_effects:
+        while len(levels) <= thresholds().mean.most_effects:
             grown, of_sets = self._grown(levels[-1])
             if not grown or not self._significant(grown[0].score - levels[-1][0].score):
                 break
@@ -159,7 +159,7 @@ class Choice:
             chosen.append(Chosen(form.candidate, (), self.search.p_value(form.score), form.gain, form.score, empty.tried))
             return chosen, self.search.tried((*members, form))
         best, chosen = self._beyond_places(best, scores)
-        nearly = (1 - decided().mean.practical_share) * empty.decoy
+        nearly = (1 - thresholds().mean.least_relative_gain) * empty.decoy
         if best.score <= max(nearly, _weak(empty.free)):  # no effect of the catalogue says it as well
             return [], empty.tried
         return chosen, best.tried
@@ -188,7 +188,11 @@ class Choice:
     def _free(self, levels: list[list[_Set]]) -> tuple[Members, Tried] | None:
         """A free form that the data ask for beside or in place of effects of the catalogue, and the effects it stands beside."""
         best, empty = levels[-1][0], levels[0][0]
-        if best.free is not None and best.free.score >= decided().mean.least_free_score and self._significant(best.free.score):
+        if (
+            best.free is not None
+            and best.free.score >= thresholds().mean.least_nonparametric_score
+            and self._significant(best.free.score)
+        ):
             found: tuple[_Set, Tried] | None = None
             for state in (level[0] for level in levels):
                 form = state.free
@@ -202,7 +206,11 @@ class Choice:
         if not best.members or alone is None:
             return None
         score = max(best.score, self.search.score(best.members))
-        margin = max(decided().mean.free_margin, decided().mean.practical_share * score) if len(best.members) < 2 else 0.0
+        margin = (
+            max(thresholds().mean.nonparametric_margin, thresholds().mean.least_relative_gain * score)
+            if len(best.members) < 2
+            else 0.0
+        )
         if alone.score > score + margin:
             return (), alone
         return None
@@ -235,4 +243,4 @@ class Choice:
         return Chosen(item.candidate, tuple(dict.fromkeys(alike)), p_value, mine.gain, mine.score, tried)
 
     def _significant(self, score: float) -> bool:
-        return score >= decided().mean.least_score and self.search.p_value(score) <= decided().mean.significance
+        return score >= thresholds().mean.least_score and self.search.p_value(score) <= thresholds().mean.significance

@@ -32,10 +32,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtri
 
 from pipeline.change.robust import nmad
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sight import NEIGHBOURS, Sight
 from pipeline.gap.residuals.standardized import medians, spread, standardized
+from pipeline.gap.thresholds import thresholds
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
@@ -105,10 +105,10 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
         shared = np.sqrt(np.maximum(scatter**2 - _BY_WHITE**2, 0.0))
         error = np.stack([np.abs(departure / np.where(z == 0, np.inf, z)), shared * residuals.sigma]) * residuals.unit_m
         faint = around / np.maximum(scatter, _LEAST_AROUND)
-        faint[np.abs(around) * residuals.sigma * residuals.unit_m < decided().changes.smallest] = 0.0
+        faint[np.abs(around) * residuals.sigma * residuals.unit_m < thresholds().changes.smallest_departure] = 0.0
         label, limit = _components(z, faint, sight, eligible)
         members = np.flatnonzero(label >= 0)
-        beside = sight.beside(members, decided().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
+        beside = sight.beside(members, thresholds().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
         if not (beside & ~before).any():
             break
     limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
@@ -135,8 +135,8 @@ def moved_share(residuals: Residuals, sight: Sight, eligible: BoolArray) -> floa
         return 0.0
     part = residuals.part(known)
     around = sight.part(known).median_around(part.value / part.sigma)
-    far = np.abs(around) * part.sigma * part.unit_m > decided().changes.smallest
-    return float(np.mean(far & (np.abs(around) > decided().changes.moved_sigmas)))
+    far = np.abs(around) * part.sigma * part.unit_m > thresholds().changes.smallest_departure
+    return float(np.mean(far & (np.abs(around) > thresholds().changes.moved_sigmas)))
 
 
 def _components(z: FloatArray, faint: FloatArray, sight: Sight, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
@@ -144,12 +144,12 @@ def _components(z: FloatArray, faint: FloatArray, sight: Sight, eligible: BoolAr
 
     z: (n,) departures in sigmas; faint: (n,) the same of medians of neighbours.
     """
-    spread_out = np.abs(faint) > decided().changes.faint
+    spread_out = np.abs(faint) > thresholds().changes.faint_sigmas
     side = np.where(spread_out, np.sign(faint), np.sign(z)) * (spread_out | (np.abs(z) > _LEVELS[0]))
     first, second = sight.around(np.flatnonzero(side))
     together = side[first] * side[second] > 0
     pairs, size = (first[together], second[together]), np.abs(z)
-    least = max(decided().changes.middle_sigmas, _correlated_sigmas(z, sight, eligible))
+    least = max(thresholds().changes.median_sigmas, _correlated_sigmas(z, sight, eligible))
     core = _faint(faint, spread_out, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
@@ -168,7 +168,7 @@ def _faint(faint: FloatArray, spread_out: BoolArray, pairs: Pairs, eligible: Boo
     inside = label >= 0
     highest = np.zeros(int(label.max(initial=-1)) + 1)
     np.maximum.at(highest, label[inside], np.where(eligible, np.abs(faint), 0.0)[inside])
-    return np.isin(label, np.flatnonzero(highest > -ndtri(decided().changes.by_chance / (2 * eligible.sum())))) & inside
+    return np.isin(label, np.flatnonzero(highest > -ndtri(thresholds().changes.false_changes / (2 * eligible.sum())))) & inside
 
 
 def _agreeing(pairs: Pairs, size: FloatArray, ratio: float) -> Pairs:
@@ -196,8 +196,8 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
     for _ in range(len(count)):
         stray = np.sort(z[inside][~accepted[label[inside]]])
         by_chance = _log_expected(count, int(eligible.sum()), len(stray), _agreeing_share(stray, ratio))
-        rare = by_chance < np.log(decided().changes.by_chance / _LOOKS)
-        again = (count >= decided().changes.fewest) & (middle > least) & rare
+        rare = by_chance < np.log(thresholds().changes.false_changes / _LOOKS)
+        again = (count >= thresholds().changes.fewest) & (middle > least) & rare
         if np.array_equal(again, accepted):
             break
         accepted = again
@@ -234,7 +234,7 @@ def _correlated_sigmas(z: FloatArray, sight: Sight, eligible: BoolArray) -> floa
     chosen = counts >= NEIGHBOURS // 2
     if not chosen.any():
         return 0.0
-    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(decided().changes.by_chance / (2 * len(known))))
+    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(thresholds().changes.false_changes / (2 * len(known))))
 
 
 def _grown(core: BoolArray, size: FloatArray, pairs: Pairs, eligible: BoolArray) -> BoolArray:
@@ -276,8 +276,8 @@ def _compact(label: NDArray[np.int64], sight: Sight, points: int) -> NDArray[np.
     place = sight.even_plane[order]
     length = (np.maximum.reduceat(place, starts) - np.minimum.reduceat(place, starts)).max(axis=1)
     size = np.diff(np.append(starts, len(order))) / len(np.unique(sight.epoch))
-    stripe = (length >= decided().changes.stripe) & (size <= 0.1 * length**2)
-    compact = (size * len(np.unique(sight.epoch)) < decided().changes.largest_share * points) & ~stripe
+    stripe = (length >= thresholds().changes.stripe_length) & (size <= 0.1 * length**2)
+    compact = (size * len(np.unique(sight.epoch)) < thresholds().changes.largest_share * points) & ~stripe
     return np.where(np.isin(label, label[order][starts][compact]), label, -1)
 
 

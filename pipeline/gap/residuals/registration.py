@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
 from pipeline.gap.residuals.several_scans import scans_residuals
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
+from pipeline.gap.thresholds import thresholds
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
@@ -40,7 +40,7 @@ def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
         value = residuals.value - residuals.pose @ pose
         z = np.abs(value / residuals.sigma)
         scale = max(1.0, nmad(z[residuals.smooth], 0.0))
-        kept = residuals.smooth & (z < decided().points.unregistered * scale)
+        kept = residuals.smooth & (z < thresholds().points.registration_outlier_sigmas * scale)
         if kept.sum() < _FEWEST:
             kept = residuals.smooth
         if np.array_equal(kept, before):  # the next rounds would be the same

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.tls_residuals import pulse_of, pulses_of, recorded
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -20,7 +20,7 @@ def thinned(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement,
 
     Scan lines and times have to be known already (`with_order`): a part of the points does not tell them.
     """
-    count, most = len(measurement.cloud.points), decided().points.most
+    count, most = len(measurement.cloud.points), thresholds().points.most
     if isinstance(measurement, StereoMeasurement) or count <= most:
         return measurement, np.arange(count)
     share, generator, pulses = most / count, random.generator(), None

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.decisions import decided
-from pipeline.gap.other.spread import spread_candidates
+from pipeline.gap.noise_and_edges.variance_model import variance_candidates
 from pipeline.gap.survey.planned import Survey, TlsView, View
 from pipeline.gap.survey.survey_design import SIGNAL_TO_NOISE, signatures
+from pipeline.gap.thresholds import thresholds
 from sensors.effects import catalogue
 from sensors.effects.base import Effect
 from sensors.effects.detection_limit import DetectionLimit
@@ -65,9 +65,9 @@ def _mean_names(view: View) -> set[str]:
 def _spread(view: View) -> list[OtherEffect]:
     """sigma_i^2 = model + theta f_i: the information on theta is sum (f_i / sigma_i^2)^2 / 2."""
     residuals = view.residuals
-    candidates = spread_candidates(residuals)
+    candidates = variance_candidates(residuals)
     found: dict[str, OtherEffect] = {}
-    excess = decided().spread.least_excess
+    excess = thresholds().variance.least_excess
     for candidate in candidates:
         form = candidate.variance.sum(axis=1) / residuals.sigma**2
         information = 0.5 * float(np.sum(form**2)) * view.whole / len(residuals)

@@ -1,10 +1,12 @@
-"""The gap before and after, on blocks that no step has used, by simulating again through the sensor's own code.
+"""Measure the gap before and after on validation blocks, by simulating again through the sensor's own code.
 
-Measure: the continuous ranked probability score of measured patches of the wall against an ensemble of simulated ones, in metres;
-a proper score, which neither a wrong mean nor an inflated spread can lower (Gneiting & Raftery 2007, eq. 21, fair ensemble form).
-A patch is scored twice, by the mean and by the standard deviation of its residuals: in single points either drowns in noise.
-Measured and simulated residuals are cut off alike, far out, so that a few points at depth steps do not stand for the wall.
-Floor: the same score of draws of the model itself; no higher than the score after, below which one draw may chance to fall.
+Measure: the continuous ranked probability score (CRPS) of measured patches of the wall against an ensemble of simulated ones, in
+metres. The score is proper: neither a wrong mean nor an inflated noise can lower it (Gneiting & Raftery 2007, eq. 21, fair
+ensemble form). A patch is scored twice, by the mean and by the standard deviation of its residuals, because in single points the
+noise hides both. Measured and simulated residuals are clipped at the same values, so that a few points at depth steps do not
+dominate.
+
+Floor: the same score of draws of the model itself. It is limited to the score after, because one draw may fall below.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_simulation import simulate_disparities
 from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals
@@ -26,13 +27,15 @@ from pipeline.gap.residuals.several_scans import simulate_departures
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, simulated_distances
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 MEASURE = "mean continuous ranked probability score of patches (mean and spread of their residuals) against simulated ones"
 LOSS_MEASURE = "mean Brier score of pulses (lost or not) against the chance of losing them"
-_DRAWS = 8
+_ENSEMBLE_SIZE = 8
+"""Simulations of an ensemble, most points that are simulated, points of a patch, and fewest points of a patch that is scored."""
 _MOST_POINTS = 30_000
 _POINTS_PER_PATCH = 30.0
 _FEWEST_POINTS = 8
@@ -40,7 +43,17 @@ _FEWEST_POINTS = 8
 
 @dataclass(frozen=True)
 class Gap:
-    """Scores on held-out points, in `unit`. error: standard error of before - after; floor_error: of before - floor."""
+    """Scores on validation points, in `unit`.
+
+    Attributes
+    ----------
+    before, after, floor : mean score of the old model, of the new model, and of draws of the new model.
+    error : standard error of before - after.
+    floor_error : standard error of before - floor.
+    points : number of points that were scored.
+    measure : what the score is, in words.
+    unit : m, or 1 for the Brier score of missing returns.
+    """
 
     before: float
     after: float
@@ -57,8 +70,8 @@ class Gap:
         return {"before": self.before, "after": self.after, "floor": self.floor}
 
     @property
-    def shown(self) -> tuple[float, str]:
-        """By what a score is multiplied where people read it, and the unit that it then has."""
+    def display_unit(self) -> tuple[float, str]:
+        """The factor by which reports multiply a score, and the unit of the product."""
         return (1e3, "mm") if self.unit == "m" else (1.0, "Brier")
 
     @property
@@ -68,21 +81,21 @@ class Gap:
 
     @property
     def above_floor(self) -> bool:
-        """Whether before lies above the floor by more than the uncertainty of that."""
-        return self.before - self.floor > decided().verdict.floor_sigmas * self.floor_error
+        """Whether the score before exceeds the floor by more than its uncertainty."""
+        return self.before - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property
     def left_open(self) -> bool:
-        """Whether after lies above the floor by more than the uncertainty of that."""
-        return self.after - self.floor > decided().verdict.floor_sigmas * self.floor_error
+        """Whether the score after exceeds the floor by more than its uncertainty."""
+        return self.after - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property
     def uncertain(self) -> bool:
-        """Whether before - floor is within its own uncertainty, and before - after, scored on the same patches, within its."""
-        return not self.above_floor and self.before - self.after <= decided().verdict.gap_sigmas * self.error
+        """Whether both before - floor and before - after are within their uncertainties."""
+        return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
 
     def to_dict(self) -> dict[str, Any]:
-        """As gap.json holds it."""
+        """Return the gap as gap.json holds it."""
         note = "before - floor is within its own uncertainty" if self.uncertain else ""
         return {
             "measure": self.measure,
@@ -99,20 +112,32 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Version:
-    """A model with its registration (6,), by which the sensor stands shifted (m) and turned (rad) against the survey."""
+class RegisteredModel:
+    """A model with the pose (6,) that registers it: shift (m) and rotation (rad) of the sensor against the survey."""
 
     model: TlsModel | StereoModel
     pose: FloatArray
 
 
-def simulated(
+def simulate_errors(
     measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """(d, n) simulated minus geometric observable of the residuals' points, NaN without a return, for each source of random
-    numbers.
+    """Simulate the sensor's errors at the points of some residuals: simulated minus geometric observable.
 
-    measurement: with its sensor where it stood, against which `residuals` may be those of another place.
+    Parameters
+    ----------
+    measurement : measurement with its sensor at the pose to simulate from; `residuals` may be those of another pose.
+    model : model to simulate.
+    residuals : residuals whose points are simulated.
+    randoms : one source of random numbers for each simulation.
+
+    Returns
+    -------
+    FloatArray : (d, n) errors in the observable's unit, NaN without a return.
+
+    Raises
+    ------
+    TypeError : measurement, model and residuals are of different sensors.
     """
     match measurement, model, residuals:
         case TlsMeasurement(), TlsModel(), TlsResiduals():
@@ -126,41 +151,53 @@ def simulated(
 
 def measure_gap(
     measurement: Measurement,
-    before: Version,
-    after: Version,
+    before: RegisteredModel,
+    after: RegisteredModel,
     residuals: Residuals,
     reference_sigma: float,
-    largest: float,
+    most_sigmas: float,
     random: KeyedRandom,
 ) -> Gap | None:
-    """Score two versions of the model on held-out residuals, with common random numbers; None where too few points remain.
+    """Score two models on validation residuals, with common random numbers.
 
-    reference_sigma: standard deviation of the reference's own error in the observable's unit, which is part of every draw;
-    largest: predicted sigmas by which a point may lie off one of the versions; those farther off both are left out.
+    Parameters
+    ----------
+    measurement : aligned measurement.
+    before, after : the models to compare.
+    residuals : residuals of the validation points.
+    reference_sigma : standard deviation of the reference error, in the observable's unit; it is added to every draw.
+    most_sigmas : points farther than this many predicted standard deviations from both models are left out.
+    random : source of random numbers.
+
+    Returns
+    -------
+    Gap or None : the scores; None where too few points remain.
     """
     patch = patches(residuals.at, _POINTS_PER_PATCH)
-    versions = [_draws(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
-    truth, measured = _draws(measurement, after, residuals, random.child("floor")), residuals.observed
+    versions = [_draw_ensemble(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
+    truth, measured = _draw_ensemble(measurement, after, residuals, random.child("floor")), residuals.observed
     usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
-    middles, sigma = [np.median(draws, axis=0) for draws in versions], residuals.sigma
-    off = np.min([np.abs(measured - middle) for middle in middles], axis=0)
-    usable &= off < largest * sigma
+    medians, sigma = [np.median(draws, axis=0) for draws in versions], residuals.sigma
+    off = np.min([np.abs(measured - median) for median in medians], axis=0)
+    usable &= off < most_sigmas * sigma
     if not usable.any():
         return None
-    spread = max(largest, decided().points.outlier * nmad((measured - middles[0])[usable] / sigma[usable], 0.0))
-    low, high = middles[0] - spread * sigma, middles[0] + spread * sigma
+    spread = max(most_sigmas, thresholds().points.outlier_sigmas * nmad((measured - medians[0])[usable] / sigma[usable], 0.0))
+    low, high = medians[0] - spread * sigma, medians[0] + spread * sigma
     measured, truth, *versions = (np.clip(each, low, high) for each in (measured, truth, *versions))
     usable &= np.isin(patch, np.flatnonzero(np.bincount(patch[usable], minlength=patch.max() + 1) >= _FEWEST_POINTS))
     if not usable.any():
         return None
     _, number = np.unique(patch[usable], return_inverse=True)
     unit = np.bincount(number, residuals.unit_m[usable]) / np.bincount(number)
-    errors = reference_sigma * random.child("reference").generator().standard_normal((3, _DRAWS, len(unit)))
-    value = _summaries(measured[None, usable], number)[:, 0]
-    ensembles = [_summaries(drawn[:, usable], number, errors[0]) for drawn in versions]
-    drawn = _summaries(truth[:, usable], number, errors[1])
-    old, new = (np.sum([_scores(e, v) for e, v in zip(found, value, strict=True)], axis=0) * unit for found in ensembles)
-    floors = [np.sum([_scores(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_DRAWS)]
+    errors = reference_sigma * random.child("reference").generator().standard_normal((3, _ENSEMBLE_SIZE, len(unit)))
+    value = _patch_statistics(measured[None, usable], number)[:, 0]
+    ensembles = [_patch_statistics(drawn[:, usable], number, errors[0]) for drawn in versions]
+    drawn = _patch_statistics(truth[:, usable], number, errors[1])
+    old, new = (np.sum([_crps(e, v) for e, v in zip(found, value, strict=True)], axis=0) * unit for found in ensembles)
+    floors = [
+        np.sum([_crps(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_ENSEMBLE_SIZE)
+    ]
     floor, count = np.mean(floors, axis=0) * unit, len(unit)
     floor = floor + min(float(new.mean() - floor.mean()), 0.0)
     return Gap(
@@ -174,9 +211,10 @@ def measure_gap(
 
 
 def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) -> Gap | None:
-    """Score a chance (m,) of losing pulses on held-out ones; before, it is the share of losses of all others.
+    """Score the predicted probability (m,) of losing pulses on validation pulses; before, it is the share lost of all others.
 
-    Floor: the score that pulses lost with that very chance have on average.
+    The floor is the expected score if pulses are lost with exactly that probability. held_out: (m,) validation pulses. Returns
+    None for fewer than 100 of these.
     """
     if held_out.sum() < 100:
         return None
@@ -199,24 +237,26 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
     )
 
 
-def _draws(measurement: Measurement, version: Version, residuals: Residuals, random: KeyedRandom) -> FloatArray:
-    stood = measurement.moved(version.pose)
-    draws = simulated(stood, version.model, residuals, [random.child(number) for number in range(_DRAWS)])
+def _draw_ensemble(measurement: Measurement, version: RegisteredModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+    """(d, n) simulated errors of one model at its pose, including errors of the reference."""
+    registered = measurement.moved(version.pose)
+    draws = simulate_errors(registered, version.model, residuals, [random.child(number) for number in range(_ENSEMBLE_SIZE)])
     if isinstance(residuals, TlsResiduals):
-        return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_DRAWS)])
-    # a cloud without cameras has no place from which to simulate it: its datum counts by its slopes
+        return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_ENSEMBLE_SIZE)])
+    # a cloud without cameras cannot be simulated at another pose: its datum enters by the Jacobian
     return draws + residuals.pose @ version.pose if isinstance(residuals, SurfaceResiduals) else draws
 
 
-def _summaries(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
-    """(2, d, p) mean, with an error (d, p) of the reference, and standard deviation of each of p patches in draws (d, n)."""
+def _patch_statistics(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
+    """(2, d, p) mean and standard deviation of each of p patches in draws (d, n). error: (d, p) error of the reference of each
+    patch."""
     count = np.bincount(patch)
     mean = np.stack([np.bincount(patch, row) for row in draws]) / count
     square = np.stack([np.bincount(patch, (row - m[patch]) ** 2) for row, m in zip(draws, mean, strict=True)])
     return np.stack([mean if error is None else mean + error, np.sqrt(square / np.maximum(count - 1, 1))])
 
 
-def _scores(draws: FloatArray, value: FloatArray) -> FloatArray:
+def _crps(draws: FloatArray, value: FloatArray) -> FloatArray:
     """(n,) fair ensemble CRPS: mean |x - y| - mean |x - x'| / 2."""
     ordered, count = np.sort(draws, axis=0), len(draws)
     weight = (2 * np.arange(count) - count + 1)[:, None]
@@ -224,6 +264,6 @@ def _scores(draws: FloatArray, value: FloatArray) -> FloatArray:
     return np.asarray(np.abs(draws - value).mean(axis=0) - spread / 2)
 
 
-def thinned(count: int) -> slice:
-    """Every how-manieth held-out point is simulated."""
+def subsampling(count: int) -> slice:
+    """Return the slice that leaves at most about 30,000 of `count` validation points."""
     return slice(None, None, max(count // _MOST_POINTS, 1))

@@ -1,4 +1,4 @@
-"""The first epoch: how it is observed, and what later ones are registered to: its surface, or the wall as it really is."""
+"""Prepare the first epoch: how it is observed, and to what later epochs are registered (its surface, or the true wall)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sensors.stereo.stereo_pair import StereoPair
 
 
 def reference_sensor(config: SimulationConfig, site: SensorSite) -> SensorSite:
-    """The site as the reference epoch is observed from it: without the sensor's noise where the config says so."""
+    """Return the site as the reference epoch is observed: without the sensor's noise if the config says so."""
     if config.noisy_reference:
         return site
     sensor = site.sensor
@@ -32,16 +32,28 @@ def reference_sensor(config: SimulationConfig, site: SensorSite) -> SensorSite:
 
 
 def _quiet(pair: StereoPair) -> StereoPair:
+    """Return the pair without noise."""
     return replace(pair, model=pair.model.without_noise())
 
 
 def reference_and_target(
     config: SimulationConfig, surface: TriangleMesh, wall: TriangleMesh, random: KeyedRandom
 ) -> tuple[TriangleMesh, ReferenceSurface | None]:
-    """The reference surface, wall frame, and the target of the later epochs' ICP, None where the config has none.
+    """Return the reference surface, wall frame, and the target of the later epochs' ICP (None without ICP).
 
-    surface: as reconstructed; wall: as it really is. With `icp_target: true_wall` (thesis 3.6) the reference itself is registered
-    to the wall too, else its own misorientation would stand in every difference map.
+    With `icp_target: true_wall` (thesis 3.6) the reference itself is also registered to the wall; otherwise its own
+    misorientation would appear in every difference map.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Config of the run.
+    surface : TriangleMesh
+        The reconstructed reference surface.
+    wall : TriangleMesh
+        The true wall.
+    random : KeyedRandom
+        Source of the registration's subsamples.
     """
     if config.icp is None:
         return surface, None

@@ -1,4 +1,4 @@
-"""What `gap` decides by: each threshold says what it is, can be set, is written down, and reaches what decides."""
+"""The thresholds of `gap`: each has a unit, a description and a source, can be set, is recorded, and is used."""
 
 from __future__ import annotations
 
@@ -12,32 +12,34 @@ from gap_cases import write_scan
 from pydantic import BaseModel
 
 from pipeline.cli.main import main
-from pipeline.gap.decisions import Decisions, decided, deciding, read_decisions
-from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.thresholds import Thresholds, read_thresholds, thresholds, use_thresholds
 
 GAP = Path(__file__).parents[2] / "pipeline" / "gap"
 
 
 def _read() -> set[tuple[str, str]]:
-    """Thresholds that code reads: decided().group.key, or by.key where `by` was set to decided().group before."""
+    """Thresholds that code reads: thresholds().group.key, or by.key where `by` was set to thresholds().group before."""
     found: set[tuple[str, str]] = set()
     for path in GAP.rglob("*.py"):
         group_of_by = ""
-        for line in (ast.unparse(ast.parse(path.read_text())) if path.name != "decisions.py" else "").splitlines():
-            if named := re.search(r"\bby = decided\(\)\.(\w+)$", line):
+        for line in (
+            ast.unparse(ast.parse(path.read_text())) if path.name not in ("thresholds.py", "noise_thresholds.py") else ""
+        ).splitlines():
+            if named := re.search(r"\bby = thresholds\(\)\.(\w+)$", line):
                 group_of_by = named[1]
-            found |= {(group, key) for group, key in re.findall(r"\b(?:decided\(\)|decisions)\.(\w+)\.(\w+)", line)}
+            found |= {(group, key) for group, key in re.findall(r"\b(?:thresholds\(\)|found\.thresholds)\.(\w+)\.(\w+)", line)}
             found |= {(group_of_by, key) for key in re.findall(r"\bby\.(\w+)", line)}
     return found
 
 
 READ = _read()
-EVERY = [(group, key) for group, found in Decisions().model_dump().items() for key in found]
+EVERY = [(group, key) for group, found in Thresholds().model_dump().items() for key in found]
 
 
 @pytest.mark.parametrize(("group", "key"), EVERY)
 def test_each_says_its_unit_what_it_decides_and_where_it_comes_from(group: str, key: str) -> None:
-    model: type[BaseModel] = type(getattr(Decisions(), group))
+    model: type[BaseModel] = type(getattr(Thresholds(), group))
     field = model.model_fields[key]
     assert isinstance(field.json_schema_extra, dict)
     assert field.description
@@ -52,11 +54,11 @@ def test_each_is_used_by_the_diagnosis(group: str, key: str) -> None:
     assert (group, key) in READ
 
 
-def test_what_is_called_within_decides_by_what_was_set() -> None:
+def test_thresholds_hold_within_the_block_that_sets_them() -> None:
     gap = Gap(before=0.0015, after=0.0015, floor=0.001, error=0.0, floor_error=0.0001, points=100)
     assert gap.above_floor
-    with deciding(read_decisions(["verdict.floor_sigmas=6"])):
-        assert decided().verdict.floor_sigmas == 6
+    with use_thresholds(read_thresholds(["verdict.floor_sigmas=6"])):
+        assert thresholds().verdict.floor_sigmas == 6
         assert not gap.above_floor
     assert gap.above_floor
 
@@ -70,7 +72,7 @@ def test_thresholds_are_set_by_the_command_and_written_down(tmp_path: Path, caps
     assert json.loads((tmp_path / "out/gap.json").read_text())["decisions"]["points"]["fewest"] == 900
 
 
-@pytest.mark.parametrize("wrong", ["points.few=3", "mean.significance=2", "spread.least_gain=much", "mean.class_margin=.inf"])
+@pytest.mark.parametrize("wrong", ["points.few=3", "mean.significance=2", "variance.least_gain=much", "mean.class_margin=.inf"])
 def test_a_threshold_that_cannot_be_is_answered_in_a_sentence(
     wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

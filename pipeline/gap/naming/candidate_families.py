@@ -1,4 +1,5 @@
-"""Every explanation of the mean that a measurement allows."""
+"""List the candidate explanations of the mean (families) that a measurement allows: the catalogue, non-parametric terms and
+nulls."""
 
 from __future__ import annotations
 
@@ -7,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import (
     MOST_CYCLES,
     MOST_CYCLES_OF_A_SENSOR,
@@ -25,66 +25,68 @@ from pipeline.gap.mean.signatures import mean_families
 from pipeline.gap.residuals.disparity_raster import spacing
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects import EFFECTS, effect_of
 from sensors.effects.angle_empirical import AngleEmpirical
 
 PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
-"""Sines, and along what: an error that repeats but is no sine is not theirs."""
+"""Sinusoidal effects and the covariate along which they repeat. A periodic error that is no sine belongs to none of them."""
 _IMAGE = ("image_x", "image_y")
-_NOT_FREE = ("edge_step", "line", "disparity_fraction")
+_NO_NONPARAMETRIC_TERM = ("edge_step", "line", "disparity_fraction")
 _MOST_POINTS = 5_000
-"""By which one sees whether one form holds another."""
+"""Number of points on which signatures are compared with the curves that the model already contains."""
 
 
-def believes(measurement: Measurement, name: str) -> bool:
-    """Whether the model holds an effect already."""
+def model_has(measurement: Measurement, name: str) -> bool:
+    """Whether the model contains an effect already."""
     return any(effect.name == name for effect in measurement.model.effects)
 
 
-def effects_of(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """Every effect of the catalogue that the fields of `part` allow, with what is typical of it."""
-    return [_with_precision(each) for each in mean_families(part, measurement)]
+def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+    """Return the effects of the catalogue that the recorded fields allow, with a Gaussian prior of their size."""
+    return [_with_prior(each) for each in mean_families(part, measurement)]
 
 
-def families_of(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """Every explanation of the mean that the fields of `part` allow, the catalogue's and free forms."""
-    named = effects_of(measurement, part)
+def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+    """Return every explanation of the mean that the recorded fields allow: catalogue, non-parametric terms, spatial null
+    candidates."""
+    named = catalogue_families(measurement, part)
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}
     free = [
         form
         for name, values in part.covariates.items()
-        if name not in _NOT_FREE and np.ptp(values) > 0
+        if name not in _NO_NONPARAMETRIC_TERM and np.ptp(values) > 0
         for form in free_forms(name, values, lowest.get(name, np.inf), _most_cycles(name, values))
     ]
     if isinstance(part, TlsResiduals):
-        angles = _of_angles(part)
-        named, free = _not_held(named, angles, measurement, part), [*free, *angles]
+        angles = _angle_terms(part)
+        named, free = _without_described_by_curves(named, angles, measurement, part), [*free, *angles]
     first, second = part.planes
     both = surface_form(first, second, part.covariates[first], part.covariates[second])
-    return [*named, *free, *_twice_a_pixel(part), both, *_repeated(part), *places(part.at)]
+    return [*named, *free, *_half_pixel_sines(part), both, *_repeating_terms(part), *places(part.at)]
 
 
 def _most_cycles(name: str, values: FloatArray) -> float:
-    """Of a wave along a covariate; along an image's axes as many as a sensor may have and its raster can show."""
+    """Highest number of cycles of a wave along a covariate; along an image's axes as many as the raster can show."""
     if name not in _IMAGE:
         return MOST_CYCLES
     step = spacing(values)
     return MOST_CYCLES_OF_A_SENSOR if step is None else min(MOST_CYCLES_OF_A_SENSOR, reach_of(values) / (2 * step))
 
 
-def _of_angles(part: TlsResiduals) -> list[Candidate | SineGrid]:
-    """Free forms of the errors of both angles: an error of an angle changes the range by the slope of the surface."""
+def _angle_terms(part: TlsResiduals) -> list[Candidate | SineGrid]:
+    """Non-parametric terms of errors of both angles. An error of an angle changes the range by the slope of the surface."""
     angles = {"azimuth": part.geometry.azimuth, "zenith": part.geometry.zenith}
     levers = {"azimuth": -part.geometry.by_azimuth, "zenith": -part.geometry.by_zenith}
     along = [(angle, name, values) for angle in levers for name, values in angles.items() if np.ptp(values) > 0]
     return [form for angle, name, values in along for form in angle_forms(angle, name, values, levers[angle])]
 
 
-def _not_held(
+def _without_described_by_curves(
     named: list[Candidate | SineGrid], angles: list[Candidate | SineGrid], measurement: Measurement, part: TlsResiduals
 ) -> list[Candidate | SineGrid]:
-    """Without the effects that a curve of an angle's error, where the model has one, holds too, but for its values."""
+    """Leave out effects that a curve of an angle's error, already in the model, describes too."""
     curves = {(each.angle, each.covariate) for each in measurement.model.effects if isinstance(each, AngleEmpirical)}
     held = [each.columns for each in angles if isinstance(each, Candidate) and (each.angle, each.name) in curves]
     if not held:
@@ -95,12 +97,12 @@ def _not_held(
     def left(columns: FloatArray) -> float:
         return float(np.sum((columns - basis @ (basis.T @ columns)) ** 2) / np.sum(columns**2))
 
-    least = decided().mean.undone_share
+    least = thresholds().mean.absorbed_share
     return [each for each in named if isinstance(each, SineGrid) or left(each.columns[rows]) > least]
 
 
-def _repeated(part: Residuals) -> list[Candidate]:
-    """Forms that repeat after a few scan lines, or columns or rows of a raster of pixels."""
+def _repeating_terms(part: Residuals) -> list[Candidate]:
+    """Terms that repeat after a few scan lines, or after a few columns or rows of a pixel raster."""
     found = part.covariates
     if "line" in found and np.ptp(found["line"]) > 0:
         turn = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
@@ -109,16 +111,16 @@ def _repeated(part: Residuals) -> list[Candidate]:
     return [form for name, step in steps.items() for form in repeated(name, (found[name] - found[name].min()) / step, step)]
 
 
-def _twice_a_pixel(part: Residuals) -> list[SineGrid]:
-    """Where disparities span as many pixels as locking to these has to."""
+def _half_pixel_sines(part: Residuals) -> list[SineGrid]:
+    """Sines of twice the pixel frequency, if the disparities span enough pixels for locking."""
     disparity = part.covariates.get("disparity")
-    if disparity is None or reach_of(disparity) < decided().locking.fewest_cycles:
+    if disparity is None or reach_of(disparity) < thresholds().locking.fewest_cycles:
         return []
     return twice_a_pixel("disparity", disparity)
 
 
-def _with_precision(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
-    """With what is typical of its effect: two effects that nearly cancel each other must not do so at any size."""
+def _with_prior(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
+    """Add the prior of an effect's size, so that two effects that nearly cancel cannot both become arbitrarily large."""
     if isinstance(candidate, SineGrid):
         return candidate
     typical = effect_of(candidate.name).typical_sizes()
@@ -128,4 +130,4 @@ def _with_precision(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
         typical.get(key, first) / max(abs(candidate.parameters(unit)[key]), 1e-300) if not key.startswith("phase") else first
         for key, unit in zip(candidate.names, units, strict=True)
     ]
-    return replace(candidate, precision=1 / (decided().mean.typical_sizes * np.array(sizes)) ** 2)
+    return replace(candidate, precision=1 / (thresholds().mean.prior_size * np.array(sizes)) ** 2)

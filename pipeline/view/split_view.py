@@ -1,4 +1,4 @@
-"""Two pictures of the same wall with a border that can be moved: before and after, two epochs, two sensors."""
+"""Combine two pictures of the same wall with a movable border between them: before and after, two epochs, two sensors."""
 
 from __future__ import annotations
 
@@ -13,28 +13,44 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 OWN, OTHER = "own ", "other "
-"""What a choice begins with: a step of the same folder, or of the other one."""
+"""Prefixes of a choice: a step of the same folder, or of the other one."""
 _APART_M = 0.02
-"""By which the frames of two runs may differ anywhere on the wall."""
+"""Largest difference of the frames of two runs, anywhere on the wall, m."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """What may stand beside what is shown. results: of the folder; other: of a second run of the same wall, or None."""
+    """What can be shown beside the present picture. results: of the same folder; other: of a second run of the same wall, or
+    None.
+    """
 
     results: Results
     other: Results | None = None
 
     @property
     def choices(self) -> dict[str, str]:
-        """What can be chosen, by key, and how people read it."""
+        """The choices by key, with their labels."""
         own = {f"{OWN}{key}": label for key, label in self.results.steps.items()}
         if self.other is None:
             return own
         return own | {f"{OTHER}{key}": f"{self.other.title}, {label}" for key, label in self.other.steps.items()}
 
     def patch(self, choice: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """The picture of a choice, by the same layer or, where it has none of that key, by its first."""
+        """Return the picture of a choice, coloured by the same layer or, if it has none with that key, by its first one.
+
+        Parameters
+        ----------
+        choice : str
+            A key of `choices`.
+        surface : str
+            The surface that is shown; the first one if the other folder lacks it.
+        layer : Layer
+            The layer of the present picture.
+        window : ViewWindow, optional
+            Part of the wall.
+        budget : int
+            Approximate limit on the number of cells.
+        """
         results = self.other if choice.startswith(OTHER) and self.other is not None else self.results
         step = choice.removeprefix(OTHER).removeprefix(OWN)
         layers = {each.key: each for each in results.layers(step)}
@@ -45,12 +61,12 @@ class Pair:
 
 
 def border(patch: Patch, share: float) -> float:
-    """x of the border at a share 0 to 1 of the picture's width, m."""
+    """Return x of the border, m, at a share 0 to 1 of the picture's width."""
     return float(patch.x[0] + share * (patch.x[-1] - patch.x[0]))
 
 
-def beside(left: Patch, right: Patch, share: float) -> Patch:
-    """`left` up to the border, beyond it `right` at the same cells: its nearest ones, no data where it has none."""
+def split_patch(left: Patch, right: Patch, share: float) -> Patch:
+    """Return `left` up to the border, and beyond it `right` at the same cells (nearest neighbour, no data where it has none)."""
     beyond = left.x > border(left, share)
     columns, outside_x = _nearest(left.x, right.x)
     rows, outside_y = _nearest(left.y, right.y)
@@ -69,7 +85,7 @@ def beside(left: Patch, right: Patch, share: float) -> Patch:
 
 
 def _nearest(wanted: FloatArray, there: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """(n,) the nearest of evenly spaced places for each wanted one, and which lie beyond their cells."""
+    """Return the nearest of evenly spaced positions for each wanted one, (n,), and which wanted ones lie beyond their cells."""
     if len(there) < 2:
         return np.zeros(len(wanted), dtype=np.intp), np.abs(wanted - there[0]) > _APART_M
     step = (there[-1] - there[0]) / (len(there) - 1)
@@ -78,7 +94,7 @@ def _nearest(wanted: FloatArray, there: FloatArray) -> tuple[NDArray[np.intp], N
 
 
 def check_same_wall(first: FloatArray, second: FloatArray, extent_m: float, where: str) -> None:
-    """Raise InputError where two runs' matrices from world to wall frame, (4, 4), differ on the wall, `extent_m` large."""
+    """Raise InputError if the matrices (4, 4), world to wall frame, of two runs differ on a wall of size `extent_m`."""
     difference = np.abs(first - second)
     if float(difference[:3, :3].max()) * extent_m > _APART_M or float(difference[:3, 3].max()) > _APART_M:
         remedy = "compare runs of one wall, as `scarpsim compare` makes them"
