@@ -304,7 +304,7 @@ def test_what_stands_in_the_place_of_a_folder_is_named(
     shutil.rmtree(copy / name, ignore_errors=True)
     make(copy / name)
     before = sorted(copy.rglob("*"))
-    assert f"{name}: is no folder" in in_one_line(["dataset", "verify", str(copy), "--quiet"], capsys)
+    assert f"{name}: is not a folder" in in_one_line(["dataset", "verify", str(copy), "--quiet"], capsys)
     assert sorted(copy.rglob("*")) == before
 
 
@@ -312,7 +312,7 @@ def test_nothing_is_staged_through_a_link(copy: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (copy / ".staging").symlink_to(tmp_path / "elsewhere")
     next((copy / "train").glob("*.tif")).unlink()
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         verify_dataset(copy)
     assert not list((tmp_path / "elsewhere").iterdir())
 
