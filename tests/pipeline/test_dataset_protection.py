@@ -259,8 +259,8 @@ def test_a_job_that_cannot_begin_leaves_nothing(
     for options, message in (
         (["--scheduler", "tcp://127.0.0.1:9"], "no scheduler answers"),
         (["--workers", "100000"], "--workers: got 100,000 workers; allowed: 1 to"),
-        (["--by", "sensor"], "--by: goes with split"),
-        (["--report-only"], "--report-only: goes with verify"),
+        (["--by", "sensor"], "--by: works only with split"),
+        (["--report-only"], "--report-only: works only with verify"),
         (["--set", "tiles.size_px=4096"], "columns of tiles"),
     ):
         assert message in in_one_line(["dataset", str(file), "--out", str(out), "--quiet", *options], capsys)

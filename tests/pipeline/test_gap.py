@@ -156,7 +156,7 @@ def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
     model.write_text(model.read_text().replace("range_sigma_m: 0.003", "range_sigma_m: 0.006"))
     found = diagnose(read_measurement(tmp_path))
     assert (found.verdict, found.effects) == ("unknown", ())
-    told = re.search(r"the residuals spread (\d+) % of what the model predicts", found.remaining["note"])
+    told = re.search(r"the residuals have (\d+) % of the predicted standard deviation", found.remaining["note"])
     assert told is not None
     assert 45 <= int(told[1]) <= 75
     assert found.model_after.noise.range_sigma_m == pytest.approx(0.003, rel=0.15)

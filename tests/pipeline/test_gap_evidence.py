@@ -65,7 +65,7 @@ def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
     ]
     scored = validate_effects(there, found, named, ~held_out_blocks(found.at, Cells.over(found.at).side_m), 0.0004)
     assert [item.name for item in scored.weak] == weak
-    assert all("within its uncertainty of none" in describe_weakness(item) for item in scored.weak)
+    assert all("within its uncertainty of zero" in describe_weakness(item) for item in scored.weak)
     assert not scored.failed
 
 

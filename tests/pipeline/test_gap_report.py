@@ -92,7 +92,7 @@ def test_every_verdict_has_a_report(
     order = ["What it means", "Where they disagree", "What was named", "<h2>The gap", "What was tried", "The model after"]
     places = [page.index(title) for title in order if title in page]
     assert places == sorted(places)
-    assert "On blocks that no step has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
+    assert "On validation blocks, which no fit has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
     assert ("± &lt; 0.001 mm" in page) == (verdict in ("named", "several", "ambiguous"))
 
 

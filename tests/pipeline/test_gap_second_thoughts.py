@@ -48,7 +48,7 @@ def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path
 
 def test_noise_found_on_some_points_adds_alike_to_all() -> None:
     found = VarianceTerm("a", "a", (), 0.1, 3.0, {}, {}, False, np.full(5, 0.04))
-    np.testing.assert_array_equal(found.everywhere(8).variance, np.full(8, 0.04))
+    np.testing.assert_array_equal(found.with_constant_variance(8).variance, np.full(8, 0.04))
 
 
 def _named(name: str, kind: str) -> NamedEffect:
@@ -68,14 +68,14 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     write_scan(tmp_path, 10, step_rad=0.007)
     there, plain, _ = settled(read_measurement(tmp_path))
     nowhere = np.zeros(len(there.cloud.points), dtype=bool)
-    state = PassInput.of(there, plain, nowhere, [])
+    pass_input = PassInput.of(there, plain, nowhere, [])
     seen: list[bool] = []
 
     def named(*given: Any) -> Any:
         seen.append(NONPARAMETRIC_TERMS in given[-1])
         items = without if seen[-1] else [_named("range_empirical", "empirical")]
-        naming = SimpleNamespace(reference_sigma=0.0, asked=seen[-1])
-        return SimpleNamespace(state=state, naming=naming, named=items)
+        selection = SimpleNamespace(reference_sigma=0.0, asked=seen[-1])
+        return SimpleNamespace(pass_input=pass_input, selection=selection, named=items)
 
     def scored(_there: Any, _residuals: Any, items: list[NamedEffect], *_: Any) -> ValidatedEffects:
         failed = [item for item in items if item.kind == "empirical"]
@@ -88,9 +88,9 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     monkeypatch.setattr(workflow, "with_separating_measurements", lambda _, items: items)
     found = workflow._select_and_validate(PassInputs(there, plain, nowhere), KeyedRandom(1))
     assert [item.name for item in found.named] == kept
-    assert found.words == ["tls.range_empirical dropped: it does not hold on blocks that were held out"]
+    assert found.words == ["tls.range_empirical dropped: it does not improve the validation blocks"]
     assert seen == [False, True]
-    assert found.naming.asked is bool(kept)  # type: ignore[attr-defined]
+    assert found.selection.asked is bool(kept)  # type: ignore[attr-defined]
 
 
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
@@ -155,20 +155,22 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
     seen = [EdgeEffect(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
 
     def named(_: Any, state: list[EdgeEffect], *_given: Any) -> Any:
-        naming = SimpleNamespace(spreads=1.0)
-        return SimpleNamespace(named=["noise"], shapes={each.name for each in state}, complexity=(0, len(state)), naming=naming)
+        selection = SimpleNamespace(noise_ratio=1.0)
+        return SimpleNamespace(
+            named=["noise"], edge_effect_names={each.name for each in state}, complexity=(0, len(state)), selection=selection
+        )
 
     monkeypatch.setattr(SelectionPass, "of", classmethod(named))
-    starts: Any = SimpleNamespace(first=[], seen_beside=lambda _: seen, beside=lambda shapes: shapes)
-    assert best_pass(starts, KeyedRandom(1), frozenset()).shapes == {"edge_fattening"}
+    starts: Any = SimpleNamespace(with_edge_effects=[], edge_effects_beside=lambda _: seen, with_these=lambda effects: effects)
+    assert best_pass(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
 
 
 @pytest.mark.parametrize(
     ("smooth", "spreads", "expected"),
     [
-        ((0, 1), 1.0, {"first", "smooth"}),
-        ((0, 1), 2.0, {"first", "smooth", "staying"}),
-        ((1, 2), 1.0, {"first", "smooth", "staying"}),
+        ((0, 1), 1.0, {"with_edge_effects", "without_edge_effects"}),
+        ((0, 1), 2.0, {"with_edge_effects", "without_edge_effects", "at_initial_pose"}),
+        ((1, 2), 1.0, {"with_edge_effects", "without_edge_effects", "at_initial_pose"}),
     ],
 )
 def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_all(
@@ -176,23 +178,27 @@ def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_a
 ) -> None:
     """One effect by itself that leaves no more spread; the answer is the least complex of what was tried."""
     asked: dict[str, tuple[tuple[int, int], float]] = {
-        "first": ((1, 3), 1.0),
-        "smooth": (smooth, spreads),
-        "staying": ((0, 2), 1.0),
+        "with_edge_effects": ((1, 3), 1.0),
+        "without_edge_effects": (smooth, spreads),
+        "at_initial_pose": ((0, 2), 1.0),
     }
     tried = []
 
     def named(_: Any, state: str, *_given: Any) -> Any:
         tried.append(state)
         complexity, wide = asked[state]
-        shapes = set() if state == "smooth" else {"smoothing"}
+        shapes = set() if state == "without_edge_effects" else {"smoothing"}
         return SimpleNamespace(
-            named=["effect"], shapes=shapes, complexity=complexity, naming=SimpleNamespace(spreads=wide), state=state
+            named=["effect"],
+            edge_effect_names=shapes,
+            complexity=complexity,
+            selection=SimpleNamespace(noise_ratio=wide),
+            state=state,
         )
 
     monkeypatch.setattr(SelectionPass, "of", classmethod(named))
     seen = [EdgeEffect(Smoothing(sigma_px=2.0), {}, 50.0, np.zeros(1, dtype=bool))]
-    starts: Any = SimpleNamespace(**{name: name for name in asked}, seen_beside=lambda _: seen, beside=lambda _: None)
+    starts: Any = SimpleNamespace(**{name: name for name in asked}, edge_effects_beside=lambda _: seen, with_these=lambda _: None)
     found = best_pass(starts, KeyedRandom(1), frozenset())
     assert set(tried) == expected
     assert found.complexity == min(asked[name][0] for name in expected if asked[name][1] < 2)
@@ -220,8 +226,8 @@ def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
     plain, nowhere = residuals_of(there), np.zeros(len(there.cloud.points), dtype=bool)
-    state = PassInput.of(there, plain, nowhere, [])
-    part, residuals = state.part
+    pass_input = PassInput.of(there, plain, nowhere, [])
+    part, residuals = pass_input.training_part
     found = residuals_of(part).value
     assert len(found) > 1000
     np.testing.assert_allclose(found, residuals.value, atol=1e-6)

@@ -205,10 +205,10 @@ def test_outlines_in_few_places_agree_by_signs() -> None:
     """A block of 60 points and 14 of two, all for it: 15 of 15 signs are 3.9 deviations, the sums, of which one is most, 1.5."""
     number = np.repeat(np.arange(15), [60, *[2] * 14])
     blocks, gains = WallBlocks(number), np.full(len(number), 2.0)
-    assert blocks.tested(gains) is None
-    assert blocks.tested(gains, by_signs=True) == pytest.approx(176)
+    assert blocks.total_if_agreed(gains) is None
+    assert blocks.total_if_agreed(gains, by_signs=True) == pytest.approx(176)
     against = np.where(number % 3 == 1, -2.0, 2.0)
-    assert blocks.tested(against, by_signs=True) is None
+    assert blocks.total_if_agreed(against, by_signs=True) is None
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("smoothing", 1), ("edge_fattening", 1), ("occlusion_fill", 6)])
@@ -316,10 +316,10 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
     value = registered(part)[0]
     spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
-    described = [replace(each, name="spread by disparity", empirical=True) for each in spread]
+    described = [replace(each, name="variance by disparity", empirical=True) for each in spread]
     (found,) = separate_white_and_grid_noise(described, part, value, there.model)
     assert found.empirical == empirical
-    assert found.name == ("spread by disparity" if empirical else kind)
+    assert found.name == ("variance by disparity" if empirical else kind)
 
 
 def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(tmp_path: Path) -> None:
@@ -385,4 +385,4 @@ def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_ma
     assert isinstance(there.model, StereoModel)
     nodes, words = find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))
     assert (nodes is not None) == found
-    assert ("taken for its error" in words) == (off_m > 0 and not found)
+    assert ("attributed to the reference" in words) == (off_m > 0 and not found)

@@ -146,8 +146,8 @@ def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_tak
     residuals = replace(residuals, sigma=np.full(len(pixels), np.sqrt(WHITE**2 + field.variance)))
     found = Cells.over(residuals.at)
     assert np.nanmean(standardised_deviations(residuals, found, residuals.value) ** 2) < 0.8
-    assert NoiseRatio.of(residuals, found, residuals.value, KeyedRandom(1)).share == 1.0
-    assert NoiseRatio.of(residuals, found, 0.7 * residuals.value, KeyedRandom(1)).share == pytest.approx(0.7, rel=0.2)
+    assert NoiseRatio.of(residuals, found, residuals.value, KeyedRandom(1)).at_most_one == 1.0
+    assert NoiseRatio.of(residuals, found, 0.7 * residuals.value, KeyedRandom(1)).at_most_one == pytest.approx(0.7, rel=0.2)
 
 
 @pytest.mark.slow

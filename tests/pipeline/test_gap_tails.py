@@ -36,10 +36,10 @@ def test_where_far_points_lie_says_whose_they_are(uneven: bool) -> None:
     """Of 3 % of width 10 a share of 0.689 lies beyond 4: P(|z| > 0.4)."""
     found = find_heavy_tails(*_residuals(0.03, uneven))
     assert found is not None
-    assert found.even is not uneven
+    assert found.uniform is not uneven
     assert found.share == pytest.approx(0.03 * 0.689, rel=0.15)
-    assert ("all over the wall" in found.words) is not uneven
-    assert f"{100 * found.share:.2g} % of the points lie beyond 4 predicted sigmas" in found.words
+    assert ("all over the wall" in found.note) is not uneven
+    assert f"{100 * found.share:.2g} % of the points lie beyond 4 predicted standard deviations" in found.note
 
 
 def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None:

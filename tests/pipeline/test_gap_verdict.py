@@ -82,7 +82,7 @@ class _Found:
         return {"p_value": self.evidence.p_value, "note": note, "lower_noise": lower}
 
     @property
-    def mended(self) -> bool:
+    def model_changed(self) -> bool:
         return bool(self.effects or self.remaining["lower_noise"])
 
 
@@ -120,7 +120,7 @@ def test_a_gap_that_nothing_closes_is_not_reported_as_closed() -> None:
         assert "0 % of the gap is closed" not in said.replace("100 %", "")
         assert " -" not in said
         gap = evidence.gap
-        if gap is not None and (not found.mended or gap.after >= gap.before):
+        if gap is not None and (not found.model_changed or gap.after >= gap.before):
             assert "% of the gap is closed" not in said
         if gap is not None and gap.before - gap.floor > 2 * ERROR:
             assert "no more than their uncertainty" not in said
@@ -132,8 +132,8 @@ def test_what_is_rejected_without_a_description_says_where_and_how_much() -> Non
         left_open = found.gap is not None and found.gap.left_open
         only_too_noisy = evidence.spread < 1.0 and not (evidence.rejects or evidence.far or left_open)
         assert ("noise is too large" in said) >= (bare and only_too_noisy)
-        assert ("nothing that was tried describes what is missing" in said) == (bare and not only_too_noisy)
-        assert ("It shows most in the mean against range, from 10 to 20: 2.1 mm there" in said) == bare
+        assert ("nothing that was tried describes the misfit" in said) == (bare and not only_too_noisy)
+        assert ("The disagreement is largest in the mean against range, from 10 to 20: 2.1 mm there" in said) == bare
         if bare:
             assert "an empirical term describes it" not in said
             assert "that is not in the catalogue" not in said
@@ -149,32 +149,32 @@ def test_effects_that_leave_most_of_the_gap_open_are_not_the_answer() -> None:
         for_nothing = gap is not None and gap.after > gap.before and evidence.p_value is None
         unsaid = little or for_nothing or rejected or evidence.wide > 1.5
         assert (physical and found.verdict == "unknown") == (physical and unsaid)
-        assert ("nothing speaks for them" in said) == (physical and for_nothing and not little)
+        assert ("nothing supports them" in said) == (physical and for_nothing and not little)
         assert ("does not make the gap smaller" in said) == (physical and for_nothing and not little)
         assert ("most of the gap stays open" in said) == (physical and little)
         assert ("closes little of the gap" in said) == (physical and little)
         assert ("too small to show that they close any of it" in said) == (physical and rejected and not little)
-        assert ("leaves more than chance would" in said) == (physical and rejected and not little)
+        assert ("leaves a misfit larger than chance would" in said) == (physical and rejected and not little)
         wide = physical and not (little or for_nothing or rejected) and evidence.wide > 1.5
-        assert ("spread far more than the model predicts" in said) == wide
+        assert ("still vary far more than the model predicts" in said) == wide
 
 
 def test_an_empirical_term_beside_effects_does_not_say_that_none_passed() -> None:
     for found, _, said in _every():
         kinds = {effect.kind for effect in found.effects}
-        assert ("explain a part of what is missing" in said) == (len(kinds) == 2)
+        assert ("explain part of the misfit" in said) == (len(kinds) == 2)
         assert ("no effect of the catalogue passes its own test" in said) == (kinds == {"empirical"})
 
 
 def test_what_an_effect_leaves_over_is_said() -> None:
     for found, evidence, said in _every():
         left = bool(found.effects) and evidence.p_value is not None and evidence.p_value <= 0.01
-        assert ("does not explain all of it" in said) == left
+        assert ("does not explain everything" in said) == left
 
 
 def test_too_much_noise_is_said_with_less_that_would_do() -> None:
     for found, evidence, said in _every():
-        assert ("the residuals spread 11 % of what the model predicts" in said) == (evidence.spread < 1.0)
+        assert ("the residuals have 11 % of the predicted standard deviation" in said) == (evidence.spread < 1.0)
         if evidence.spread < 1.0:
             assert "range_sigma_m 0.00033" in said
             assert "too noisy" in said or found.verdict != "no_gap"
@@ -188,7 +188,7 @@ def test_a_wall_much_of_which_moved_says_nothing_of_the_sensor(gap: Gap | None, 
     said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summarise(found)} {'; '.join(note_moved_wall(found.evidence, False))}"
     assert found.verdict == "insufficient_data"
     assert "41 % of the points lie off the reference together with their neighbours" in said
-    assert "name stable_areas" in said
+    assert "add stable_areas" in said
     assert "too few" not in said.lower()
     assert verdict_of((), Evidence(gap, p_value, moved=0.29)) == verdict_of((), Evidence(gap, p_value))
     assert note_moved_wall(Evidence(gap, p_value, moved=0.29), False) == []

@@ -69,9 +69,9 @@ def test_every_effect_of_the_catalogue_says_what_it_means_and_what_to_do(effect:
     assert page_of(f"reference/effects/{effect.sensor}.{effect.model_fields['name'].default}").startswith("file://")
 
 
-def test_what_the_catalogue_does_not_hold_is_told_in_general_words() -> None:
+def test_a_cause_outside_the_catalogue_has_general_advice() -> None:
     term = NamedEffect("tls.range_empirical", "empirical", {"name": "range_empirical"}, {}, (), None, 9.0)
-    assert "does not hold" in advice_on(term).means
+    assert "not in the catalogue" in advice_on(term).means
     assert (
         "Simulate with model_after.yaml" in advice_on(NamedEffect("tls.range_empirical", "physical", {}, {}, (), None, 9.0)).act
     )

@@ -95,6 +95,7 @@ def _without_described_by_curves(
     basis = np.linalg.qr(np.concatenate([part.pose[rows], *(columns[rows] for columns in held)], axis=1))[0]
 
     def left(columns: FloatArray) -> float:
+        """Share of a signature's sum of squares that pose and curves leave."""
         return float(np.sum((columns - basis @ (basis.T @ columns)) ** 2) / np.sum(columns**2))
 
     least = thresholds().mean.absorbed_share

@@ -154,9 +154,9 @@ def select_effects(
         noise_terms = [grid_noise]
 
     def variance_at(at: Residuals) -> list[VarianceTerm]:
-        there = _fit_variance(measurement, at, Cells.over(at.at), registered(at)[0], random, excluded)[0]
-        if there or grid_noise is None:
-            return there
+        fitted = _fit_variance(measurement, at, Cells.over(at.at), registered(at)[0], random, excluded)[0]
+        if fitted or grid_noise is None:
+            return fitted
         return [replace(grid_noise, variance=grid_noise.variance[np.isin(part.index, at.index)])]
 
     points = SearchInput(measurement, part, families, variance_at, added, random)
@@ -164,18 +164,18 @@ def select_effects(
     found = select_and_refit(points, first)
     physical = any(not each.empirical for each in families)
     names, cosines, survival = first.design.identifiability() if physical else ([], np.zeros((0, 0)), np.zeros(0))
-    wrong = out_of_bounds(measurement, found.estimates, found.at)
-    implausible = absorbed_by_registration(found.estimates, found.at, dict(zip(names, survival, strict=True)))
+    wrong = out_of_bounds(measurement, found.estimates, found.residuals)
+    implausible = absorbed_by_registration(found.estimates, found.residuals, dict(zip(names, survival, strict=True)))
     if implausible and not _explains_everything(found):
         wrong |= implausible
     design = found.search.design
     left = design.without([each.candidate for each in found.beside])
     if found.chosen and not wrong:
-        noise_terms, variance_tried, note = _fit_variance(measurement, found.at, design.cells, left, random, excluded)
+        noise_terms, variance_tried, note = _fit_variance(measurement, found.residuals, design.cells, left, random, excluded)
     if noise_terms in ([], [grid_noise]) and (_GRID_NOISE, False) not in excluded:
-        match measurement, part, found.at:
+        match measurement, part, found.residuals:
             case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
-                noise_left, shared = find_grid_noise(found.at, left, model, random)
+                noise_left, shared = find_grid_noise(found.residuals, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
                 if noise_left is not None and grid_noise is None:
                     noise_in_all = find_grid_noise(part, registered(part)[0], model, random)[0] if described else None
@@ -188,10 +188,10 @@ def select_effects(
         return keep_implausible_in_class(
             again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong
         ), result
-    systematic = [effect_from_estimate(each, found.at) for each in found.estimates]
+    systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
     named += systematic
     named += [effect_from_variance(each, part.sensor) for each in noise_terms]
-    unexplained_noise = NoiseRatio(1.0, False) if noise_terms else NoiseRatio.of(found.at, design.cells, left, random)
+    unexplained_noise = NoiseRatio(1.0, False) if noise_terms else NoiseRatio.of(found.residuals, design.cells, left, random)
     said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part))
     notes = (*part.notes, *_note_left_out(excluded), *filter(None, [note]), *said)
     p_value = found.search.p_of_rest(found.tried)
@@ -202,7 +202,7 @@ def select_effects(
     tried = found.chosen[0].tried if found.chosen else found.tried
     without_nulls = tuple(item for item in tried if not item.name.startswith(PLACE))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
-    noise_ratio_left = nmad(left / found.at.sigma, 0.0)
+    noise_ratio_left = nmad(left / found.residuals.sigma, 0.0)
     result = SelectionResult(
         without_nulls,
         tuple(variance_tried),
@@ -265,9 +265,9 @@ def _select_beside_angle_terms(
 
     What the second selection finds of the same form is added to the curves of the first.
     """
-    there, found, _ = aligned_with(measurement, angles, all_residuals.index)
+    aligned, found, _ = aligned_with(measurement, angles, all_residuals.index)
     at = at_points_of(found, all_residuals)
-    named, result = select_effects(there, at, registered(at)[2], random.child("angles"), excluded)
+    named, result = select_effects(aligned, at, registered(at)[2], random.child("angles"), excluded)
     joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], all_residuals)
     rest = [item for item in named if item.effect is not AngleEmpirical]
     systematic = result.systematic | {item.name for item in angles}
@@ -347,7 +347,7 @@ def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
         f"non-parametric terms of {name}" if empirical else name for name, empirical in sorted(excluded - {NONPARAMETRIC_TERMS})
     )
     why = (
-        "the best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
+        "its best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
         "of it, and a misfit is left"
     )
     return [f"{what} left out: {why}" for what in said]

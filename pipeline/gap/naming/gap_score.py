@@ -32,8 +32,10 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import StereoModel, TlsModel
 
-MEASURE = "mean continuous ranked probability score of patches (mean and spread of their residuals) against simulated ones"
-LOSS_MEASURE = "mean Brier score of pulses (lost or not) against the chance of losing them"
+MEASURE = (
+    "mean continuous ranked probability score of patches (mean and standard deviation of their residuals) against simulations"
+)
+LOSS_MEASURE = "mean Brier score of pulses (lost or not) against their predicted probability of loss"
 _ENSEMBLE_SIZE = 8
 """Simulations of an ensemble, most points that are simulated, points of a patch, and fewest points of a patch that is scored."""
 _MOST_POINTS = 30_000

@@ -61,7 +61,7 @@ class SearchOutcome:
     chosen : explanations of the first search.
     estimates : effects of both searches with their coefficients.
     search : the last search.
-    at : residuals of the last search.
+    residuals : residuals of the last search.
     beside : explanations of the last search alone.
     tried : candidates that the last search tried.
     """
@@ -69,7 +69,7 @@ class SearchOutcome:
     chosen: list[Chosen]
     estimates: list[Estimate]
     search: MeanSearch
-    at: Residuals
+    residuals: Residuals
     beside: list[Chosen]
     tried: tuple[Tried, ...]
 
@@ -83,12 +83,17 @@ class SearchOutcome:
 class _SingleFit:
     """One effect alone in the model, without linearising.
 
-    estimate: the effect; at: residuals against the model with it; there: the measurement with it; log_likelihood: of all points.
+    Attributes
+    ----------
+    estimate : the effect with its coefficients.
+    residuals : residuals against the model with it.
+    measurement : the measurement with it in its model, at the estimated pose.
+    log_likelihood : log-likelihood of all points.
     """
 
     estimate: Estimate
-    at: Residuals
-    there: Measurement
+    residuals: Residuals
+    measurement: Measurement
     log_likelihood: float
 
     @property
@@ -102,29 +107,29 @@ class _SingleFit:
         return self.log_likelihood - (self.estimate.chosen.gain - self.estimate.chosen.score)
 
     @classmethod
-    def of(cls, points: SearchInput, first: MeanSearch, estimate: Estimate) -> _SingleFit | None:
+    def of(cls, given: SearchInput, first: MeanSearch, estimate: Estimate) -> _SingleFit | None:
         """Put one effect into the model; None if it is out of bounds, or if too few rays meet the reference with it."""
-        if out_of_bounds(points.measurement, [estimate], points.part):
+        if out_of_bounds(given.measurement, [estimate], given.part):
             return None
-        there, found, _ = _aligned_with_estimates(points, [estimate])
-        found = found.part(np.isin(found.index, points.part.index))
+        measurement, found, _ = _aligned_with_estimates(given, [estimate])
+        found = found.part(np.isin(found.index, given.part.index))
         registered_residuals, _, noise_ratio = registered(found)
         largest = thresholds().points.outlier_sigmas * noise_ratio * found.sigma
-        value, kept = np.zeros(len(points.part)), _still_present(found, points.part)
+        value, kept = np.zeros(len(given.part)), _still_present(found, given.part)
         if kept.mean() < thresholds().points.least_share_on_reference:
             return None
         value[kept] = np.where(found.smooth, np.clip(registered_residuals, -largest, largest), 0.0)
-        return cls(estimate, at_points_of(found, points.part), there, first.design.log_likelihood(value, estimate.candidate))
+        return cls(estimate, at_points_of(found, given.part), measurement, first.design.log_likelihood(value, estimate.candidate))
 
-    def improved(self, points: SearchInput, first: MeanSearch) -> _SingleFit | None:
+    def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
         """Return the fit after one Gauss-Newton step from the present values."""
-        candidate = _recomputed(self.estimate.candidate, candidate_families(self.there, self.at))
+        candidate = _recomputed(self.estimate.candidate, candidate_families(self.measurement, self.residuals))
         width = candidate.columns.shape[1]
-        step = _gauss_newton_step(self.at, candidate.columns, precision_of(candidate, width), np.zeros(width))
-        return _SingleFit.of(points, first, replace(self.estimate, values=self.estimate.values + step))
+        step = _gauss_newton_step(self.residuals, candidate.columns, precision_of(candidate, width), np.zeros(width))
+        return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
 
 
-def select_and_refit(points: SearchInput, first: MeanSearch) -> SearchOutcome:
+def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     """Select systematic effects and refit the strong ones without linearising.
 
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
@@ -133,7 +138,7 @@ def select_and_refit(points: SearchInput, first: MeanSearch) -> SearchOutcome:
 
     Parameters
     ----------
-    points : input of the searches.
+    given : input of the searches.
     first : the linearised search.
 
     Returns
@@ -141,55 +146,62 @@ def select_and_refit(points: SearchInput, first: MeanSearch) -> SearchOutcome:
     SearchOutcome : the explanation with the fewest empirical terms, then the fewest effects.
     """
     together, tried = first.select()
-    linear = SearchOutcome(together, _estimates_of(first, together), first, points.part, together, tried)
-    alone = _strongest_single_fits(points, first, together) if together else []
+    linear = SearchOutcome(together, _estimates_of(first, together), first, given.part, together, tried)
+    alone = _strongest_single_fits(given, first, together) if together else []
     if not alone:
-        return _search_beside(points, linear) or linear
-    beside_best = _search_beside_best(points, linear, alone)
+        return _search_beside(given, linear) or linear
+    beside_best = _search_beside_best(given, linear, alone)
     if beside_best is not None and len(beside_best.estimates) > 1:
         others = {each.candidate.name for each in beside_best.estimates if not each.candidate.empirical}
-        extended = _with_alternatives(points, first, alone, others)
+        extended = _with_alternatives(given, first, alone, others)
         if extended[0] is not alone[0]:
-            beside_best = _search_beside_best(points, linear, extended) or beside_best
+            beside_best = _search_beside_best(given, linear, extended) or beside_best
     if beside_best is not None and len(beside_best.estimates) == 1:
         return beside_best
-    there = search_at_joint_fit(points)
-    found = [_search_beside(points, linear) or linear]
+    joint = search_at_joint_fit(given)
+    found = [_search_beside(given, linear) or linear]
     if beside_best is not None:
         found.insert(0, beside_best)
-    if there is not None and there.chosen:
-        found.append(_search_beside(points, there) or there)
-    possible = [each for each in found if not out_of_bounds(points.measurement, each.estimates, each.at)]
+    if joint is not None and joint.chosen:
+        found.append(_search_beside(given, joint) or joint)
+    possible = [each for each in found if not out_of_bounds(given.measurement, each.estimates, each.residuals)]
     return min(possible, key=lambda each: each.complexity, default=linear)
 
 
-def search_at_joint_fit(points: SearchInput) -> SearchOutcome | None:
+def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
     """Select effects with the model linearised at the joint fit of all effects of the catalogue.
 
     There the rays are traced to where they really went, whichever effect turned them, so the Jacobian is right. The fitted part
     of all effects is added back to the residuals before the selection. Returns None if an effect is out of bounds.
     """
-    plain = [each for each in points.families if isinstance(each, Candidate) and not each.empirical]
-    fitted = fit_jointly(points, plain)
+    plain = [each for each in given.families if isinstance(each, Candidate) and not each.empirical]
+    fitted = fit_jointly(given, plain)
     if fitted is None:
         return None
-    there, at, explained = fitted
-    allowed = {(family.name, family.empirical) for family in points.families}
-    families = [each for each in candidate_families(there, at) if (each.name, each.empirical) in allowed]
+    measurement, at, explained = fitted
+    allowed = {(family.name, family.empirical) for family in given.families}
+    families = [each for each in candidate_families(measurement, at) if (each.name, each.empirical) in allowed]
     left = replace(at, value=at.value + explained)
-    weighted = replace(_with_variance_refitted(points, at), value=left.value)
-    search = MeanSearch(weighted, families, points.random.child("best fit"))
+    weighted = replace(_with_variance_refitted(given, at), value=left.value)
+    search = MeanSearch(weighted, families, given.random.child("best fit"))
     together, tried = search.select()
     return SearchOutcome(together, _estimates_of(search, together), search, left, together, tried)
 
 
-def fit_jointly(points: SearchInput, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
+def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
     """Fit some effects together by Gauss-Newton.
 
-    Returns the measurement with them in its model, the residuals there, and their linearised part (n,) of the observations; None
-    if an effect is out of bounds or too few points remain.
+    Parameters
+    ----------
+    given : input of the searches.
+    candidates : effects to fit.
+
+    Returns
+    -------
+    tuple or None : the measurement with the effects in its model, the residuals against it, and the effects' linearised part (n,)
+        of the observations. None if an effect is out of bounds or too few points remain.
     """
-    there, at, before = points.measurement, points.part, np.inf
+    measurement, at, before = given.measurement, given.part, np.inf
     widths = [each.columns.shape[1] for each in candidates]
     values = np.zeros(sum(widths))
     for _ in range(_MOST_FITS):
@@ -201,24 +213,25 @@ def fit_jointly(points: SearchInput, candidates: list[Candidate]) -> tuple[Measu
         values = values + _gauss_newton_step(at, _all_columns(candidates), precision, values)
         parts = np.split(values, np.cumsum(widths)[:-1])
         estimates = [_estimate_of_size(each, part) for each, part in zip(candidates, parts, strict=True)]
-        if out_of_bounds(points.measurement, estimates, at):
+        if out_of_bounds(given.measurement, estimates, at):
             return None
-        there, found, _ = _aligned_with_estimates(points, estimates)
-        at = with_added_variance(at_points_of(found, points.part), points.added)
-        if _too_few_left(points, at):
+        measurement, found, _ = _aligned_with_estimates(given, estimates)
+        at = with_added_variance(at_points_of(found, given.part), given.added)
+        if _too_few_left(given, at):
             return None
-        renewed = catalogue_families(there, at)
+        renewed = catalogue_families(measurement, at)
         candidates = [_recomputed(each, renewed) for each in candidates]
     explained: FloatArray = _all_columns(candidates) @ values
-    return there, at, explained
+    return measurement, at, explained
 
 
-def _too_few_left(points: SearchInput, at: Residuals) -> bool:
+def _too_few_left(given: SearchInput, at: Residuals) -> bool:
     """Whether too few of the points are left for a search."""
-    return len(at) < thresholds().points.least_share_on_reference * len(points.part)
+    return len(at) < thresholds().points.least_share_on_reference * len(given.part)
 
 
 def _all_columns(candidates: list[Candidate]) -> FloatArray:
+    """Columns of all candidates side by side."""
     columns: FloatArray = np.concatenate([each.columns for each in candidates], axis=1)
     return columns
 
@@ -240,7 +253,7 @@ def _gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray
     return np.asarray(found[start:])
 
 
-def _strongest_single_fits(points: SearchInput, first: MeanSearch, together: list[Chosen]) -> list[_SingleFit]:
+def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[Chosen]) -> list[_SingleFit]:
     """The effects that alone explain most, refitted without linearising, best first.
 
     Empty where the linearised model is good enough: its error is smaller than the gain of any selected effect.
@@ -248,20 +261,20 @@ def _strongest_single_fits(points: SearchInput, first: MeanSearch, together: lis
     found: list[_SingleFit] = []
     tolerance = min([thresholds().mean.linearisation_error, *(_ABSORBED_SHARE * each.gain for each in together)])
     for candidate in first.leading():
-        alone = _single_fit(points, first, candidate)
+        alone = _single_fit(given, first, candidate)
         if alone is None:
             continue
-        linearised = first.design.log_likelihood(points.part.value, candidate)
+        linearised = first.design.log_likelihood(given.part.value, candidate)
         if not found and abs(alone.log_likelihood - linearised) < tolerance:
             return []
         found.append(alone)
     if not found:
         return []
-    likeliest = _best_variants(points, first, found)
-    return _with_alternatives(points, first, likeliest, set(likeliest[0].estimate.chosen.alike))
+    likeliest = _best_variants(given, first, found)
+    return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.alike))
 
 
-def _with_alternatives(points: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:
+def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:
     """Add single fits of further effects, and of those that the linearised search cannot tell from the best; best first.
 
     Of each effect the variant with the parameters that the linearised search prefers is used, in every camera.
@@ -271,20 +284,20 @@ def _with_alternatives(points: SearchInput, first: MeanSearch, alone: list[_Sing
         others.pop(each.name, None)
     plain = (each for each in first.design.families.plain if not each.empirical)
     variants = [each for each in plain if each.names == others.get(each.name)]
-    more = [each for each in (_single_fit(points, first, variant) for variant in variants) if each is not None]
+    more = [each for each in (_single_fit(given, first, variant) for variant in variants) if each is not None]
     if not more:
         return alone
-    ranked = sorted([*alone, *_best_variants(points, first, more)], key=lambda each: -each.score)
-    return _with_alternatives(points, first, ranked, set(ranked[0].estimate.chosen.alike))
+    ranked = sorted([*alone, *_best_variants(given, first, more)], key=lambda each: -each.score)
+    return _with_alternatives(given, first, ranked, set(ranked[0].estimate.chosen.alike))
 
 
-def _single_fit(points: SearchInput, first: MeanSearch, candidate: Candidate) -> _SingleFit | None:
+def _single_fit(given: SearchInput, first: MeanSearch, candidate: Candidate) -> _SingleFit | None:
     """One effect in the model, at the coefficients of the linearised fit."""
     (estimate,) = _estimates_of(first, [first.alone(candidate)])
-    return _SingleFit.of(points, first, estimate)
+    return _SingleFit.of(given, first, estimate)
 
 
-def _best_variants(points: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:
+def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:
     """The best effects, refitted to convergence, best first.
 
     Of the best effect further variants are refitted too, because which camera it belongs to may not show before.
@@ -292,16 +305,16 @@ def _best_variants(points: SearchInput, first: MeanSearch, found: list[_SingleFi
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
     variants = {each.name: each for each in reversed(ranked)}
     likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
-    best, *rest = sorted((_converged(points, first, each) for each in likely), key=lambda each: -each.score)
+    best, *rest = sorted((_converged(given, first, each) for each in likely), key=lambda each: -each.score)
     others = [each for each in ranked if each.name == best.name and each is not variants[best.name]][: _MOST_CONVERGED - 1]
-    best = max([best, *(_converged(points, first, each) for each in others)], key=lambda each: each.score)
+    best = max([best, *(_converged(given, first, each) for each in others)], key=lambda each: each.score)
     return [best, *rest]
 
 
-def _search_beside_best(points: SearchInput, plain: SearchOutcome, alone: list[_SingleFit]) -> SearchOutcome | None:
+def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_SingleFit]) -> SearchOutcome | None:
     """Repeat the search beside the best of some single fits."""
     estimate = _with_equivalence_class(alone).estimate
-    return _search_beside(points, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
+    return _search_beside(given, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
 
 
 def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
@@ -314,26 +327,26 @@ def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
     return replace(best, estimate=replace(best.estimate, chosen=replace(chosen, alike=tuple(sorted(near | linearised)))))
 
 
-def _converged(points: SearchInput, first: MeanSearch, alone: _SingleFit) -> _SingleFit:
+def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _SingleFit:
     """Gauss-Newton steps until the log-likelihood rises by less than 1."""
     for _ in range(_MOST_ROUNDS):
-        improved = alone.improved(points, first)
+        improved = alone.improved(given, first)
         if improved is None or improved.log_likelihood < alone.log_likelihood + _CONVERGED_GAIN:
             break
         alone = improved
     return alone
 
 
-def _search_beside(points: SearchInput, chosen: SearchOutcome) -> SearchOutcome | None:
+def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome | None:
     """Repeat the search beside the selected effects; None where there are none, or where one is out of bounds."""
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
-    if not physical or out_of_bounds(points.measurement, chosen.estimates, chosen.at):
+    if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
         return None
-    again = _repeat_search(points, physical, chosen.search.gains_alone)
+    again = _repeat_search(given, physical, chosen.search.gains_alone)
     if again is None:
         return None
     search, at, estimates, beside, tried = again
-    return replace(chosen, estimates=estimates, search=search, at=at, beside=beside, tried=tried)
+    return replace(chosen, estimates=estimates, search=search, residuals=at, beside=beside, tried=tried)
 
 
 def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
@@ -385,14 +398,14 @@ def _estimates_of(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
 
 
 def _repeat_search(
-    points: SearchInput, had: list[Estimate], alone: Mapping[Explanation, float]
+    given: SearchInput, known_effects: list[Estimate], alone: Mapping[Explanation, float]
 ) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]] | None:
     """Repeat the search with some effects in the model, whose coefficients stay free like the pose.
 
     Parameters
     ----------
-    points : input of the searches.
-    had : effects to put into the model.
+    given : input of the searches.
+    known_effects : effects to put into the model.
     alone : log-likelihood ratio of each explanation alone.
 
     Returns
@@ -400,25 +413,25 @@ def _repeat_search(
     tuple or None : the search, its residuals, the estimates of all effects, the new explanations, and what was tried last; None
         if too few rays meet the reference with the effects.
     """
-    part = points.part
-    there, found, _ = _aligned_with_estimates(points, had)
-    at = with_added_variance(at_points_of(found, part), points.added)
-    if _too_few_left(points, at):
+    part = given.part
+    measurement, found, _ = _aligned_with_estimates(given, known_effects)
+    at = with_added_variance(at_points_of(found, part), given.added)
+    if _too_few_left(given, at):
         return None
-    renewed = candidate_families(there, at)
-    allowed = {(family.name, family.empirical) for family in points.families}
-    names = {each.candidate.name for each in had}
+    renewed = candidate_families(measurement, at)
+    allowed = {(family.name, family.empirical) for family in given.families}
+    names = {each.candidate.name for each in known_effects}
     others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
-    known = [replace(each, candidate=_recomputed(each.candidate, renewed)) for each in had]
+    known = [replace(each, candidate=_recomputed(each.candidate, renewed)) for each in known_effects]
     columns = [_free_columns(each) for each in known]
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
     others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in OVERTONES]
-    weighted = _with_variance_refitted(points, at)
+    weighted = _with_variance_refitted(given, at)
     precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
         replace(weighted, pose=np.concatenate([at.pose, *columns], axis=1)),
         others,
-        points.random.child("again"),
+        given.random.child("again"),
         np.concatenate([np.zeros(at.pose.shape[1]), *precision]),
         alone,
     )
@@ -431,14 +444,14 @@ def _repeat_search(
     return search, at, _merge_sines_with_overtones([*kept, *_estimates_of(search, chosen)]), chosen, tried
 
 
-def _with_variance_refitted(points: SearchInput, at: Residuals) -> Residuals:
+def _with_variance_refitted(given: SearchInput, at: Residuals) -> Residuals:
     """Residuals with the noise fitted beside the effects in the model. Without these, their signatures would look like noise."""
-    return with_fitted_variance(at, points.variance_at(at), registered(at)[2])
+    return with_fitted_variance(at, given.variance_at(at), registered(at)[2])
 
 
-def _aligned_with_estimates(points: SearchInput, effects: list[Estimate]) -> Settled:
+def _aligned_with_estimates(given: SearchInput, effects: list[Estimate]) -> Settled:
     """Put some effects into the model of the measurement and estimate the pose again."""
-    return aligned_with(points.measurement, [effect_from_estimate(each, points.part) for each in effects], points.part.index)
+    return aligned_with(given.measurement, [effect_from_estimate(each, given.part) for each in effects], given.part.index)
 
 
 def _merge_sines_with_overtones(estimates: list[Estimate]) -> list[Estimate]:

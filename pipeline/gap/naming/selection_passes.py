@@ -70,7 +70,7 @@ class PassInput:
     @classmethod
     def of(
         cls,
-        there: Measurement,
+        aligned: Measurement,
         plain: Residuals,
         held_out_points: BoolArray,
         edge_effects: list[EdgeEffect],
@@ -80,7 +80,7 @@ class PassInput:
 
         Parameters
         ----------
-        there : aligned measurement.
+        aligned : aligned measurement.
         plain : its residuals, without edge effects.
         held_out_points : (N,) points of the measurement that are kept for validation.
         edge_effects : effects to put into the model; their `touched` refers to the points of the measurement.
@@ -88,11 +88,11 @@ class PassInput:
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
         registration_rows = plain.index[~(touched | held_out_points[plain.index])] if realigned else None
-        modelled, residuals = _with_edge_effects(there, plain, edge_effects, touched, registration_rows)
+        modelled, residuals = _with_edge_effects(aligned, plain, edge_effects, touched, registration_rows)
         registered_residuals, _, noise_ratio = registered(residuals)
-        sight = Sight.of(there, residuals)
+        sight = Sight.of(aligned, residuals)
         changes, changed = find_changes(replace(residuals, value=registered_residuals), sight, residuals.even & ~touched)
-        if isinstance(there, TlsMeasurement) and there.scans:
+        if isinstance(aligned, TlsMeasurement) and aligned.scans:
             changes = once_each(changes)
         registered_residuals, _, noise_ratio = registered(replace(residuals, smooth=residuals.smooth & ~changed))
         cells = Cells.over(residuals.at)
@@ -133,12 +133,12 @@ class PassInput:
 
         What edge effects do at these points is kept fixed: it hardly changes while the cameras move by millimetres.
         """
-        there, residuals = self.measurement, self.residuals
-        if isinstance(there, StereoMeasurement) and isinstance(residuals, StereoResiduals):
-            shaped = np.zeros(len(there.cloud.points))
+        measurement, residuals = self.measurement, self.residuals
+        if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
+            shaped = np.zeros(len(measurement.cloud.points))
             shaped[residuals.index] = residuals.geometry.shaped
-            there = there.changed(shaped_px=shaped)
-        return subsample(there, residuals, self.training_rows)
+            measurement = measurement.changed(shaped_px=shaped)
+        return subsample(measurement, residuals, self.training_rows)
 
 
 @dataclass(frozen=True)
@@ -181,6 +181,7 @@ class PassInputs:
 
     @cached_property
     def _edge_effects(self) -> list[EdgeEffect]:
+        """The edge effects that show in the plain residuals."""
         return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
 
     @cached_property
@@ -226,6 +227,7 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
     """
 
     def search_edges_again(found: SelectionPass) -> SelectionPass:
+        """Repeat the pass beside the edge effects that show once the named effects are in the model."""
         if not found.named:
             return found
         # a small error of the rays' directions looks like smoothing
@@ -296,8 +298,8 @@ def _with_edge_effects(
     place[found.index] = np.arange(len(found))
     rows = place[residuals.index]
     known = rows >= 0
-    there = residuals.with_rows(known, found.part(rows[known]))
-    return modelled, replace(there, smooth=residuals.smooth & ~touched & known)
+    matched = residuals.with_rows(known, found.part(rows[known]))
+    return modelled, replace(matched, smooth=residuals.smooth & ~touched & known)
 
 
 def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:

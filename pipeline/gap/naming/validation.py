@@ -133,9 +133,11 @@ class Validation:
         return 0.0 if gap is None else gap.after - gap.before - thresholds().verdict.gap_sigmas * gap.error
 
     def _model(self, named: list[NamedEffect]) -> TlsModel | StereoModel:
+        """The model with the effects and the reduced noise."""
         return with_effects(self.measurement.model, [item.entry for item in named], self.reduced_noise)
 
     def _result_of(self, named: list[NamedEffect], rows: BoolArray) -> ValidationResult:
+        """Put the effects into the model and measure the gap on some points (n,)."""
         value, pose = self._registered(named)
         versions = RegisteredModel(self.measurement.model, self.pose), RegisteredModel(self._model(_without_losses(named)), pose)
         return ValidationResult(named, self.reduced_noise, self._model(named), value, pose, self._gap(named, versions, rows))
@@ -146,11 +148,12 @@ class Validation:
         if not (named or self.reduced_noise):
             return self.residuals.value - self.residuals.pose @ self.pose, self.pose
         registered_points = self.residuals.index[self.registration_rows]
-        _, found, there = aligned_with(self.measurement, named, registered_points, self.reduced_noise)
+        _, found, pose = aligned_with(self.measurement, named, registered_points, self.reduced_noise)
         rest = pose_of(found, found.smooth & np.isin(found.index, registered_points))
-        return found.of_points(found.value - found.pose @ rest, self.residuals.index), there + rest
+        return found.of_points(found.value - found.pose @ rest, self.residuals.index), pose + rest
 
     def _gap(self, named: list[NamedEffect], versions: tuple[RegisteredModel, RegisteredModel], rows: BoolArray) -> Gap | None:
+        """Score two models on some points (n,), or on pulses if the first effect explains missing returns."""
         missing = self.residuals.missing
         if self.losses is not None and missing is not None and named and named[0].name == f"tls.{self.losses[0].name}":
             found, held_out = self.losses

@@ -147,25 +147,26 @@ def diagnose(
 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
+    """Run the steps of the workflow on the subsampled measurement."""
     measurement.check_near(FILE)
     initial = residuals_of(measurement)
     check_noise("surface" if isinstance(initial, SurfaceResiduals) else initial.sensor, initial.sigma)
     held_out_points = np.zeros(len(measurement.cloud.points), dtype=bool)
     held_out_points[initial.index] = held_out_blocks(initial.at, Cells.over(initial.at).side_m)
     held_out_points |= _in_validation_epoch(measurement.epochs)
-    there, plain, surveyed = settled(measurement, initial.index[~held_out_points[initial.index]], initial)
-    if isinstance(there, StereoMeasurement) and isinstance(plain, StereoResiduals):
-        there = with_surroundings(there, plain)
-    if isinstance(there, TlsMeasurement) and isinstance(plain, TlsResiduals):
-        plain = replace(plain, missing=missing_returns(there, plain))
+    aligned, plain, surveyed = settled(measurement, initial.index[~held_out_points[initial.index]], initial)
+    if isinstance(aligned, StereoMeasurement) and isinstance(plain, StereoResiduals):
+        aligned = with_surroundings(aligned, plain)
+    if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):
+        plain = replace(plain, missing=missing_returns(aligned, plain))
     clock.lap("residuals")
     if plain.smooth.sum() < thresholds().points.fewest:
         return _insufficient_data(measurement, plain, clock)
-    validated = _select_and_validate(PassInputs(there, plain, held_out_points), random)
+    validated = _select_and_validate(PassInputs(aligned, plain, held_out_points), random)
     given, selection = validated.given, validated.selection
     clock.lap("naming")
     validation = Validation(
-        measurement=there,
+        measurement=aligned,
         residuals=plain,
         registration_rows=given.training_rows,
         tested=given.measurable & given.held_out,
@@ -174,7 +175,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         reference_sigma=selection.reference_sigma,
         most_sigmas=thresholds().points.outlier_sigmas * given.noise_ratio,
         random=random,
-        reduced_noise=reduced_noise(there.model, _share_of_model_noise(selection.unexplained_noise.at_most_one, plain)),
+        reduced_noise=reduced_noise(aligned.model, _share_of_model_noise(selection.unexplained_noise.at_most_one, plain)),
     )
     result, harmful = validation.validate(validated.named)
     notes = [
@@ -187,10 +188,10 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     wide = 1.0 if any(item.adds_variance for item in result.named) else selection.unexplained_noise.value
     evidence = Evidence(result.gap, selection.p_beside(result.named), selection.unexplained_noise.at_most_one, far, wide=wide)
     notes = [*notes, *note_overdispersion(evidence, notes)]
-    evidence = _with_moved_share(evidence, there, given, result)
+    evidence = _with_moved_share(evidence, aligned, given, result)
     if evidence.much_moved:
         result, _ = replace(validation, reduced_noise={}).validate([])
-        notes = [*note_moved_wall(evidence, bool(there.stable_areas)), *selection.notes]
+        notes = [*note_moved_wall(evidence, bool(aligned.stable_areas)), *selection.notes]
     value = plain.value - plain.pose @ validation.pose
     clock.lap("validation")
     return GapDiagnosis(
@@ -223,7 +224,7 @@ def _share_of_model_noise(share: float, residuals: Residuals) -> float:
     return float(np.sqrt(max(share**2 * whole - reference, _LEAST_MODEL_SHARE**2 * own) / own))
 
 
-def _with_moved_share(evidence: Evidence, there: Measurement, given: PassInput, result: ValidationResult) -> Evidence:
+def _with_moved_share(evidence: Evidence, aligned: Measurement, given: PassInput, result: ValidationResult) -> Evidence:
     """Add the share of the wall that moved, if that may be why nothing closes the gap, or why a noise term was named.
 
     A noise term closes part of any gap, but it does not move neighbours together: beside a true noise next to nothing moved.
@@ -233,10 +234,10 @@ def _with_moved_share(evidence: Evidence, there: Measurement, given: PassInput, 
     if not (noisy or still_unexplained):
         return evidence
     after = replace(given.residuals, value=result.value)
-    sight = Sight.of(there, after)
+    sight = Sight.of(aligned, after)
     moved = moved_share(after, sight, given.stable)
     if noisy and not still_unexplained and moved >= thresholds().changes.moved_share:
-        found = residuals_of(there.changed(model=result.model))
+        found = residuals_of(aligned.changed(model=result.model))
         sigma = found.of_points(found.sigma, after.index)
         beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, given.stable)
         moved = moved if beside >= thresholds().changes.moved_share_beside_noise else 0.0
@@ -275,13 +276,13 @@ def _select_and_validate(
     inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]] = frozenset()
 ) -> _ValidatedSelection:
     """Select effects and validate them. If an empirical term fails, the selection is repeated without empirical terms."""
-    best, there, plain = best_pass(inputs, random, excluded), inputs.measurement, inputs.plain
+    best, aligned, plain = best_pass(inputs, random, excluded), inputs.measurement, inputs.plain
     given, selection = best.pass_input, best.selection
-    losses = _explain_losses(there, given)
-    lost = [effect_from_losses(losses[0], there.cloud.intensity)] if losses else []
+    losses = _explain_losses(aligned, given)
+    lost = [effect_from_losses(losses[0], aligned.cloud.intensity)] if losses else []
     named = sorted([*best.named, *map(effect_from_edges, given.edge_effects), *lost], key=lambda item: -item.gain)
-    named, words = only_within_bounds(there.model, named)
-    scored = _validate(there, given, named, selection.reference_sigma)
+    named, words = only_within_bounds(aligned.model, named)
+    scored = _validate(aligned, given, named, selection.reference_sigma)
     words += [f"{item.name} dropped: it does not improve the validation blocks" for item in scored.failed]
     nameable = any(not each.empirical for each in plain.candidates)
     if (
@@ -297,19 +298,19 @@ def _select_and_validate(
     least = thresholds().validation.leftover_share * max(described, default=0.0)
     left = [item for item in scored.named if item.adds_variance and item.gain < least]
     words += [f"{item.name} dropped: it only describes the misfit of the empirical term" for item in left]
-    steady = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
+    rows_of_tails = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
     kept = [item for item in scored.named if item not in left]
-    found, tails = _with_heavy_tails(*subsample(there, given.residuals, steady), kept, given.cells.side_m)
+    found, tails = _with_heavy_tails(*subsample(aligned, given.residuals, rows_of_tails), kept, given.cells.side_m)
     words += [tails.note] if tails else []
-    return _ValidatedSelection(given, selection, losses, with_separating_measurements(there, found), tails, words)
+    return _ValidatedSelection(given, selection, losses, with_separating_measurements(aligned, found), tails, words)
 
 
-def _validate(there: Measurement, given: PassInput, named: list[NamedEffect], reference_sigma: float) -> ValidatedEffects:
+def _validate(aligned: Measurement, given: PassInput, named: list[NamedEffect], reference_sigma: float) -> ValidatedEffects:
     """Score the effects on the validation points."""
     tested = subsample_rows(np.flatnonzero(given.stable & given.held_out))
     rows = np.concatenate([given.training_rows, tested])
-    trained = np.arange(len(rows)) < len(given.training_rows)
-    return validate_effects(*subsample(there, given.residuals, rows), named, trained, reference_sigma)
+    training = np.arange(len(rows)) < len(given.training_rows)
+    return validate_effects(*subsample(aligned, given.residuals, rows), named, training, reference_sigma)
 
 
 def _with_heavy_tails(
@@ -327,13 +328,13 @@ def _with_heavy_tails(
     tails = find_heavy_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
     if tails is None or not tails.uniform or not tails.sigma:
         return named, tails
-    steady = [item for item in named if not item.adds_variance]
-    if len(steady) < len(named):
-        _, _, middle = _smooth_residuals_with(measurement, steady)
+    rows_of_tails = [item for item in named if not item.adds_variance]
+    if len(rows_of_tails) < len(named):
+        _, _, middle = _smooth_residuals_with(measurement, rows_of_tails)
         if middle**2 - 1 > thresholds().variance.core_excess:
             return named, tails
     heavy = effect_from_tails(part, tails.sigma * float(np.median(part.sigma)), tails.gain)
-    return [*steady, *only_within_bounds(measurement.model, [heavy])[0]], tails
+    return [*rows_of_tails, *only_within_bounds(measurement.model, [heavy])[0]], tails
 
 
 def _smooth_residuals_with(measurement: Measurement, named: list[NamedEffect]) -> tuple[Residuals, FloatArray, float]:
@@ -354,6 +355,7 @@ class _Clock:
         self.laps: dict[str, float] = {}
 
     def lap(self, name: str) -> None:
+        """End a step."""
         now = time.perf_counter()
         self.laps[name], self._last = now - self._last, now
         if self._report is not None:
@@ -361,6 +363,7 @@ class _Clock:
 
     @property
     def total(self) -> float:
+        """Time since the start, s."""
         return time.perf_counter() - self._start
 
 

@@ -196,6 +196,7 @@ def find_disparity_edge_effects(
 
 
 def _run_search(data: _EdgeData, search: _EffectSearch) -> EdgeEffect | None:
+    """Run one search; the order of arguments suits `functools.partial`."""
     return search(data)
 
 

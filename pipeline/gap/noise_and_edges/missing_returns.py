@@ -266,5 +266,6 @@ def _fit_directional_losses(losses: LossData, covariates: dict[str, FloatArray])
 
 
 def _log_likelihood(lost: BoolArray, probability: FloatArray) -> float:
+    """Bernoulli log-likelihood of losses (m,) with probability (m,)."""
     p = np.clip(probability, 1e-9, 1 - 1e-9)
     return float(np.sum(np.log(np.where(lost, p, 1 - p))))

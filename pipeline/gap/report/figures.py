@@ -228,10 +228,12 @@ class _PixelGrid:
 
 
 def _means(group: Any, values: FloatArray, size: int) -> FloatArray:
+    """Mean of the values of each group."""
     return np.asarray(np.bincount(group, values, size) / np.maximum(np.bincount(group, minlength=size), 1))
 
 
 def _mean_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str, label: str) -> None:
+    """Draw the mean of each bin with a band of two standard errors."""
     mean = _means(group, values, len(middle))
     count = np.maximum(np.bincount(group, minlength=len(middle)), 1)
     error = 2 * np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0) / count)
@@ -240,6 +242,7 @@ def _mean_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, c
 
 
 def _std_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str) -> None:
+    """Draw the standard deviation of each bin with a band of two standard errors."""
     mean = _means(group, values, len(middle))
     spread = np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0))
     error = 2 * spread / np.sqrt(2 * np.maximum(np.bincount(group, minlength=len(middle)), 1))

@@ -96,6 +96,7 @@ def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:
 
 
 def _row(found: Identifiability, row: int) -> _Row:
+    """The table's row of one effect."""
     best, named = found.best_extension(row), found.named_from[row]
     helps = best.named_from[row] < _WORTHWHILE_RATIO * named
     return _Row(
@@ -110,4 +111,5 @@ def _row(found: Identifiability, row: int) -> _Row:
 
 
 def _format_value(parameter: str, value: float) -> str:
+    """Format a parameter's value; "never" where it is infinite."""
     return f"{parameter} {format_number(value, 2) if np.isfinite(value) else _NEVER}".strip()

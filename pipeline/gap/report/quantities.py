@@ -67,4 +67,5 @@ def _exponent(value: float) -> int:
 
 
 def _join_unit(text: str, unit: str) -> str:
+    """Append a unit, if there is one."""
     return f"{text} {unit}" if unit else text

@@ -147,6 +147,7 @@ def _describe_needed_data(found: GapDiagnosis) -> str:
 
 
 def _pictures(found: GapDiagnosis) -> dict[str, bytes]:
+    """The figures by file name, as PNG."""
     pictures = {"maps.png": maps_figure(found)} if len(found.residuals) else {}
     if inliers(found).any():
         pictures["profiles.png"] = profiles_figure(found)
@@ -160,6 +161,7 @@ def _pictures(found: GapDiagnosis) -> dict[str, bytes]:
 
 
 def _render_page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
+    """The page report.html."""
     rows = rank_disagreements(found)
     tried = sorted(found.tried, key=lambda item: -item.score)
     best = tried[0].score if tried else 0.0
