@@ -1,4 +1,4 @@
-"""Reports of elevation models: GeoTIFF."""
+"""Public reports about elevation models: GeoTIFF."""
 
 from __future__ import annotations
 
