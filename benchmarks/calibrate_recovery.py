@@ -1,11 +1,11 @@
-"""Do calibrations find the noise that maps were simulated with, and do their intervals hold it as often as they say?
+"""Check whether calibrations recover the noise of simulated maps, and whether their intervals have the stated coverage.
 
     python benchmarks/calibrate_recovery.py [--sensor stereo|tls] [--trials 50] [--out DIR] [--write]
 
-Each trial has a wall and a seed of its own and draws its true noise at random; its maps are made by the whole simulation
-(`noise_map`: every cell, meshing, ICP of one noisy epoch to the other, rasters), not by the one that the calibration searches
-with. Finished trials are kept under --out, so an interrupted benchmark goes on where it was. --write puts the
-table into docs/validation/calibration.md.
+Each trial has its own wall and seed and draws its true noise at random. Its maps come from the whole simulation (`noise_map`:
+every cell, meshing, ICP between two noisy epochs, rasters), not from the fast one that the calibration searches with. Finished
+trials are kept under --out, so that an interrupted benchmark continues. --write puts the table into
+docs/validation/calibration.md.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ TRUTH = {
     "range_sigma_m": (0.0015, 0.01),
     "angle_sigma_rad": (3e-5, 3e-4),
 }
-"""Bounds between which the logarithm of the true value is uniform."""
+"""Bounds of the true value, whose logarithm is uniform."""
 
 
 def trial(sensor: Any, number: int) -> dict[str, Any]:
-    """One calibration: true values, estimates, intervals."""
+    """Run one calibration and return true values, estimates and intervals."""
     config = load_config(bundled_config("", "demo"), [*SETTINGS, f"wall.seed={100 + number}"], sensor, 1000 + number)
     random = KeyedRandom(50_000 + number)
     site = prepare_site(config, sensor, KeyedRandom(config.seed))
@@ -86,8 +86,9 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
 
 
 def table(found: list[dict[str, Any]]) -> list[str]:
-    """Per parameter: intervals that hold the truth, with the binomial bounds (Clopper and Pearson 1934) of 95 % of their share,
-    median width and RMS error of the logarithm."""
+    """Return, for each parameter, the coverage of the intervals with its 95 % binomial interval (Clopper and Pearson 1934), the
+    median width, and the RMS error of the logarithm.
+    """
     rows = [f"| {len(found)} trials | in the interval of 95 % (bounds of the share) | RMS error | median half width |"]
     rows.append("|" + "---|" * 4)
     for name in found[0]["parameters"]:

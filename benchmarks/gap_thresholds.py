@@ -1,10 +1,10 @@
-"""What each threshold of the diagnosis does when it is 0.7 and 1.4 times as large, on development cases.
+"""Measure the effect of each threshold of the diagnosis when it is 0.7 and 1.4 times as large, on development cases.
 
     python benchmarks/gap_thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/validation/gap_thresholds.md
 
-The first diagnosis of a case carries each threshold's other values along and notes which of them would have decided
-otherwise; only with those it is diagnosed again. Interrupted, it goes on where it was; `--minutes` ends it with the table of
-what there is; `--all` diagnoses again with those that make no difference too, and fails where one does.
+The first diagnosis of a case also carries each threshold's other values (benchmarks/varied.py) and records which of them would
+change a decision; only with those is it diagnosed again. An interrupted run continues. `--minutes` ends it with the table so far;
+`--all` also repeats the diagnosis with values that change no decision, and fails if one does.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WRONGS = ("false alarm", "wrong name", "missed", "not answered unknown", "called
 
 
 class _Watched:
-    """Thresholds whose values are `Varied`: which were asked for, and which would have decided otherwise."""
+    """Thresholds whose values are `Varied`: records which were used, and which would have changed a decision."""
 
     def __init__(self, values: Any, prefix: str, asked: set[str], matters: set[Setting]) -> None:
         self._values, self._prefix, self._asked, self._matters = values, prefix, asked, matters
@@ -53,7 +53,7 @@ class _Watched:
 
 @functools.cache
 def _others(key: str) -> dict[Setting, Any]:
-    """A threshold's other values; none for a factor that it cannot have."""
+    """Return a threshold's other values; none for an impossible factor."""
     group, name = key.split(".")
     found = {factor: scaled(key, factor) for factor in FACTORS}
     return {(key, factor): getattr(getattr(by, group), name) for factor, by in found.items() if by is not None}
@@ -65,7 +65,7 @@ def keys() -> list[str]:
 
 
 def scaled(key: str, factor: float) -> Thresholds | None:
-    """The usual thresholds with one of them so many times as large; None where it may not be, or where whole numbers stay."""
+    """Return the usual thresholds with one of them scaled; None if the value is not allowed or does not change."""
     group, name = key.split(".")
     values = Thresholds().model_dump()
     old = values[group][name]
@@ -78,7 +78,7 @@ def scaled(key: str, factor: float) -> Thresholds | None:
 
 
 def answer(folder: Path, thresholds: Any) -> Json:
-    """gap.json, or what went wrong."""
+    """Return gap.json, or the error."""
     measurement = read_measurement(folder)
     try:
         return to_dict(diagnose(measurement, thresholds=thresholds), measurement)
@@ -87,7 +87,7 @@ def answer(folder: Path, thresholds: Any) -> Json:
 
 
 def jobs(cases: list[Case], out: Path, *, everything: bool) -> Iterator[tuple[Case, str, float]]:
-    """What is to be diagnosed: each case as usual, and then with each threshold that makes a difference (or is asked for)."""
+    """Yield what to diagnose: each case as usual, then with each threshold that makes a difference (or was used)."""
     for case in cases:
         yield case, "usual", 1.0
     turns: Counter[Setting] = Counter()
@@ -101,14 +101,14 @@ def jobs(cases: list[Case], out: Path, *, everything: bool) -> Iterator[tuple[Ca
 
 
 def _asked(out: Path, case: Case, *, everything: bool) -> list[Setting]:
-    """Thresholds and factors that a case asked for, or only those that would have decided something in it otherwise."""
+    """Return thresholds and factors that a case used, or only those that would have changed a decision."""
     noted = json.loads((out / case.name / "asked.json").read_text())
     some = [(key, factor) for key in noted["asked"] for _, factor in _others(key)]
     return some if everything else [each for each in some if list(each) in noted["matters"]]
 
 
 def work(cases: list[Case], out: Path, minutes: float, *, everything: bool = False) -> None:
-    """Diagnose what has no answer yet, until the time is up; the usual answers in any case."""
+    """Diagnose cases without an answer until the time is up; those with the usual thresholds in any case."""
     end = time.monotonic() + 60 * minutes
     for case, key, factor in jobs(cases, out, everything=everything):
         folder = out / case.name
@@ -123,7 +123,7 @@ def work(cases: list[Case], out: Path, minutes: float, *, everything: bool = Fal
 
 
 def _usual(folder: Path) -> Json:
-    """gap.json with the usual thresholds, watched: which were asked for and which make a difference is noted beside it."""
+    """Diagnose with the usual thresholds, and record which were used and which make a difference."""
     asked: set[str] = set()
     matters: set[Setting] = set()
     measurement = read_measurement(folder / "case")
@@ -134,7 +134,7 @@ def _usual(folder: Path) -> Json:
 
 
 def _check_followed(cases: list[Case], out: Path) -> None:
-    """Raise ValueError where a threshold that was noted to make no difference makes one."""
+    """Raise ValueError if a threshold recorded as making no difference makes one."""
     for case in cases:
         usual = json.loads((out / case.name / "usual@1.json").read_text())
         for key, factor in set(_asked(out, case, everything=True)) - set(_asked(out, case, everything=False)):
@@ -144,7 +144,7 @@ def _check_followed(cases: list[Case], out: Path) -> None:
 
 
 def _bare(found: Json) -> Json:
-    """Of an answer what may not depend on a threshold that decides nothing."""
+    """Return the parts of an answer that must not depend on a threshold that decides nothing."""
     return {key: value for key, value in found.items() if key not in ("seconds", "timings", "decisions")}
 
 
@@ -154,7 +154,7 @@ def _row(truth: Json, folder: Path, name: str) -> Json | None:
 
 
 def table(cases: list[Case], out: Path) -> str:
-    """One line for each threshold that some case asked for: how many answers change, and what becomes wrong or right."""
+    """Return one line for each threshold that some case used: how many answers change, and become wrong or right."""
     cells: dict[str, dict[float, list[tuple[Json, Json]]]] = {}
     for case in cases:
         folder = out / case.name

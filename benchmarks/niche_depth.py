@@ -1,11 +1,12 @@
-"""How deep the niches of small blocks are, and how many of them stand out: by placement, and on coarser and smoother walls.
+"""Measure how deep the niches of small blocks are, and how many stand out from the noise, by placement and on coarser, smoother
+walls.
 
     python benchmarks/niche_depth.py [--width 24 --height 14] [--maps 2] [--write]
 
-The thesis carves its blocks out of Metashape's mesh of a wall, made from depth maps of a quarter of the images' resolution: its
-vertices are farther apart, and it is smoother than rock. Here the relief of a Glendale wall, sampled every centimetre, goes
-through a Gaussian filter and is sampled anew. Small blocks as in configs/datasets/detector_test.yaml, stereo pair, surfaces by
-vertices. --write puts the table into docs/validation/detector_bound.md.
+The thesis carves its blocks out of Metashape's mesh of a wall, made from depth maps at a quarter of the images' resolution: its
+vertices are farther apart, and it is smoother than rock. Here the relief of a Glendale wall, sampled every centimetre, is
+smoothed by a Gaussian filter and sampled again. Small blocks are as in configs/datasets/detector_test.yaml, with a stereo pair
+and surfaces by vertices. --write puts the table into docs/validation/detector_bound.md.
 """
 
 from __future__ import annotations

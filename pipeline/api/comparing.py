@@ -141,7 +141,7 @@ class Comparison:
 
 
 def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any]) -> list[Given]:
-    """Turn the arguments of `compare` into what `contestants` takes: names of files and presets, or pairs of a name and a
+    """Turn the arguments of `compare` into what `sensor_setups` takes: names of files and presets, or pairs of a name and a
     config.
     """
     if not sensors:

@@ -15,11 +15,11 @@ from pipeline.api.maps import DIFFERENCE, data_array
 from pipeline.api.pictures import Picture, html_table
 from pipeline.api.tables import frame
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.outlines import in_survey
-from pipeline.monitor.products import COLUMNS, Result
-from pipeline.monitor.report import headline
-from pipeline.monitor.run import monitor_paths
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.outlines import in_survey
+from pipeline.monitoring.products import COLUMNS, Result
+from pipeline.monitoring.report import headline
+from pipeline.monitoring.run import monitor_paths
 from pipeline.report.notebook_progress import python_progress
 from scene.common.errors import InputError
 
@@ -97,8 +97,8 @@ class Monitoring:
 
     Attributes
     ----------
-    result : pipeline.monitor.products.Result
-        Folder, sources, site and epochs, as `pipeline.monitor` computes them.
+    result : pipeline.monitoring.products.Result
+        Folder, sources, site and epochs, as `pipeline.monitoring` computes them.
     """
 
     result: Result

@@ -13,7 +13,7 @@ from scene.common.errors import InputError
 from scene.common.lengths import METRES
 
 if TYPE_CHECKING:
-    from pipeline.monitor.options import MonitorOptions
+    from pipeline.monitoring.options import MonitorOptions
 
 SUMMARY = "compare real epochs of a wall: registered maps, level of detection, a list of what fell"
 EXAMPLE = """  scarpsim monitor march.laz april.laz --out april
@@ -82,10 +82,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
     """Compare the epochs and write maps, events and report."""
-    from pipeline.monitor.follow import follow
-    from pipeline.monitor.report import headline
-    from pipeline.monitor.run import monitor_paths
-    from pipeline.monitor.write_site import write_site
+    from pipeline.monitoring.follow import follow
+    from pipeline.monitoring.report import headline
+    from pipeline.monitoring.run import monitor_paths
+    from pipeline.monitoring.write_site import write_site
     from pipeline.report.progress import shown_progress
 
     options = _options(arguments)
@@ -108,7 +108,7 @@ def _options(arguments: argparse.Namespace) -> MonitorOptions:
     """Collect the options of the comparison from the arguments."""
     import numpy as np
 
-    from pipeline.monitor.options import MonitorOptions, read_areas
+    from pipeline.monitoring.options import MonitorOptions, read_areas
 
     if arguments.scanner and arguments.model:
         raise InputError("cannot be combined with --model", where="--scanner", remedy="give one of them")

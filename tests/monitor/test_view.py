@@ -10,8 +10,8 @@ import pytest
 from monitor_cases import STATION, las, points
 
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.run import monitor_paths
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.run import monitor_paths
 from pipeline.view.figures import map_figure, wall_figure
 from pipeline.view.monitor_results import MonitorResults
 from pipeline.view.server import make_app, open_results

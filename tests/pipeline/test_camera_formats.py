@@ -227,8 +227,8 @@ def test_a_camera_of_a_rig_is_no_unaligned_one(tmp_path: Path) -> None:
         ("<k1>-0.05</k1>", "<k1>minus</k1>", "expected 1 numbers, got 'minus'"),
         ("<k1>-0.05</k1>", "<k1>-50</k1>", "folds the image"),
         ('label="B"', 'label="A"', "labelled 'A'"),
-        ('sensor_id="0" component_id="0" label="A"', 'component_id="0" label="A"', "names no sensor"),
-        ("0 -1 0 1 0 0 0 0 1<", "0 1 0 1 0 0 0 0 1<", "no rotation"),
+        ('sensor_id="0" component_id="0" label="A"', 'component_id="0" label="A"', "sensor of camera"),
+        ("0 -1 0 1 0 0 0 0 1<", "0 1 0 1 0 0 0 0 1<", "not a rotation"),
         (">2.5<", ">-2.5<", "scale -2.5"),
         ("<document", "<!DOCTYPE x><document", "entities"),
         ("</document>", "", "not valid XML"),
@@ -276,7 +276,7 @@ def test_the_pair_has_to_be_clear(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=what):
             CamerasFile(file=path, left=labels[0], right=labels[1]).pair()
     path.write_text(EXPORT.replace('label="C"/', 'label="C"><transform>1 0 0 4 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera'))
-    with pytest.raises(InputError, match="holds 3 aligned cameras"):
+    with pytest.raises(InputError, match="has 3 aligned cameras"):
         CamerasFile(file=path).pair()
 
 
@@ -304,7 +304,7 @@ def test_unreadable_files_are_one_line(tmp_path: Path) -> None:
         ("none.xml", "cannot be read"),
         ("lens.yml", "FileStorage"),
         ("part.yml", "has no matrix"),
-        ("lens.txt", "no number"),
+        ("lens.txt", "not a number"),
     ):
         with pytest.raises(InputError, match=what):
             read_lens(tmp_path / name)

@@ -134,7 +134,7 @@ def test_what_was_guessed_is_said(case: Case, tmp_path: Path) -> None:
     scan = read_scans(as_pts(case, tmp_path))[0]
     assert "x, y, z, intensity, red, green, blue" in scan.words[0]
     scan = read_scans(as_ptx(case, tmp_path))[0]
-    assert any("made so" in words for words in scan.words)
+    assert any("was corrected" in words for words in scan.words)
     assert len(scan.cloud.points) == len(case[1].points)
     assert len(read_points(tmp_path / "a.ptx").points) == len(case[1].points)
     cells = read_ptx(tmp_path / "a.ptx")[0].cloud.extra
@@ -230,10 +230,10 @@ def test_a_rotation_of_few_digits_is_made_orthonormal() -> None:
     mended, words = orthonormal(turn, "a")
     np.testing.assert_allclose(mended @ mended.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(mended, turn, atol=1e-3)
-    assert "off from orthonormal" in words[0]
+    assert "deviated from orthonormal" in words[0]
     assert orthonormal(np.eye(3), "a")[1] == ()
     for wrong in (np.diag([1.0, 1.0, -1.0]), 2 * np.eye(3), np.full((3, 3), np.nan)):
-        with pytest.raises(InputError, match="no rotation matrix"):
+        with pytest.raises(InputError, match="not a rotation matrix"):
             orthonormal(wrong, "a")
 
 
@@ -264,7 +264,7 @@ def test_a_pattern_may_be_in_degrees_and_run_the_other_way(case: Case, tmp_path:
 
 def test_degrees_stand_beside_no_radians(case: Case, tmp_path: Path) -> None:
     folder = rewritten(case, tmp_path, lambda values: values["pattern"].update(zenith_deg=[40, 90, 0.7]))
-    with pytest.raises(InputError, match="'zenith_deg' stands beside 'zenith_rad'"):
+    with pytest.raises(InputError, match="'zenith_deg' and 'zenith_rad' are both given"):
         read_measurement(folder)
 
 

@@ -179,7 +179,7 @@ def test_clouds_that_are_of_no_diagnosis_are_told(gap: Path, tmp_path: Path) -> 
     for extra, points, said in (
         ({}, cloud.points, "no channel residual_m"),
         ({"residual_m": cloud.extra["residual_m"]}, cloud.points, "no channel held_out"),
-        ({**cloud.extra, "residual_m": cloud.extra["residual_m"] * np.nan}, cloud.points, "no numbers"),
+        ({**cloud.extra, "residual_m": cloud.extra["residual_m"] * np.nan}, cloud.points, "not numbers"),
         ({key: value[:2] for key, value in cloud.extra.items()}, cloud.points[:2], "holds 2 points"),
     ):
         shutil.copytree(gap, tmp_path / said)
@@ -328,7 +328,7 @@ def test_windows_beyond_the_raster_keep_a_pixel() -> None:
         (lambda folder: _written(folder, "run.json", "{"), "run.json: is not JSON"),
         (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "holds no finished epoch"),
         (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: expected a mapping"),
-        (lambda folder: _written(folder, "annotations.json", "{}"), "is no COCO annotation file"),
+        (lambda folder: _written(folder, "annotations.json", "{}"), "is not a COCO annotation file"),
     ],
 )
 def test_other_folders_are_told(make: Any, expected: str, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def write_gltf(path: Path, parts: Sequence[GltfPart]) -> None:
     Positions are float32, as glTF requires: 4 micrometres at 60 m. Raises InputError for another suffix.
     """
     if path.suffix.lower() != ".glb":
-        raise InputError(f"the format '{path.suffix}' is unknown", where=str(path), allowed=".glb")
+        raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=".glb")
     import trimesh
 
     scene = trimesh.Scene()

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.monitor.events import ChangedRegion
+from pipeline.monitoring.events import ChangedRegion
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 
 from pipeline.formats.files.atomic import write_bytes, write_text
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitor.magnitude import PowerLaw, fit_power_law
-from pipeline.monitor.model import compared_in_words
-from pipeline.monitor.products import Followed, Result, event_raster
-from pipeline.monitor.significance import NORMAL_95
+from pipeline.monitoring.magnitude import PowerLaw, fit_power_law
+from pipeline.monitoring.model import compared_in_words
+from pipeline.monitoring.products import Followed, Result, event_raster
+from pipeline.monitoring.significance import NORMAL_95
 from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import template
@@ -39,7 +39,7 @@ def write_report(result: Result) -> None:
     for name, png in pictures.items():
         write_bytes(result.folder / name, png)
     rows = result.rows()
-    text = template("monitor/report.html.jinja").render(
+    text = template("monitoring/report.html.jinja").render(
         result=result,
         epochs=[_about(epoch, result) for epoch in result.epochs],
         headline=headline(result),

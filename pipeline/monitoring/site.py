@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.monitor.comparison import ReferenceHeights
-from pipeline.monitor.frame import raster_of, towards_sensor, wall_frame
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.reading import EpochData, EpochSource, read_epoch
+from pipeline.monitoring.comparison import ReferenceHeights
+from pipeline.monitoring.frame import raster_of, towards_sensor, wall_frame
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.reading import EpochData, EpochSource, read_epoch
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray

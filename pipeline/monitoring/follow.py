@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.products import Result
-from pipeline.monitor.reading import epoch_files
-from pipeline.monitor.run import monitor_paths
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.products import Result
+from pipeline.monitoring.reading import epoch_files
+from pipeline.monitoring.run import monitor_paths
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 

@@ -9,8 +9,8 @@ import yaml
 
 from pipeline.formats.files.atomic import write_text
 from pipeline.formats.meshes.ply import write_ply
-from pipeline.monitor.products import Result
-from pipeline.monitor.significance import NORMAL_95
+from pipeline.monitoring.products import Result
+from pipeline.monitoring.significance import NORMAL_95
 from pipeline.surface.raster_mesh import mesh_of_raster
 from scene.common.errors import InputError
 

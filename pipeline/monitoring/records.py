@@ -13,7 +13,7 @@ from pycocotools import mask as coco_mask
 
 from pipeline.change.annotate import run_length_encoding
 from pipeline.formats.files.atomic import write_json
-from pipeline.monitor.events import ChangedRegion
+from pipeline.monitoring.events import ChangedRegion
 from pipeline.registration.rigid import RigidTransform
 
 KEPT = ".monitor"

@@ -15,8 +15,8 @@ from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
 from pipeline.measurement.scans import read_scans
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.times import EpochTime, check_order, time_of
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.times import EpochTime, check_order, time_of
 from scene.common.errors import InputError
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid

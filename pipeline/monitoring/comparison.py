@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.change.areas import Area
-from pipeline.monitor.alignment import Alignment, applied, coarse, reference_surface, refine
-from pipeline.monitor.events import Change, ChangedRegion, find_regions
-from pipeline.monitor.gridding import HeightRaster, gridded
-from pipeline.monitor.significance import significance
+from pipeline.monitoring.alignment import Alignment, applied, coarse, reference_surface, refine
+from pipeline.monitoring.events import Change, ChangedRegion, find_regions
+from pipeline.monitoring.gridding import HeightRaster, gridded
+from pipeline.monitoring.significance import significance
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.rigid import RigidTransform
 from scene.geometry.grid import Grid

@@ -7,8 +7,8 @@ import numpy as np
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.scans import RawScan
 from pipeline.measurement.station import find_station
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.reading import EpochData
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.reading import EpochData
 from scene.common.errors import InputError
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid

@@ -18,15 +18,15 @@ import numpy as np
 
 from pipeline.formats.files.atomic import empty_folder
 from pipeline.formats.rasters.geotiff import write_geotiff
-from pipeline.monitor.comparison import EpochChange, compare_epoch
-from pipeline.monitor.detector import regions_of_detector
-from pipeline.monitor.events import Catalogue
-from pipeline.monitor.model import predicted_level, scanner_model
-from pipeline.monitor.options import NO_DETECTOR, MonitorOptions
-from pipeline.monitor.products import Followed, Result, write_points, write_results
-from pipeline.monitor.reading import EpochData, EpochSource, find_epochs, read_epoch
-from pipeline.monitor.records import EpochRecord, kept
-from pipeline.monitor.site import ReferenceSite, prepared
+from pipeline.monitoring.comparison import EpochChange, compare_epoch
+from pipeline.monitoring.detector import regions_of_detector
+from pipeline.monitoring.events import Catalogue
+from pipeline.monitoring.model import predicted_level, scanner_model
+from pipeline.monitoring.options import NO_DETECTOR, MonitorOptions
+from pipeline.monitoring.products import Followed, Result, write_points, write_results
+from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
+from pipeline.monitoring.records import EpochRecord, kept
+from pipeline.monitoring.site import ReferenceSite, prepared
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 

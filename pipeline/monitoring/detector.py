@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from pycocotools import mask as coco_mask
 
-from pipeline.monitor.events import Change, ChangedRegion, region_of_mask
+from pipeline.monitoring.events import Change, ChangedRegion, region_of_mask
 from scene.common.errors import InputError, OutsideError
 
 CONFIDENCE = 0.9

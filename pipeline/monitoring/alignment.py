@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.areas import Area, in_areas
-from pipeline.monitor.gridding import HeightRaster
+from pipeline.monitoring.gridding import HeightRaster
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, register_to
 from pipeline.registration.rigid import RigidTransform

@@ -6,9 +6,9 @@ import numpy as np
 
 from pipeline.config.presets import read_preset
 from pipeline.formats.measurements.measurement import read_model
-from pipeline.monitor.gridding import HeightRaster
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.significance import NORMAL_95
+from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.significance import NORMAL_95
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import TlsModel

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.monitor.gridding import HeightRaster
-from pipeline.monitor.significance import Significance
+from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.significance import Significance
 from scene.geometry.grid import Grid
 
 Kind = Literal["missing", "added"]

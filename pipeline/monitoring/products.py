@@ -19,12 +19,12 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import LazHeader, write_laz
 from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.formats.records.geopackage import write_geopackage
-from pipeline.monitor.events import ChangedRegion
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.outlines import in_survey
-from pipeline.monitor.reading import EpochData, EpochSource
-from pipeline.monitor.records import EpochRecord
-from pipeline.monitor.site import ReferenceSite
+from pipeline.monitoring.events import ChangedRegion
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.outlines import in_survey
+from pipeline.monitoring.reading import EpochData, EpochSource
+from pipeline.monitoring.records import EpochRecord
+from pipeline.monitoring.site import ReferenceSite
 from pipeline.report.provenance import versions
 
 SCHEMA = 1
@@ -102,7 +102,7 @@ def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Pat
 
 def write_results(result: Result) -> None:
     """Write the tables, the outlines, COCO, the report, and monitor.json at the end."""
-    from pipeline.monitor.report import write_report
+    from pipeline.monitoring.report import write_report
 
     rows = result.rows()
     write_geotiff(result.folder / "reference.tif", result.site.reference.raster.height, result.site.grid)
