@@ -39,8 +39,10 @@ MATCHERS: dict[str, RefinementConfig | None] = {SGBM: None, REFINED: RefinementC
 
 @dataclass(frozen=True)
 class Case:
-    """One pair. true: (rows, columns), NaN where unknown or seen by one camera only; found: by matcher; reduction: frame px per
-    cell."""
+    """One pair.
+
+    true: (rows, columns), NaN where unknown or seen by one camera only; found: by matcher; reduction: frame px per cell.
+    """
 
     name: str
     true: Raster

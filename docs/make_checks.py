@@ -50,8 +50,11 @@ names the file, what is wrong, what is allowed and how to mend it, and that it w
 
 @dataclass(frozen=True)
 class Kind:
-    """Files of one kind. suffix: of their names; doors: words of a command, or a function, by their name, FILE for the file;
-    faults: how a file with a fault is made."""
+    """Files of one kind.
+
+    suffix: of their names; doors: words of a command, or a function, by their name, FILE for the file; faults: how a file with a
+    fault is made.
+    """
 
     title: str
     suffix: str

@@ -88,8 +88,9 @@ def _spread(value: Array, relative: Mapping[str, list[Array]]) -> dict[str, floa
 def _answers(
     pose: Array, designs: Mapping[str, list[Array]], value: Array, relative: Mapping[str, list[Array]]
 ) -> dict[str, str]:
-    """Return the names that the two baselines give; "" for none. Variance effects are tried on the residuals of the best mean
-    effect.
+    """Return the names that the two baselines give; "" for none.
+
+    Variance effects are tried on the residuals of the best mean effect.
     """
     fixed = basis(pose)
     value = value - fixed @ (fixed.T @ value)

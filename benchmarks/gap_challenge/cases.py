@@ -29,8 +29,9 @@ _LARGE_EVERY, _LARGE = 40, 150_000
 
 @dataclass(frozen=True)
 class Case:
-    """A planned case. number: its name; seed: of everything in it; kinds: effects by name, including forms outside
-    the catalogue.
+    """A planned case.
+
+    number: its name; seed: of everything in it; kinds: effects by name, including forms outside the catalogue.
     """
 
     number: int

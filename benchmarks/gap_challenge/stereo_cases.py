@@ -314,8 +314,9 @@ def _drawn(
 
 
 def _shown(scene: Set, kind: str, p: Parameters, part: Image) -> Array:
-    """Return the (n,) mean change of the disparity. Locking acts on the noisy disparity, which reduces its mean over the true
-    one.
+    """Return the (n,) mean change of the disparity.
+
+    Locking acts on the noisy disparity, which reduces its mean over the true one.
     """
     damping = float(np.exp(-2 * np.pi**2 * scene.noise[0] ** 2)) if kind == "pixel_locking" else 1.0
     return damping * _signature(scene, kind, p, part)

@@ -21,8 +21,9 @@ _LEAST_COSINE = 0.1
 
 @dataclass(frozen=True)
 class Scan:
-    """Points of a scanner. az, ze: recorded angles, rad; R: range, m; line: scan line; cos_i: cosine of incidence; power: or
-    None.
+    """Points of a scanner.
+
+    az, ze: recorded angles, rad; R: range, m; line: scan line; cos_i: cosine of incidence; power: or None.
     """
 
     az: Array

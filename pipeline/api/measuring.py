@@ -227,8 +227,9 @@ class Diagnosis:
 
     @property
     def changes(self) -> geopandas.GeoDataFrame:
-        """Regions where the scene itself changed: volume_m3, volume_std_m3, offset_m, position. The geometry is the bounding
-        rectangle, wall frame.
+        """Regions where the scene itself changed: volume_m3, volume_std_m3, offset_m, position.
+
+        The geometry is the bounding rectangle, wall frame.
         """
         rows, bounds = [], []
         for each in self.found.changes:

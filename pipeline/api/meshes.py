@@ -81,8 +81,9 @@ class Mesh(TriangleMesh):
         return made
 
     def plot(self, gsd_m: float | None = None) -> Picture:
-        """Return a hillshade, viewed along the normal of the mean plane. gsd_m: side of a pixel, m; default: about 100,000
-        pixels.
+        """Return a hillshade, viewed along the normal of the mean plane.
+
+        gsd_m: side of a pixel, m; default: about 100,000 pixels.
         """
         from pipeline.precision.surface import wall_raster
         from pipeline.report.figures import hillshade_figure

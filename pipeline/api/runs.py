@@ -91,8 +91,9 @@ def open_run(folder: Path | str) -> Run:
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """A run on disk, whose files are read when they are needed. `run[0]` is the reference epoch, `run[1]` the first after
-    rockfall.
+    """A run on disk, whose files are read when they are needed.
+
+    `run[0]` is the reference epoch, `run[1]` the first after rockfall.
 
     Attributes
     ----------
@@ -269,8 +270,9 @@ class Epoch:
         )
 
     def plot(self, kind: str = "difference") -> Picture:
-        """Return a figure of the report: difference, blocks, hillshade, histogram, icp or m3c2. The reference has only its
-        hillshade.
+        """Return a figure of the report: difference, blocks, hillshade, histogram, icp or m3c2.
+
+        The reference has only its hillshade.
         """
         if self.number == 0:
             return Picture((self.run.folder / "reference.png").read_bytes())

@@ -75,8 +75,9 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
 
 
 def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
-    """Rasterise `mesh` (wall frame) by looking along -z at every pixel centre of `grid`. Labels are its `face_block`, else
-    `vertex_block`.
+    """Rasterise `mesh` (wall frame) by looking along -z at every pixel centre of `grid`.
+
+    Labels are its `face_block`, else `vertex_block`.
     """
     dr.flush_malloc_cache()  # frees the observation's memory: rasterising the surface is the peak of an epoch
     return cast_raster(RayCaster(mesh), grid)

@@ -151,8 +151,9 @@ def true_change(
 
 
 def _ratio(template: FloatArray, spectrum: FloatArray) -> float:
-    """Return rho of a template. A template larger than the spectrum's window is averaged to coarser pixels, whose noise counts as
-    white.
+    """Return rho of a template.
+
+    A template larger than the spectrum's window is averaged to coarser pixels, whose noise counts as white.
     """
     side = len(spectrum)
     step = -(-max(template.shape) // side)

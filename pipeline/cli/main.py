@@ -94,8 +94,9 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run `scarpsim COMMAND ...` and return the exit status. `argv`: the words after `scarpsim`; default: those of the
-    process.
+    """Run `scarpsim COMMAND ...` and return the exit status.
+
+    `argv`: the words after `scarpsim`; default: those of the process.
     """
     words = sys.argv[1:] if argv is None else argv
     name = words[0] if words else ""

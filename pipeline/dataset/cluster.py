@@ -178,8 +178,9 @@ def _threads_each(count: int) -> int:
 
 
 def _local(stack: ExitStack, count: int) -> LocalCluster:
-    """Start workers on this machine, with one Dask thread each. Dask's memory limit is off: it takes the ray tracer's memory for
-    a leak.
+    """Start workers on this machine, with one Dask thread each.
+
+    Dask's memory limit is off: it takes the ray tracer's memory for a leak.
     """
     import dask
     from distributed import LocalCluster, Security
@@ -270,8 +271,9 @@ def _closed(each: LocalCluster | Client) -> None:
 
 
 def _remote(stack: ExitStack, address: str) -> Client:
-    """Connect to the user's scheduler. For tls://, Dask's own configuration gives the
-    certificates (docs/reference/data_sets.md).
+    """Connect to the user's scheduler.
+
+    For tls://, Dask's own configuration gives the certificates (docs/reference/data_sets.md).
     """
     from distributed import Client
 

@@ -22,8 +22,9 @@ _PROJECT = "project the points to a coordinate system in metres, such as UTM, an
 
 @dataclass(frozen=True)
 class AxisUnits:
-    """Unit of the coordinates, as a file states it. metres: length of one unit along x, y and z; source: where the file states
-    it.
+    """Unit of the coordinates, as a file states it.
+
+    metres: length of one unit along x, y and z; source: where the file states it.
     """
 
     metres: tuple[float, float, float]

@@ -265,8 +265,9 @@ def register(
 def register_to(
     surface: ReferenceSurface, moving: FloatArray, config: IcpConfig, random: KeyedRandom, *, threads: int | None = None
 ) -> Registration:
-    """Register points to a reference that is already indexed, for many registrations to one reference. Arguments as in
-    `register`.
+    """Register points to a reference that is already indexed, for many registrations to one reference.
+
+    Arguments as in `register`.
     """
     normals = _normals(surface, config)
     moving = checked_cloud(moving, "moving points")

@@ -386,8 +386,9 @@ def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) 
 
 
 def label_map_axes(axes: Axes, left: float, bottom: float) -> None:
-    """Label the axes of a map over a wall. Coordinates far from zero, m, are given relative to round numbers, which the label
-    states.
+    """Label the axes of a map over a wall.
+
+    Coordinates far from zero, m, are given relative to round numbers, which the label states.
     """
     offsets = [_shortened(axis, low) for axis, low in ((axes.xaxis, left), (axes.yaxis, bottom))]
     far = f" (from x {offsets[0]:,.0f}, y {offsets[1]:,.0f})" if any(offsets) else ""

@@ -104,8 +104,9 @@ class Progress:
         return f"{duration(self.elapsed_s)} so far" + (", slower than expected" if overdue else "")
 
     def _done(self) -> float:
-        """Return the weight that is done. A stage that has not reported its progress is estimated from the pace of earlier
-        stages.
+        """Return the weight that is done.
+
+        A stage that has not reported its progress is estimated from the pace of earlier stages.
         """
         return self._weight_finished() + self._weight() * (self._fraction or min(self._guess(), _GUESS_LIMIT))
 

@@ -53,8 +53,9 @@ class Acquisition:
 
 
 def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random: KeyedRandom) -> Acquisition:
-    """Observe `scene` with the site's sensor. The right depth map, which takes a second observation, is only made if it is
-    needed.
+    """Observe `scene` with the site's sensor.
+
+    The right depth map, which takes a second observation, is only made if it is needed.
 
     Parameters
     ----------

@@ -151,8 +151,9 @@ def labelled_surface(
 
 
 def octree_depth(points: FloatArray) -> int:
-    """Return the octree depth whose cells are as large as the median spacing of points (n, 3). Raises InputError if they
-    coincide.
+    """Return the octree depth whose cells are as large as the median spacing of points (n, 3).
+
+    Raises InputError if they coincide.
     """
     longest = float(np.ptp(points, axis=0).max())
     return int(np.clip(np.ceil(np.log2(longest / median_spacing(points))), 4, _POISSON_DEPTH_LIMIT))

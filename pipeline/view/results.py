@@ -169,8 +169,9 @@ class Results(Protocol):
         ...
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return at most about `budget` of the measured points in a window; None if the folder has none. Arguments as in
-        `patch`.
+        """Return at most about `budget` of the measured points in a window; None if the folder has none.
+
+        Arguments as in `patch`.
         """
         ...
 

@@ -32,8 +32,9 @@ class RunResults:
     step_name = "epoch"
 
     def __init__(self, folder: Path, detections: Path | None = None) -> None:
-        """Read the folder. Raises InputError if run.json is damaged, no epoch is finished, or the detections belong to other
-        maps.
+        """Read the folder.
+
+        Raises InputError if run.json is damaged, no epoch is finished, or the detections belong to other maps.
         """
         self.folder = folder
         record = read_run(folder / RUN_FILE, "continue it with simulate --resume")

@@ -20,8 +20,9 @@ _APART_M = 0.02
 
 @dataclass(frozen=True)
 class Pair:
-    """What can be shown beside the present picture. results: of the same folder; other: of a second run of the same wall, or
-    None.
+    """What can be shown beside the present picture.
+
+    results: of the same folder; other: of a second run of the same wall, or None.
     """
 
     results: Results

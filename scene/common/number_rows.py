@@ -74,8 +74,9 @@ class RowsFound:
 
 
 def split_row(line: str, separator: str | None) -> list[str]:
-    """Split a line into values, without quotation marks and a trailing comment. The last value is empty if the line ends with a
-    separator.
+    """Split a line into values, without quotation marks and a trailing comment.
+
+    The last value is empty if the line ends with a separator.
     """
     if "#" in line or "//" in line:
         line = _TRAILING.split(line, maxsplit=1)[0]

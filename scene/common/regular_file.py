@@ -145,8 +145,9 @@ def _json_gb(path: Path, size: int, enough: float) -> float:
 
 
 def bounded_lines(file: IO[AnyStr], count: int, longest: int = 65_536) -> Iterator[AnyStr]:
-    """Yield at most `count` lines of an open file. Raises ValueError for a line longer than `longest`, which would fill the
-    memory.
+    """Yield at most `count` lines of an open file.
+
+    Raises ValueError for a line longer than `longest`, which would fill the memory.
     """
     for _ in range(count):
         line = file.readline(longest)

@@ -60,10 +60,10 @@ class FrameConfig(Config):
 
 @dataclass(frozen=True)
 class WallFrame:
-    """The rigid transform between the world frame (the survey's coordinates, m) and the wall frame: x_wall = R (x_world -
-    origin).
+    """The rigid transform from the world frame to the wall frame: x_wall = R (x_world - origin).
 
-    The origin is subtracted first, so that micrometres survive with UTM-sized coordinates.
+    The world frame has the survey's coordinates, m. The origin is subtracted first, so that micrometres survive with UTM-sized
+    coordinates.
 
     Attributes
     ----------

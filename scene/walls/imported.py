@@ -122,8 +122,9 @@ def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 
 def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read a reference surface, m, and notes on it. Vertices stay as in the file, because repairs could move what is measured
-    against.
+    """Read a reference surface, m, and notes on it.
+
+    Vertices stay as in the file, because repairs could move what is measured against.
 
     Raises InputError if the file cannot be used.
     """

@@ -319,8 +319,9 @@ class LaserScanner:
         return SubRays(echoes, beam.sub_rays)
 
     def _axes(self, pulses: Pulses, start: int, count: int) -> tuple[mi.Array3f64, ...]:
-        """Return unit vectors along the beams of `count` pulses from number `start` on, and two perpendicular to each, wall
-        frame.
+        """Return unit vectors along the beams, and two perpendicular to each; wall frame.
+
+        The beams are those of `count` pulses from number `start` on.
         """
         pulse = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
         azimuth, zenith = (dr.gather(mi.Float64, angle, pulse) for angle in (pulses.aim_azimuth, pulses.aim_zenith))

@@ -1,5 +1,6 @@
-"""Define the sensor models: base noise and a list of effects, as in a config's `sensor:` section and a measurement's
-model.yaml.
+"""Define the sensor models: base noise and a list of effects.
+
+They are the `sensor:` section of a config, and model.yaml of a measurement.
 """
 
 from __future__ import annotations

@@ -61,8 +61,9 @@ class BoxTargets:
 def anchor_targets(
     anchors: np.ndarray, blocks: Tensor, valid: Tensor, config: ProposalConfig, seed: random.SeedGenerator
 ) -> AnchorTargets:
-    """Sample positive and negative anchors. Positive are those with a large overlap with a block, and the nearest one to each
-    block.
+    """Sample positive and negative anchors.
+
+    Positive are those with a large overlap with a block, and the nearest one to each block.
 
     Parameters
     ----------

@@ -215,8 +215,9 @@ def _restore_or_start(out: Path, config: TrainConfig, model: MaskRCNN, *, resume
 
 
 def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> None:
-    """Write a checkpoint. The state names the files of its epoch and is written last, so that a kill leaves the previous one
-    complete.
+    """Write a checkpoint.
+
+    The state names the files of its epoch and is written last, so that a kill leaves the previous one complete.
     """
     folder, epoch = out / CHECKPOINT, len(history.training)
     names = {"weights": f"epoch_{epoch:04d}.weights.h5", "optimizer": f"epoch_{epoch:04d}.{_OPTIMIZER}"}

@@ -200,8 +200,9 @@ def _with_pulses(
     rotation: FloatArray,
     shape: FloatArray,
 ) -> ScanGeometry | None:
-    """Return the geometry once the lines are known; None if zenith angles have no step. straight: (n,) azimuth without the line's
-    shape.
+    """Return the geometry once the lines are known; None if zenith angles have no step.
+
+    straight: (n,) azimuth without the line's shape.
     """
     try:
         step = _period(_longest_lines(zenith[far], line[far]))
@@ -319,8 +320,9 @@ def _refined_step(zenith: FloatArray, line: IntArray, far: NDArray[np.bool_], st
 
 @dataclass(frozen=True)
 class _AxisFit:
-    """Fit of the scan's axis. rotation: scanner's frame to that of the axis; shape: d, c, t; step: of azimuth; cut: azimuth at
-    the start.
+    """Fit of the scan's axis.
+
+    rotation: scanner's frame to that of the axis; shape: d, c, t; step: of azimuth; cut: azimuth at the start.
     """
 
     rotation: FloatArray

@@ -173,6 +173,8 @@ def _without_losses(named: list[NamedEffect]) -> list[NamedEffect]:
 
 
 def _may_be_dropped(item: NamedEffect) -> bool:
-    """Whether an effect may be dropped for slight harm. An empirical term on the mean may not: it is inexact, but describes a
-    misfit."""
+    """Whether an effect may be dropped for slight harm.
+
+    An empirical term on the mean may not: it is inexact, but describes a misfit.
+    """
     return item.adds_variance or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)

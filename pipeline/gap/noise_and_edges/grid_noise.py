@@ -122,8 +122,10 @@ class _Variogram:
 
     @property
     def chi2_of_reference_error(self) -> float:
-        """chi^2 of the best fit without grid noise. Errors of the reference of all lengths are tried; short ones have a lower
-        bound."""
+        """chi^2 of the best fit without grid noise.
+
+        Errors of the reference of all lengths are tried; short ones have a lower bound.
+        """
         by = thresholds().grid_noise
         chi2 = self.chi2_without_grid
         for length in _RELATIVE_LENGTHS:

@@ -155,8 +155,10 @@ def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
 
 
 def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]) -> VarianceCandidate:
-    """The candidate of an effect, one column for each typical size. Extreme values are clipped, so that a few points cannot
-    decide."""
+    """The candidate of an effect, one column for each typical size.
+
+    Extreme values are clipped, so that a few points cannot decide.
+    """
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
     columns = np.minimum(columns, np.quantile(columns, _HIGHEST_QUANTILE, axis=0))
@@ -268,8 +270,10 @@ def _describe_shared_variance(excess: float, unshared: float, sigma: FloatArray)
 
 
 def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, added: FloatArray) -> float:
-    """Share of an added variance that shows in the differences of neighbours, from the points `used`. added: over the predicted
-    variance."""
+    """Share of an added variance that shows in the differences of neighbours, from the points `used`.
+
+    added: over the predicted variance.
+    """
     part = residuals.part(used)
     value, predicted = value[used], part.sigma**2
     other = cKDTree(part.at).query(part.at, k=2)[1][:, 1]
