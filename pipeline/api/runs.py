@@ -121,7 +121,7 @@ class Run:
 
     @property
     def sensor(self) -> SensorName:
-        """ "stereo" or "tls"."""
+        """The kind of sensor: "stereo" or "tls"."""
         return "stereo" if self.record["sensor"] == "stereo" else "tls"
 
     @property
@@ -167,8 +167,9 @@ class Run:
 
     @property
     def statistics(self) -> pandas.DataFrame:
-        """One row per epoch: statistics of the differences outside the blocks (count, median_m, nmad_m, ...), RMS of the
-        registration.
+        """One row per epoch: statistics of its differences and the RMS of its registration.
+
+        The statistics (count, median_m, nmad_m, ...) are those outside the blocks.
         """
         return frame(each.statistics for each in self.epochs)
 

@@ -98,8 +98,9 @@ def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
 
 
 def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.float32]:
-    """Return reference minus epoch in z, (h, w), m: positive where rock is missing, negative where it was added, NaN without
-    data.
+    """Return reference minus epoch in z, (h, w), m.
+
+    It is positive where rock is missing, negative where it was added, and NaN without data.
     """
     if reference.grid != epoch.grid:
         raise InputError(f"{epoch.grid} is not the reference's {reference.grid}", where="difference")

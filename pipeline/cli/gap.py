@@ -1,5 +1,6 @@
-"""`scarpsim gap`: find where simulation and measurement disagree, name the effects that explain it, and write the improved
-model.
+"""`scarpsim gap`: find where simulation and measurement disagree, and name the effects that explain it.
+
+The command also writes the improved model.
 """
 
 from __future__ import annotations

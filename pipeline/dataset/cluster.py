@@ -128,8 +128,9 @@ def _make(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[tupl
 def _results(
     client: Client, futures: list[Future], cluster: LocalCluster | None
 ) -> Iterator[tuple[Future, list[dict[str, Any]]]]:
-    """Yield each future with its result as it finishes, and release it: Dask would otherwise repeat the epochs of
-    dead workers.
+    """Yield each future with its result as it finishes, and release it.
+
+    Dask would otherwise repeat the epochs of dead workers.
     """
     from distributed import KilledWorker, wait
 
@@ -180,7 +181,7 @@ def _threads_each(count: int) -> int:
 def _local(stack: ExitStack, count: int) -> LocalCluster:
     """Start workers on this machine, with one Dask thread each.
 
-    Dask's memory limit is off: it takes the ray tracer's memory for a leak.
+    Dask's memory limit is off, because it takes the ray tracer's memory for a leak.
     """
     import dask
     from distributed import LocalCluster, Security

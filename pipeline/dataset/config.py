@@ -81,8 +81,9 @@ class SizeClass(Config):
 
 
 class Part(Config):
-    """A part of the set: all combinations of its walls, noise levels, size classes and the sensors, with equally many epochs
-    each.
+    """A part of the set: all combinations of its walls, noise levels, size classes and sensors.
+
+    Each combination has equally many epochs.
     """
 
     walls: tuple[Name, ...] = Field(min_length=1, description="names of walls")

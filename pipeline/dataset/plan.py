@@ -107,8 +107,9 @@ def block_count(config: DatasetConfig, size: str, grid: Grid) -> int:
 
 
 def random_of_wall(config: DatasetConfig, wall: str) -> KeyedRandom:
-    """Return the random source of a wall without its own seed, and of its texture; the same for all sensors, noise levels and
-    sizes.
+    """Return the random source of a wall without its own seed, and of its texture.
+
+    It is the same for all sensors, noise levels and sizes.
     """
     return KeyedRandom(config.seed).child("dataset", "wall", wall)
 

@@ -60,10 +60,10 @@ class PerspectiveView:
 
     @classmethod
     def on(cls, places: FloatArray, width: int = 1280) -> PerspectiveView:
-        """Place the camera so that all `places` (n, 3), m, are in its picture of `width` px, which is at most _TALLEST times as
-        high.
+        """Place the camera so that all `places` (n, 3), m, are in its picture of `width` px.
 
-        Raises InputError if the places are one point or lie on one line of sight.
+        The picture is at most _TALLEST times as high as wide. Raises InputError if the places are one point or lie on one line of
+        sight.
         """
         forward = -_FROM / np.linalg.norm(_FROM)
         right = np.cross(forward, [0.0, 1.0, 0.0])

@@ -59,10 +59,10 @@ def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
 
 
 def save_scan(run: ExportedRun, number: int, path: Path) -> None:
-    """Write an animated GIF that shows how an epoch's points are recorded, line by line, coloured by their distance from the wall
-    plane.
+    """Write an animated GIF that shows how an epoch's points are recorded, line by line.
 
-    Raises InputError for a run of a stereo pair, which records all its points at once.
+    Points are coloured by their distance from the wall plane. Raises InputError for a run of a stereo pair, which records all its
+    points at once.
     """
     if run.record["sensor"] != "tls":
         raise InputError("is of a stereo pair", where=str(run.folder), allowed="a run of a laser scanner")

@@ -24,7 +24,12 @@ _PROJECT = "project the points to a coordinate system in metres, such as UTM, an
 class AxisUnits:
     """Unit of the coordinates, as a file states it.
 
-    metres: length of one unit along x, y and z; source: where the file states it.
+    Attributes
+    ----------
+    metres
+        Length of one unit along x, y and z, m.
+    source
+        Where the file states it.
     """
 
     metres: tuple[float, float, float]
@@ -84,8 +89,9 @@ def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option
 
 
 def understood_crs(text: str) -> Any:
-    """Return the coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260; None if PROJ does not understand
-    the text.
+    """Return the coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260.
+
+    None if PROJ does not understand the text.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -143,8 +149,9 @@ def units_of_crs(crs: Any, where: str) -> AxisUnits | None:
 
 
 def metres_of_epsg_unit(code: int) -> float | None:
-    """Return the length, m, of a unit by its EPSG code, such as 9003 of the US survey foot; None if the code is not a unit of
-    length.
+    """Return the length, m, of a unit by its EPSG code, such as 9003 of the US survey foot.
+
+    None if the code is not a unit of length.
     """
     from pyproj.database import get_units_map
 

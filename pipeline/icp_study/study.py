@@ -1,5 +1,6 @@
-"""Study which settings of ICP suit a run: the two sensitivity studies of the thesis (3.6), with the true transform beside the
-RMS.
+"""Study which settings of ICP suit a run.
+
+These are the two sensitivity studies of the thesis (3.6), with the error against the true transform beside the RMS.
 
 The true transform of an epoch is known in a simulation. T(s) is the rigid motion that brings what a sensor measured, s, onto
 the true wall of that epoch, by a point-to-plane fit over all points. To lie on the reference, the epoch has to be moved by
@@ -419,8 +420,9 @@ def _threshold_row(judge: _PoseEvaluator, threshold: float, epoch: StudyEpoch, g
 
 
 def _displaced(surface: EpochSurfaces, reference_to_truth: RigidTransform, offset_m: float, random: KeyedRandom) -> StudyEpoch:
-    """Displace the epoch by a random rigid motion: a shift of `offset_m`, and a rotation that moves the cloud's edge by as
-    much.
+    """Displace the epoch by a random rigid motion.
+
+    It is a shift of `offset_m`, and a rotation that moves the cloud's edge by as much.
     """
     points = surface.measured.vertices
     true = reference_to_truth.inverse().after(true_pose(surface, random))

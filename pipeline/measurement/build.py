@@ -1,5 +1,6 @@
-"""Build the measurement folder of laser scans, or of clouds from a stereo pair, with a record of how the files
-were interpreted.
+"""Build the measurement folder of laser scans, or of clouds from a stereo pair.
+
+A record of how the files were interpreted is part of it.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ _PLANES = "incidence angles refer to planes through 24 of its points, as noise a
 
 
 def build(request: Request, out: Path) -> Interpretation:
-    """Write the measurement folder of laser scans: measurement.yaml, model.yaml, points, reference, and how the files were
-    interpreted.
+    """Write the measurement folder of laser scans, and a record of how the files were interpreted.
+
+    The folder has measurement.yaml, model.yaml, points and reference.
 
     Parameters
     ----------
@@ -159,8 +161,9 @@ def _scans(request: Request) -> list[RawScan]:
 
 
 def _stations(scans: list[RawScan], request: Request) -> list[Station]:
-    """Find the station of each scan; raise InputError if half of the first scan would be the reference of a scan
-    from elsewhere.
+    """Find the station of each scan.
+
+    Raises InputError if half of the first scan would be the reference of a scan from elsewhere.
     """
     position = None if request.position is None else np.array(request.position)
     stations = [find_station(scan, position) for scan in scans]

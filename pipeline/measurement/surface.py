@@ -126,8 +126,9 @@ def _normal(points: FloatArray) -> FloatArray:
 
 
 def _view_towards(eye: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the place and the rotation (3, 3) to the world of a frame that looks at `centre`: x towards it, z up in
-    the picture.
+    """Return the place and the rotation (3, 3) to the world of a frame that looks at `centre`.
+
+    Its x axis points towards the centre; z is up in the picture.
     """
     forward = (centre - eye) / np.linalg.norm(centre - eye)
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.9 else np.array([0.0, 1.0, 0.0])

@@ -172,7 +172,7 @@ def applied(alignment: Alignment, epoch: HeightRaster) -> NDArray[np.float32]:
 
 
 def _places(grid: Grid) -> tuple[FloatArray, FloatArray]:
-    """x and y of the pixels' centres, (h, w), wall frame, m."""
+    """Return x and y of the pixels' centres, (h, w), wall frame, m."""
     x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
     y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
     return np.broadcast_to(x, grid.shape), np.broadcast_to(y[:, None], grid.shape)

@@ -118,7 +118,7 @@ def _spacing(points: FloatArray) -> float:
 def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> NDArray[np.float32]:
     """Return the mean of reference minus point in z over each pixel, (h, w), m; NaN without points.
 
-    points: (n, 3), wall frame.
+    points: (n, 3), wall frame, m.
     """
     top = float(reference.mesh.bounds[1, 2]) + 1.0
     x, y = (on_device(mi.Float64, np.ascontiguousarray(points[:, axis])) for axis in (0, 1))

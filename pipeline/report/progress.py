@@ -119,8 +119,9 @@ class Progress:
         return 0.0 if self.current in self._finished else self._weights.get(self.current, 0.0)
 
     def _guess(self) -> float:
-        """Return the share of the current stage that is done: as reported, else estimated from the pace of earlier stages (above
-        1 if it is slower).
+        """Return the share of the current stage that is done.
+
+        It is as reported, else estimated from the pace of earlier stages (above 1 if the stage is slower).
         """
         weight = self._weight()
         if not weight or self._fraction:
@@ -157,8 +158,9 @@ class LineProgress(Progress):
 
 
 def shown_progress(*, quiet: bool = False, stream: TextIO | None = None) -> Progress:
-    """Return the progress for a command: a bar on a terminal, plain lines elsewhere, nothing if `quiet`; on stderr if it is
-    open.
+    """Return the progress for a command: a bar on a terminal, plain lines elsewhere, nothing if `quiet`.
+
+    It goes to stderr if that is open.
     """
     stream = stream or sys.stderr
     if quiet or stream is None:

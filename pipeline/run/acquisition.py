@@ -55,7 +55,7 @@ class Acquisition:
 def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random: KeyedRandom) -> Acquisition:
     """Observe `scene` with the site's sensor.
 
-    The right depth map, which takes a second observation, is only made if it is needed.
+    The right depth map takes a second observation, so it is only made if it is needed.
 
     Parameters
     ----------

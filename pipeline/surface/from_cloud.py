@@ -98,8 +98,9 @@ def _triangulation(points: FloatArray, viewpoint: FloatArray, where: str) -> Tri
 
 
 def _looking_at(direction: FloatArray) -> FloatArray:
-    """Return a rotation (3, 3), local to cloud frame, whose x axis points along `direction` (3,), so that no pole of the angles
-    is in view.
+    """Return a rotation (3, 3), local to cloud frame, whose x axis points along `direction` (3,).
+
+    No pole of the polar angles is then in view.
     """
     length = np.linalg.norm(direction)
     forward = direction / length if length > 0 else np.array([1.0, 0.0, 0.0])

@@ -22,7 +22,12 @@ _APART_M = 0.02
 class Pair:
     """What can be shown beside the present picture.
 
-    results: of the same folder; other: of a second run of the same wall, or None.
+    Attributes
+    ----------
+    results
+        Results of the same folder.
+    other
+        Results of a second run of the same wall, or None.
     """
 
     results: Results

@@ -63,8 +63,9 @@ def detector(model: str, *, unmirrored: bool = False) -> Detector:
 
 
 def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values in rising order without repetition; raise InputError unless they are between the lowest kept score
-    and 1.
+    """Return the values in rising order without repetition.
+
+    Raises InputError unless they are between the lowest kept score and 1.
     """
     for value in values:
         if not LOWEST_SCORE <= value <= 1:
@@ -75,8 +76,9 @@ def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def find_inputs(places: Sequence[Path]) -> list[InputMap]:
-    """Find the difference maps at some paths: TIFF files, folders with annotations.json, run folders; ids are COCO's, or count
-    from 1.
+    """Find the difference maps at some paths: TIFF files, folders with annotations.json, run folders.
+
+    Ids are COCO's, or count from 1.
     """
     result: list[InputMap] = []
     for place in places:

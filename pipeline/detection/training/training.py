@@ -1,5 +1,6 @@
-"""Train the detector: epochs, validation, checkpoints and early stopping; an interrupted training can be resumed without a
-difference.
+"""Train the detector: epochs, validation, checkpoints and early stopping.
+
+An interrupted training can be resumed with the same result.
 """
 
 from __future__ import annotations
@@ -217,7 +218,8 @@ def _restore_or_start(out: Path, config: TrainConfig, model: MaskRCNN, *, resume
 def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> None:
     """Write a checkpoint.
 
-    The state names the files of its epoch and is written last, so that a kill leaves the previous one complete.
+    The state names the files of its epoch and is written last, so that the previous checkpoint stays complete if the process is
+    killed.
     """
     folder, epoch = out / CHECKPOINT, len(history.training)
     names = {"weights": f"epoch_{epoch:04d}.weights.h5", "optimizer": f"epoch_{epoch:04d}.{_OPTIMIZER}"}

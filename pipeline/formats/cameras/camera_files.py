@@ -18,10 +18,10 @@ _COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 
 
 def read_oriented(path: Path) -> MetashapeCameras | None:
-    """Read cameras with poses by label, from Metashape's camera XML or project, or from COLMAP's text model (its folder or a file
-    of it).
+    """Read cameras with poses by label, from a file or folder of Metashape or COLMAP.
 
-    Returns None for other kinds of file, such as the project's cameras.yaml. Raises InputError for a calibration without poses.
+    Read are Metashape's camera XML or project, and COLMAP's text model (its folder or a file of it). Returns None for other kinds
+    of file, such as the project's cameras.yaml. Raises InputError for a calibration without poses.
     """
     if path.is_dir() or path.name in _COLMAP_FILES:
         return MetashapeCameras(read_colmap(path if path.is_dir() else path.parent), ())

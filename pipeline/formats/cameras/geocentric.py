@@ -37,8 +37,9 @@ class Projection:
     where: str
 
     def pose(self, matrix: FloatArray) -> FloatArray:
-        """Convert a (4, 4) pose, camera to geocentric coordinates, to camera to easting, northing and ellipsoidal height; a scale
-        is kept.
+        """Convert a pose (4, 4) from camera to geocentric coordinates to one to easting, northing, height.
+
+        The height is ellipsoidal; a scale is kept.
         """
         position = matrix[:3, 3]
         shifted = position + _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])

@@ -1,5 +1,6 @@
-"""Read and write calibrations in OpenCV's forms: FileStorage (XML, YAML, JSON), and plain text of size, camera matrix and
-distortion.
+"""Read and write calibrations in OpenCV's forms.
+
+They are FileStorage (XML, YAML, JSON), and plain text of size, camera matrix and distortion.
 
 OpenCV's distortion, with r2 = x^2 + y^2 (OpenCV 5 documentation, calib3d, detailed description), is
 
@@ -46,8 +47,9 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class OpencvInterior:
-    """Interior orientation in OpenCV's terms, px, except that cx, cy are relative to the frame's corner, as in COLMAP (OpenCV's
-    plus 0.5).
+    """Interior orientation in OpenCV's terms, px.
+
+    Unlike in OpenCV, cx and cy are relative to the frame's corner, as in COLMAP (OpenCV's plus 0.5).
     """
 
     fx: float

@@ -175,8 +175,9 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
 
 
 def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
-    """Raise InputError if the pixels of a cloud's points, if it has them, are not those in which the left camera sees
-    the points.
+    """Raise InputError if the pixels of a cloud's points are not those in which the left camera sees them.
+
+    A cloud without pixels is accepted.
     """
     if not {"pixel_x", "pixel_y"} <= set(cloud.extra):
         return

@@ -88,8 +88,9 @@ class StoredCloud:
 
     @classmethod
     def of(cls, cloud: PointCloud, pulses: PulseChannels, header: LazHeader) -> StoredCloud:
-        """Prepare a cloud for writing; raise ValueError for points that are not finite, or return numbers that LAS
-        cannot store.
+        """Prepare a cloud for writing.
+
+        Raises ValueError for points that are not finite, or return numbers that LAS cannot store.
         """
         fields = {"bit_fields": _return_bits(pulses.return_number, pulses.number_of_returns), "gps_time": cloud.gps_time}
         if pulses.scan_angle_rad is not None:

@@ -133,9 +133,9 @@ def _check_kind(lines: Sequence[str], where: str) -> None:
 
 
 def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
-    """Detect how rows are written from a sample; first_line: number of its first line.
+    """Detect how rows are written, from a sample of them.
 
-    Raises InputError for thousands separators.
+    first_line: number of the sample's first line in the file. Raises InputError for thousands separators.
     """
     separator, decimal_comma = _separator(sample)
     rows = [split_row(line, separator) for line in sample]

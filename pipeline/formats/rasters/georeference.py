@@ -157,8 +157,9 @@ def _unit(keys: dict[int, int], key: int, path: Path) -> float | None:
 
 
 def _unit_of_code(keys: dict[int, int], path: Path) -> float | None:
-    """Return the length of the unit of the projected coordinate system that the file names by its EPSG code, m; None
-    without one.
+    """Return the length, m, of the unit of the projected coordinate system that the file names.
+
+    The file names it by its EPSG code; None without one.
     """
     code = keys.get(_PROJECTED)
     crs = None if code in (None, _USER_DEFINED) else understood_crs(f"EPSG:{code}")

@@ -273,8 +273,9 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
 
 
 def most_pixels() -> int:
-    """Return the largest number of pixels of an image: MOST_PIXELS, or more if the variable READ_LIMIT allows it, with four bytes
-    each.
+    """Return the largest number of pixels that an image may have.
+
+    It is MOST_PIXELS, or more if the limit in the environment variable READ_LIMIT names allows it, at four bytes a pixel.
     """
     return max(MOST_PIXELS, int(read_limit_gb() * 1e9 / 4))
 
