@@ -1,5 +1,6 @@
-"""Measure the noise outside blocks of a data set's difference maps, by wall and noise level; the config's scales are chosen by
-it.
+"""Measure the noise outside blocks of a data set's difference maps, by wall and noise level.
+
+The config's scales are chosen by it.
 
     python benchmarks/dataset_noise.py [CONFIG] [--maps 4] [--sensor stereo|tls] [--unit]
 

@@ -1,5 +1,6 @@
-r"""Measure what single choices of the detector's training contribute: short trainings of equal length, each with one choice
-undone.
+r"""Measure what single choices of the detector's training contribute.
+
+Trainings are short and of equal length; each has one choice undone.
 
     python benchmarks/detector_ablation.py --set sets/mixed --test sets/detector_test --test sets/detector_test_mean \
         --out runs/ablation [--epochs 8] [--seeds 1 2] [--write]

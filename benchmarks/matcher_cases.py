@@ -39,9 +39,13 @@ MATCHERS: dict[str, RefinementConfig | None] = {SGBM: None, REFINED: RefinementC
 
 @dataclass(frozen=True)
 class Case:
-    """One pair.
+    """One pair of pictures with true and matched disparities.
 
-    true: (rows, columns), NaN where unknown or seen by one camera only; found: by matcher; reduction: frame px per cell.
+    Attributes
+    ----------
+    true : (rows, columns) disparities, NaN where unknown or seen by one camera only.
+    found : Matched disparities by matcher.
+    reduction : Frame px per cell.
     """
 
     name: str

@@ -52,8 +52,10 @@ def main() -> None:
 
 
 def model(values: Sequence[float], reduction: int) -> StereoModel:
-    """The sensor model, px of the frame, of parameters in px of the matched pictures: white noise, heavy-tailed noise (sigma,
-    step, tail), smoothing, fattening and, where there is any, locking."""
+    """Return the sensor model, px of the frame, of parameters in px of the matched pictures.
+
+    values: white noise; sigma, step and tail of heavy-tailed noise; smoothing; fattening; and locking, if there is any.
+    """
     white, sigma, step, tail, smoothing, radius, *rest = (float(value) for value in values)
     locking = rest[0] if rest else 0.0
     return StereoModel(

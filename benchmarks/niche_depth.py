@@ -1,5 +1,6 @@
-"""Measure how deep the niches of small blocks are, and how many stand out from the noise, by placement and on coarser, smoother
-walls.
+"""Measure how deep the niches of small blocks are, and how many stand out from the noise.
+
+This depends on how blocks are placed, and on how coarse and smooth the wall is.
 
     python benchmarks/niche_depth.py [--width 24 --height 14] [--maps 2] [--write]
 

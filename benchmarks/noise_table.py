@@ -1,5 +1,6 @@
-"""Compare the noise of simulated difference maps of the Glendale site, after ICP and without blocks, with the thesis (tables 5-1
-to 5-3).
+"""Compare the noise of simulated difference maps of the Glendale site with the thesis (tables 5-1 to 5-3).
+
+The maps are made after ICP and without blocks.
 
     python benchmarks/noise_table.py [--maps 45] [--levels high medium low] [--parameters | --readings]
         [--write]

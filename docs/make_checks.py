@@ -50,10 +50,14 @@ names the file, what is wrong, what is allowed and how to mend it, and that it w
 
 @dataclass(frozen=True)
 class Kind:
-    """Files of one kind.
+    """Files of one kind, and how commands and functions are tried with faults in them.
 
-    suffix: of their names; doors: words of a command, or a function, by their name, FILE for the file; faults: how a file with a
-    fault is made.
+    Attributes
+    ----------
+    title : Heading of the kind.
+    suffix : Suffix of the files' names.
+    doors : What reads such files, by name: the words of a command (FILE for the file), or a function.
+    faults : How a file with each fault is made.
     """
 
     title: str

@@ -62,14 +62,17 @@ class Stage:
 
     @cached_property
     def frame(self) -> WallFrame:
+        """The wall frame, for a sensor at 105 m."""
         return WallFrame.fit(self.wall.vertices, Target(self.wall).stand(105.0, None))
 
     @cached_property
     def caster(self) -> RayCaster:
+        """The ray caster of the wall, wall frame."""
         return RayCaster(self.wall.with_vertices(self.frame.to_wall(self.wall.vertices)))
 
     @cached_property
     def without(self) -> dict[str, Observation]:
+        """What each sensor records without effects."""
         return {sensor: self.observe(sensor, ()) for sensor in SCENES}
 
     def observe(self, sensor: str, effects: tuple[Effect, ...]) -> Observation:
@@ -97,10 +100,12 @@ class Comparison:
 
     @property
     def lost(self) -> NDArray[np.bool_]:
+        """(h, w) mask of the cells that only the observation without the effect has."""
         return self.without.valid & ~self.acting.valid
 
     @property
     def gained(self) -> NDArray[np.bool_]:
+        """(h, w) mask of the cells that only the observation with the effect has."""
         return self.acting.valid & ~self.without.valid
 
 

@@ -1,5 +1,6 @@
-"""Bad inputs on the command line: arguments that are empty, repeated or in other scripts, and names that are unusual
-but right.
+"""Bad inputs on the command line.
+
+Arguments are empty, repeated or in other scripts; some names are unusual but right.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
-"""Bad inputs that are mistakes people make: another program's notation, one place for input and output, stray files in a folder,
-records that do not fit the other files.
+"""Bad inputs that are mistakes people make.
+
+They are another program's notation, one place for input and output, stray files in a folder, and records that do not fit the
+other files.
 """
 
 from __future__ import annotations

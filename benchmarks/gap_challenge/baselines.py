@@ -20,8 +20,14 @@ _CLIP, _ROUNDS, _MOST_POINTS, _BLOCKS = 5.0, 2, 20_000, 12
 
 @dataclass(frozen=True)
 class Data:
-    """Inputs of the baselines: residuals against reference and survey (n,), predicted sigma (n,), effect of the pose (n, 6),
-    place (n, 2).
+    """Inputs of the baselines.
+
+    Attributes
+    ----------
+    value : (n,) residuals against reference and survey.
+    sigma : (n,) their predicted standard deviation.
+    pose : (n, 6) effect of the pose on them.
+    at : (n, 2) place on the wall, m.
     """
 
     value: Array
@@ -65,8 +71,9 @@ def _sound(data: Data) -> Array:
 
 
 def _gains(pose: Array, design: Array, value: Array, held_out: Array) -> tuple[float, float]:
-    """Return the decrease of the weighted squares when `design` is fitted beside the pose: on validation blocks, and on those of
-    the fit.
+    """Return by how much the weighted squares decrease when `design` is fitted beside the pose.
+
+    The first number is that of the blocks of the fit, the second that of the validation blocks.
     """
     left = []
     for columns in (pose, np.concatenate([pose, design], axis=1)):

@@ -1,5 +1,6 @@
-"""Plan and make the cases of an evaluation: strata by quota, every effect in turn, shuffled numbers; folders separate from
-truths.
+"""Plan and make the cases of an evaluation.
+
+Strata have quotas, every effect comes in turn, and numbers are shuffled. Folders and truths are kept apart.
 """
 
 from __future__ import annotations
@@ -31,7 +32,11 @@ _LARGE_EVERY, _LARGE = 40, 150_000
 class Case:
     """A planned case.
 
-    number: its name; seed: of everything in it; kinds: effects by name, including forms outside the catalogue.
+    Attributes
+    ----------
+    number : Number by which the case is named.
+    seed : Seed of everything in it.
+    kinds : Names of its effects, including forms outside the catalogue.
     """
 
     number: int

@@ -24,8 +24,9 @@ class Surface:
         )
 
     def cast(self, origin: Array, ray: Array) -> tuple[Array, Array]:
-        """Return distances (n,) in lengths of `ray` (n, 3), NaN without a hit, and unit normals (n, 3); origin: (3,) or
-        (n, 3).
+        """Cast rays (n, 3) from `origin`, (3,) or (n, 3), onto the surface.
+
+        Returns distances (n,) in lengths of the rays, NaN without a hit, and unit normals (n, 3).
         """
         start = np.broadcast_to(origin, ray.shape)
         distance, normal = np.empty(len(ray)), np.empty(ray.shape)

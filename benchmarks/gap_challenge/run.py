@@ -1,5 +1,6 @@
-"""Evaluate `scarpsim gap` on closed-form measurements with hidden truth, as GAP.md specifies: make, diagnose by the command, and
-score.
+"""Evaluate `scarpsim gap` on closed-form measurements with hidden truth, as GAP.md specifies.
+
+The measurements are made, diagnosed by the command, and scored.
 
     python benchmarks/gap_challenge/run.py --cases 60 --seed 1 --jobs 1 --out /tmp/challenge
 

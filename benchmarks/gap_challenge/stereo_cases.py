@@ -1,5 +1,6 @@
-"""Make a stereo pair's measurement folder: matches by brute-force projection through the real cameras, points by the nominal
-ones.
+"""Make a stereo pair's measurement folder by brute-force projection.
+
+Matches are found through the real cameras, points by the nominal ones.
 """
 
 from __future__ import annotations
@@ -314,7 +315,7 @@ def _drawn(
 
 
 def _shown(scene: Set, kind: str, p: Parameters, part: Image) -> Array:
-    """Return the (n,) mean change of the disparity.
+    """Return the mean change (n,) of the disparity by an effect, px.
 
     Locking acts on the noisy disparity, which reduces its mean over the true one.
     """

@@ -1,5 +1,6 @@
-"""Compute how strongly an effect stands out, and from which other effects: distances between their predictions after the pose
-fit.
+"""Compute how strongly an effect stands out, and from which other effects.
+
+The strength is a distance between predictions after the pose fit.
 
 For a mean effect it is the Mahalanobis distance, with white noise within cells and, between cells, also the reference's error,
 correlated over metres. For an effect on variance or losses it is the square root of twice the Kullback-Leibler divergence, summed
@@ -104,8 +105,15 @@ def basis(columns: Array) -> Array:
 
 
 def mean_strength(name: str, signature: Array, base: Array, families: Families, whiten: Whitener) -> Strength:
-    """Return the strength of a mean effect with range or disparity errors `signature` (n,), after fitting the columns `base` (n,
-    b).
+    """Return the strength of a mean effect.
+
+    Parameters
+    ----------
+    name : Name of the effect, which is not compared with itself.
+    signature : (n,) its range or disparity errors.
+    base : (n, b) columns to fit first, such as the pose.
+    families : Columns of the other effects.
+    whiten : Transforms columns to white noise.
     """
     fixed = basis(whiten(base))
     clean = _without(fixed, whiten(signature))[:, 0]
@@ -137,8 +145,9 @@ def spread_distance(true: Array, assumed: Array) -> float:
 
 
 def spread_strength(name: str, added: Array, variance: Array, forms: Mapping[str, Sequence[Array]]) -> Strength:
-    """Return the strength of an effect that adds a variance (n,) to the model's; forms: variances of the other effects, to be
-    scaled.
+    """Return the strength of an effect that adds a variance (n,) to the model's.
+
+    forms: variances of the other effects, which are scaled to come nearest.
     """
     true = variance + added
     scales = np.concatenate([[0.0], np.geomspace(1e-3, 30, 60)])

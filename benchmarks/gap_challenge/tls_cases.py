@@ -334,8 +334,9 @@ def _special(kind: str, scene: Set, rays: Rays, sigma: Array, random: Random) ->
 
 
 def _footprint(scene: Set, rays: Rays, p: Parameters, seen: Surface | None = None) -> tuple[Array, Array]:
-    """Return the range by the whole beam (n,), and the cosine on the axis: 19 sub-rays of a Gaussian beam, with echoes within a
-    pulse merged.
+    """Return the range by the whole beam and the range along its axis, (n,) each, m.
+
+    A Gaussian beam has 19 sub-rays; echoes within a pulse length are merged.
     """
     surface = scene.known if seen is None else seen
     position, rotation = (scene.position, scene.rotation) if seen is None else (scene.true_position, scene.true_rotation)

@@ -28,7 +28,7 @@ class Wall:
         return (rows - 1) * self.spacing, (columns - 1) * self.spacing
 
     def nodes(self) -> tuple[Array, Array]:
-        """x and z of the nodes, each of the grid's shape."""
+        """Return x and z of the nodes, each of the grid's shape."""
         rows, columns = self.depth.shape
         x, z = np.meshgrid(self.spacing * np.arange(rows), self.spacing * np.arange(columns), indexing="ij")
         return x, z

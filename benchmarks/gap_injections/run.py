@@ -45,8 +45,9 @@ _NOISES = {
 
 
 def base_folder(name: str, out: Path) -> Path:
-    """Return the folder of an unchanged measurement, with the white noise that its own diagnosis proposes, made and diagnosed
-    once.
+    """Return the folder of an unchanged measurement, with the white noise that its own diagnosis proposes.
+
+    It is made and diagnosed once.
     """
     folder = out / "bases" / name
     answer = out / "answers" / f"{name}.json"

@@ -1,3 +1,4 @@
-"""A second generator for evaluating `scarpsim gap`, written from the specification only: folders with hidden truth, and their
-scores.
+"""Evaluate `scarpsim gap` by a second generator, which was written from the specification only.
+
+It makes folders with hidden truth, and their scores.
 """

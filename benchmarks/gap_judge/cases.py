@@ -148,8 +148,9 @@ def _write_rest(where: Path, reference: Surface, wall: Frame, sheet: dict[str, A
 def _sized(
     case: Case, sensor: Any, catalogue: Any, strength: Any, shot: Any, rng: Rng
 ) -> tuple[dict[str, Parameters], dict[str, dict[str, Any]]]:
-    """Return the parameters of each effect of the case, and its clarity: wanted ratio, reached ratio, and distance from the
-    nearest effect.
+    """Draw the parameters of each effect of the case, and state how clear the effect is.
+
+    Its clarity is the wanted ratio, the reached ratio, and the distance from the nearest effect.
     """
     effects, clear = {}, {}
     for name in case.names:

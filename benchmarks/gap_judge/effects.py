@@ -96,8 +96,9 @@ class Whitening:
         return np.concatenate([within, means / np.sqrt(error + 1 / total)[:, None]])
 
     def strength(self, shift: Array, other: Array | None = None) -> float:
-        """Return the signal-to-noise ratio of a (n,) `shift` after fitting the pose and (n, k) `other`; a point counts 9
-        at most.
+        """Return the signal-to-noise ratio of a shift (n,) after fitting the pose and `other` (n, k).
+
+        The square of one point counts 9 at most.
         """
         nuisance = self.white(self.pose if other is None else np.concatenate([self.pose, other], axis=1))
         wanted = self.white(shift[:, None])[:, 0]
@@ -121,8 +122,9 @@ def spread_strength(added: Array, variance: Array) -> float:
 
 
 def loss_strength(lost: Array, base: float) -> float:
-    """Return the root of twice the information of returns lost with probability (n,) `lost`, beside a share `base`
-    lost anywhere.
+    """Return how strongly losses stand out: the root of twice their information.
+
+    lost: (n,) probability of a loss by the effect; base: share that is lost anywhere.
     """
     p = np.clip(base + (1 - base) * lost, 1e-6, 1 - 1e-6)
     return float(np.sqrt(2 * np.sum(p * np.log(p / base) + (1 - p) * np.log((1 - p) / (1 - base)))))

@@ -44,9 +44,9 @@ class Frame:
         return (points - self.position) @ self.rotation
 
     def of(self, outer: Frame) -> Frame:
-        """This frame, given in the frame `outer`, as seen from where `outer` is given."""
+        """Return this frame, given in the frame `outer`, as seen from where `outer` is given."""
         return Frame(outer.rotation @ self.rotation, outer.outward(self.position))
 
     def within(self, outer: Frame) -> Frame:
-        """This frame as seen from inside `outer`, both being given in the same one."""
+        """Return this frame as seen from inside `outer`, both being given in the same frame."""
         return Frame(outer.rotation.T @ self.rotation, outer.inward(self.position))

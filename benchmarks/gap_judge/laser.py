@@ -1,5 +1,6 @@
-"""Simulate a laser scan in closed form: pattern, aim, ray casting, footprint, range, power, return, record; recorded = true +
-effect.
+"""Simulate a laser scan in closed form; recorded = true + effect.
+
+The steps are pattern, aim, ray casting, footprint, range, power, return and record.
 """
 
 from __future__ import annotations
@@ -66,8 +67,14 @@ class Noise:
 
 @dataclass(frozen=True)
 class Scan:
-    """Recorded pulses that returned: points (n, 3) in the surveyed scanner's frame, power, time, s; and the number of pulses
-    sent.
+    """Recorded pulses that returned.
+
+    Attributes
+    ----------
+    points : (n, 3) in the surveyed scanner's frame, m.
+    power : (n,) received power.
+    time : (n,) time, s.
+    sent : Number of pulses sent.
     """
 
     points: Array

@@ -20,8 +20,16 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Shot:
-    """What an effect may depend on, each (n,): recorded angles, rad; scan line; time, 0..1; range, m; cosine of
-    incidence; power.
+    """What an effect may depend on, (n,) each.
+
+    Attributes
+    ----------
+    azimuth, zenith : Recorded angles, rad.
+    line : Scan line.
+    time : Elapsed share of the scan, 0 to 1.
+    range_m : Range, m.
+    cosine : Cosine of the incidence angle.
+    power : Received power.
     """
 
     azimuth: Array

@@ -1,5 +1,6 @@
-"""Simulate a stereo pair in closed form: real cameras, rays cast from both, disparities along rectified rows, nominal
-reconstruction.
+"""Simulate a stereo pair in closed form.
+
+Rays are cast from both real cameras, disparities run along rectified rows, and points are reconstructed by the nominal cameras.
 """
 
 from __future__ import annotations
@@ -149,8 +150,10 @@ class Strength:
         return 0.0
 
     def _field(self, parameters: Parameters) -> float:
-        """Return the ratio of a grid noise: a node is seen by (step / stride)^2 points, against white noise, the model's own
-        grid, the reference.
+        """Return the signal-to-noise ratio of grid noise.
+
+        A node is seen by (step / stride)^2 points. It stands out against white noise, the model's own grid noise and the
+        reference's error.
         """
         many = max((parameters["step_px"] / self.stride) ** 2, 1.0)
         own = max((self.noise.step_px / self.stride) ** 2, 1.0)
@@ -216,8 +219,9 @@ def _drawn(rng: Rng, noise: Noise, chosen: dict[str, list[tuple[Effect, Paramete
 
 
 def filled(disparity: Array, hidden: Mask, reach: float) -> Array:
-    """Give half-occluded pixels (rows, columns) within `reach` columns of matched background its disparity (that of the smaller
-    side).
+    """Fill half-occluded pixels within `reach` columns of matched ones with the background's disparity.
+
+    disparity, hidden: (rows, columns). The background is the side with the smaller disparity.
     """
     columns = np.arange(disparity.shape[1])
     there = np.isfinite(disparity)
@@ -268,8 +272,9 @@ def place(rng: Rng, change_count: int, reference_share: float, straight: bool) -
 
 
 def _aimed(rng: Rng, body: Camera, at: Array, loose: float) -> Camera:
-    """Return the camera at `at` (wall's frame) that looks half-way to the wall's middle (convergent), slightly askew; x right, y
-    down.
+    """Return a camera that looks half-way to the wall's middle (convergent), slightly askew.
+
+    at: its place, wall frame, m; loose: how much its direction and place scatter. Image axes are x right, y down.
     """
     toe = loose * rng.uniform(0.2, 1.0) * np.arctan2(at[0], at[1])
     facing = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])

@@ -1,5 +1,6 @@
-"""Walls that are not smooth height fields, errors of their reference, and rock that moved; local frame of
-`surface.py`, metres.
+"""Make walls that are not smooth height fields, errors of their reference, and rock that moved.
+
+All are in the local frame of `surface.py`, m.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ Rng = np.random.Generator
 
 
 def fractal(shape: tuple[int, ...], rng: Rng, exponent: float, longest: float = 1.0) -> Array:
-    """Return an (a, b) field of unit variance whose power falls with frequency to the power -2 exponent, with wavelengths up to
-    `longest`.
+    """Draw a random field (a, b) of unit variance whose power falls with frequency to the power -2 exponent.
+
+    Wavelengths reach up to `longest`.
     """
     kx, kz = np.fft.fftfreq(2 * shape[0])[:, None] * shape[0], np.fft.rfftfreq(2 * shape[1])[None] * shape[1]
     k = np.hypot(kx * max(shape) / shape[0], kz * max(shape) / shape[1])
