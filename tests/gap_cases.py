@@ -91,10 +91,17 @@ class Scan:
 
 @dataclass(frozen=True)
 class ScanCase:
-    """What a scan is like. angles: (azimuth, zenith, line) to recorded minus true angles; ranges: recorded ranges; lost: returns
-    lost; fall: x, z and depth of a niche of 1.2 m that the reference does not have; blocks: column, row and depth of nodes that
-    lie deeper than in the reference: pyramids of volume depth x STEP^2; scans: place and face of each of several scans, which are
-    of one pose where the place is the same."""
+    """What a scan is like.
+
+    Attributes
+    ----------
+    angles : Maps (azimuth, zenith, line) to recorded minus true azimuth and zenith, rad.
+    ranges : Makes the recorded ranges, m.
+    lost : Makes the mask of lost returns.
+    fall : x, z and depth, m, of a niche of 1.2 m that the reference does not have.
+    blocks : Column, row and depth, m, of nodes that lie deeper than in the reference; pyramids of volume depth x STEP^2.
+    scans : Place and face of each of several scans; scans at the same place have one pose.
+    """
 
     angles: Callable[[Array, Array, Array], tuple[Array, Array]] | None = None
     ranges: Callable[[Scan], Array] | None = None

@@ -38,8 +38,17 @@ def normals(x: Array, z: Array) -> Array:
 
 @dataclass(frozen=True)
 class CloudCase:
-    """What a cloud is like. above: (x, z) to m above the wall, along the normal; scale: of the cloud about the wall's middle;
-    niche: x, z and depth of a square niche of 1 m along and up; sigma: m; points: how many; moved, turn_rad: of the cloud, m."""
+    """What a cloud is like.
+
+    Attributes
+    ----------
+    above : Maps (x, z) to the height above the wall along the normal, m.
+    scale : Scale of the cloud about the wall's middle.
+    niche : x, z and depth, m, of a square niche of 1 m along and up.
+    sigma : Noise, m.
+    points : Number of points.
+    moved, turn_rad : Shift, m, and rotation, rad, of the cloud.
+    """
 
     above: Callable[[Array, Array], Array] | None = None
     scale: float = 1.0

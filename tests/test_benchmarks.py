@@ -1,8 +1,7 @@
-"""Every benchmark runs at a tiny size, so that a changed signature cannot leave one behind. Its figures mean nothing at such
-a size.
+"""Run every benchmark at a tiny size, so that a changed signature cannot leave one behind.
 
-A script's constants and the configs that it makes are replaced by smaller ones before its `main` is called, in this process,
-so that imports and kernels are shared.
+Its figures mean nothing at such a size. A script's constants and the configs that it makes are replaced by smaller ones before
+its `main` is called, in this process, so that imports and kernels are shared.
 """
 
 from __future__ import annotations
@@ -47,9 +46,16 @@ ELSEWHERE = {
 
 @dataclass(frozen=True)
 class Tiny:
-    """How a script is made small. words: on its command line; arguments: of its `main`; values: new values of its globals;
-    keys: what is set beside the keywords of a config that the script makes, by the config's name; overrides: of the configs
-    that it loads."""
+    """How a script is made small.
+
+    Attributes
+    ----------
+    words : Words of its command line.
+    arguments : Arguments of its `main`.
+    values : New values of its globals.
+    keys : Keywords that are added to a config that the script makes, by the config's name.
+    overrides : Overrides of the configs that it loads.
+    """
 
     words: tuple[str, ...] = ()
     arguments: tuple[Any, ...] = ()

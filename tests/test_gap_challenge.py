@@ -311,8 +311,11 @@ def test_powers_and_slopes_are_part_of_a_ray() -> None:
 
 @pytest.mark.slow
 def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
-    """8 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names)
-    each fails in less than 4 % of draws; the seed is fixed."""
+    """Answers to 8 cases of some thousand points are mostly right.
+
+    The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names) each fails in less than 4 % of
+    draws. The seed is fixed.
+    """
     found = run(8, 20, 1, tmp_path, small=True)
     rows = found["rows"]
     assert {row["stratum"] for row in rows} == set(cases.STRATA)

@@ -101,10 +101,12 @@ def _compiled(seed: int = 1) -> MaskRCNN:
 
 @pytest.mark.slow
 def test_two_tiles_are_learned_by_heart(data_set, tmp_path):
-    """Every block of both tiles is found with a mask that overlaps it by more than 0.85 (the least is 0.91 here, and may be less
-    on another processor, whose kernels sum in another order), and nothing else; also from a score of 0.95 on, once the scores of
-    a network that is made too modest are shifted. Masks have no margin: learned by heart, they are known in the boxes of the
-    training alone."""
+    """Every block of both tiles is found with a mask that overlaps it by more than 0.85, and nothing else is found.
+
+    The least overlap is 0.91 here; another processor, whose kernels sum in another order, may give less. If the scores are
+    shifted down, the operating point shifts them back: the blocks are then found at a score of 0.95. Masks have no margin,
+    because blocks that are learned by heart are known only in the boxes of the training.
+    """
     folder, model = CocoFolder(data_set / "train"), _compiled()
     exact = SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"mask_margin_px": 0.0})})
     model.config = exact
@@ -271,8 +273,11 @@ def test_scores_are_shifted_by_the_size_of_the_box(eager):
 
 
 def test_the_shifts_are_those_with_which_blocks_are_found_best():
-    """Small blocks are right from a score of 0.6 on, large ones from 0.9 on: one score for both misses or adds some, and with the
-    shifts a score of 0.95 parts all. Where no detection is wrong, size needs no shift."""
+    """Small blocks are right from a score of 0.6 on, large ones from 0.9 on.
+
+    One score for both would miss some or add some. With the shifts, a score of 0.95 separates right from wrong at both sizes.
+    Where no detection is wrong, the shift does not depend on size.
+    """
     right = [_square(number, 4, score) for number, score in enumerate((0.6, 0.7, 0.8))]
     right += [_square(number, 32, score) for number, score in enumerate((0.9, 0.97), start=3)]
     wrong = [_square(5, 4, 0.4), _square(6, 32, 0.8), _square(7, 32, 0.85)]

@@ -134,9 +134,12 @@ assert all(np.array_equal(variable, value) for variable, value in zip(model.trai
 
 
 def test_it_learns_and_goes_on_as_if_nothing_had_been(tmp_path):
-    """With JAX as the backend, in a process of its own, and a network of three numbers, which XLA compiles in no time: 32 steps
-    halve the loss of both sets, from the first epoch on; from the state after 16 steps the rest ends with the same numbers; with
-    learning rates of nought weights stay. (Mask R-CNN itself was trained so on a card: docs/validation/detector.md.)"""
+    """A training with JAX can be interrupted: the rest ends with the same numbers.
+
+    It runs in a process of its own, with a network of three numbers, which XLA compiles quickly. 32 steps halve the loss of both
+    sets, from the first epoch on. With learning rates of zero the weights stay. Mask R-CNN itself was trained like this on a
+    graphics card (docs/validation/detector.md).
+    """
     for part, count in (("train", 16), ("val", 3)):
         make_set(tmp_path / part, count, 6, blocks=2)
     environment = {**os.environ, "KERAS_BACKEND": "jax"}

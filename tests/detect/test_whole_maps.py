@@ -216,8 +216,10 @@ def test_every_kind_of_input_is_searched_to_its_last_corner(kind, tmp_path, monk
 
 @pytest.mark.slow
 def test_the_detector_that_comes_along_searches_the_whole_map(tmp_path, eager):
-    """40 niches of 30 px, twenty times as deep as the noise, on a grid over 600 x 1400 px, 2 x 5 tiles: clear enough for each
-    to be found, by a mask of its own that covers most of it."""
+    """The bundled detector finds each of 40 clear niches in a map of 2 x 5 tiles, by a mask that covers most of it.
+
+    The niches have 30 px, are twenty times as deep as the noise, and lie on a grid over 600 x 1400 px.
+    """
     shape = (600, 1400)
     y, x = np.mgrid[: shape[0], : shape[1]]
     centres = [(60 + 160 * row, 60 + 142 * column) for row in range(4) for column in range(10)]

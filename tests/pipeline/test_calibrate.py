@@ -237,8 +237,11 @@ def test_a_model_that_cannot_make_the_measurement_is_told() -> None:
 
 
 def test_a_search_that_went_astray_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the second parameter is too small to matter nothing shows the way back. Five standard deviations; the first search,
-    without the second, ends more than ten away."""
+    """The search restarts if the first one ends where the second parameter is too small to matter.
+
+    Nothing shows the way back from there. The first search ends more than ten standard deviations from the truth, the result
+    within five.
+    """
     known = Known(np.array([[1.0, 0.1], [1.0, 0.3], [0.6, 1.0], [0.1, 1.0], [0.4, 0.4]]))
     search, truth = known.search(1), np.log([1.0, 0.6])
     approach = search._approach

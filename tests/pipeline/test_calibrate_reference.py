@@ -51,8 +51,11 @@ def wall(rng: np.random.Generator, count: int = 40) -> TriangleMesh:
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_points_lie_as_far_from_the_wall_as_from_one_whose_vertices_are_wrong(shared: bool) -> None:
-    """Of noise by casting on that wall, to 1 % of the noise; of relief, which no neighbour shares, by its variance: the sum of
-    the squared weights, within 3 standard errors."""
+    """The reference's error moves points as if its vertices were displaced along the rays.
+
+    Errors that neighbours share agree to 1 % of the noise with casting on the displaced wall. Independent errors have the
+    variance of a weighted mean of three vertices, to 3 standard errors.
+    """
     mesh, rng = wall(np.random.default_rng(1)), np.random.default_rng(2)
     caster, sigma = RayCaster(mesh), 1e-3
     ray = rays(*rng.uniform([[np.pi / 2 - 0.11], [np.pi / 2 - 0.11]], [[np.pi / 2 + 0.11], [np.pi / 2 + 0.11]], (2, 5000)))
@@ -104,8 +107,11 @@ def inputs(half: Path) -> tuple[SimulationConfig, CalibrationInputs]:
 
 
 def test_maps_of_a_half_are_as_noisy_as_measured_only_with_the_reference_error(half: Path) -> None:
-    """Without it the simulated maps have less than 0.85 of the measured deviation, with it as much to 8 %: a half's points stand
-    as on a chessboard, simulated ones on squares, and pixels hold some three."""
+    """Simulated maps of half a scan have the measured standard deviation, to 8 %, only with the reference's error.
+
+    Without it they have less than 0.85 of it. The two differ a little, because the half's points lie on a chessboard, simulated
+    ones on squares, and a pixel holds about three.
+    """
     config, found = inputs(half)
     assert found.reference_error is not None
     assert found.reference_error.sigma_m == pytest.approx(NOISE_M, rel=0.1)

@@ -181,9 +181,11 @@ def test_all_see_the_same_wall_and_blocks(trial: Trial) -> None:
 
 
 def test_planted_noise_is_measured(trial: Trial) -> None:
-    """Ranges with 2 and 20 mm, in two epochs, interpolated by triangles: the NMAD of z on stable ground lies between sqrt(2 / 3)
-    (middle of a triangle) and sqrt(2) (vertex) times sigma over the cosine between ray and wall's normal (0.9 and more); the
-    tenfold noise gives the tenfold NMAD, to a fifth, as steps along slopes and ICP add to both.
+    """Range noise of 2 and 20 mm in two epochs is measured as the NMAD of z on stable ground.
+
+    Surfaces are interpolated by triangles. So the NMAD lies between sqrt(2 / 3) (middle of a triangle) and sqrt(2) (vertex) times
+    sigma over the cosine between ray and wall's normal (0.9 and more). The tenfold noise gives the tenfold NMAD, to a fifth,
+    because steps along slopes and ICP add to both.
     """
     found = [assess(trial, seen, KeyedRandom(1)) for seen in trial.seen]
     quiet, noisy = found

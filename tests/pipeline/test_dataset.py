@@ -253,8 +253,11 @@ def test_the_loaders_leave_the_simulation_alone() -> None:
 
 
 def test_tf_data(made: Path) -> None:
-    """In a process of its own: TensorFlow and the ray tracer bring LLVM each. Tiles are read in threads of TensorFlow's, several
-    of them, in which PROJ would crash."""
+    """The TensorFlow data set yields the same tiles as the list of tiles.
+
+    It runs in a process of its own, because TensorFlow and the ray tracer both bring LLVM. Several threads of TensorFlow read the
+    tiles; PROJ would crash in them.
+    """
     pytest.importorskip("tensorflow")
     program = f"""
 import numpy as np

@@ -63,8 +63,11 @@ def test_many_blocks_tell_the_curve() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_gap_between_the_sizes_is_told_and_no_number_made_up(seed: int) -> None:
-    """Complete separation: all of 5 cm missed, all of 30 cm seen. The likelihood is 1 for any size between, to a tenth, as the
-    curve's least width of 0.02 keeps it from the blocks themselves."""
+    """Complete separation: all blocks of 5 cm are missed and all of 30 cm are seen.
+
+    The likelihood is then 1 for any size between. The limits hold to a tenth, as the curve's least width of 0.02 keeps it from
+    the blocks themselves.
+    """
     spread = np.exp(KeyedRandom(seed).generator().normal(0, 0.1, 60))
     size = np.repeat([0.05, 0.3], 30) * spread
     curve = fitted(size, np.repeat([False, True], 30))

@@ -89,8 +89,11 @@ def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
 
 
 def test_a_range_error_that_jumps_is_folded_with_its_high_overtones(tmp_path: Path) -> None:
-    """A square first found as the sine of a cyclic error: to the fifth overtone 6.7 % of its variance are left (a correlation of
-    0.966), which was taken for noise, to the eleventh 3.4 % (0.983)."""
+    """A square wave that is first found as a sine is described by its overtones up to the eleventh.
+
+    Up to the fifth, 6.7 % of its variance would be left (a correlation of 0.966) and be taken for noise; up to the eleventh 3.4 %
+    (0.983).
+    """
     length = 2.6
 
     def square(range_m: Any) -> Any:
@@ -165,8 +168,10 @@ def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
 
 
 def test_noise_by_incidence_is_told_from_noise_of_the_angles(tmp_path: Path) -> None:
-    """Nine points a cell, quiet ones beside noisy ones: without their weights the noisy tilt the cell's plane, and the quiet seem
-    noisy too."""
+    """Cells of nine points have quiet points beside noisy ones, and need weights.
+
+    Without weights the noisy points tilt the cell's plane, and the quiet ones seem noisy too.
+    """
     noisy = found_in(
         tmp_path,
         43,

@@ -1,5 +1,8 @@
-"""What is no evidence for an effect: debris in blocks that are held out, an error of the reference, what a free form misses,
-what another effect makes up for."""
+"""Test what must not count as evidence for an effect.
+
+This is debris in validation blocks, an error of the reference, what a non-parametric term misses, and what another effect
+compensates for.
+"""
 
 from __future__ import annotations
 
@@ -148,8 +151,11 @@ class _Scripted:
 
 
 class _Cameras(_Scripted):
-    """A search in which tangential_distortion of the left camera does better alone and beside focal_length, that of the right one
-    beside camera_shift."""
+    """A search whose best explanation depends on which effects are fitted together.
+
+    The tangential distortion of the left camera explains more alone and beside a focal length; that of the right camera explains
+    more beside a camera shift.
+    """
 
     _SCORES: ClassVar = {
         "": {"tangential_distortion left": 45.0, "focal_length": 6.0, "camera_shift": 4.0},

@@ -52,8 +52,10 @@ class _Strong(Target):
 
 @pytest.mark.parametrize("kind", ["camera_phi", "camera_omega"])
 def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    """Some milliradians, which move the registered pair by metres: slopes give half the angle and make up for the rest with
-    other effects."""
+    """A camera rotation of some milliradians, which moves the registered pair by metres, is named alone.
+
+    The linearised model gives half of the angle, and adds other effects for the rest.
+    """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
     make(Case(0, (3, 1), "one", "stereo", (kind,), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
@@ -68,8 +70,11 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
 
 
 def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """10 px, which turn the registered pair by some milliradians: by slopes it is the other camera's, beside which a focal length
-    makes up for the rest."""
+    """An error of 10 px is attributed to the camera that has it, once the effect is in the model.
+
+    It rotates the registered pair by some milliradians. The linearised model attributes it to the other camera, and adds a focal
+    length for the rest.
+    """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
     make(Case(0, (77, 1), "one", "stereo", ("principal_point_x",), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
@@ -97,8 +102,10 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchI
 def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """Least squares with the columns of both effects there find both values to 15 %, two to three standard errors;
-    by the slopes at the model they miss a third of one."""
+    """With the Jacobian at the joint fit, least squares finds both effects to 15 %, two to three standard errors.
+
+    With the Jacobian at the model without effects, it misses a third of one of them.
+    """
     points, truth = turned_and_zoomed
 
     def both(families: list[Candidate | SineGrid], part: Residuals, value: FloatArray) -> list[float]:
@@ -119,8 +126,11 @@ def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
 def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """Without them what they do, hundreds of times the noise, is found as noise of some pixels; with them none is, and the
-    residuals spread as predicted: an NMAD of 3,000 values errs by 2 %, and the effects' values by their own errors."""
+    """Noise terms are fitted to the residuals with the effects in the model, where there are none.
+
+    Without the effects, their traces are hundreds of times the noise and are found as noise of some pixels. With them the
+    residuals scatter as predicted: an NMAD of 3,000 values is uncertain by 2 %, and the effects' values have errors of their own.
+    """
     points, _ = turned_and_zoomed
     asked: list[Residuals] = []
     search_at_joint_fit(replace(points, variance_at=lambda at: asked.append(at) or []))  # type: ignore[func-returns-value]
@@ -137,8 +147,11 @@ def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
 def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is what the answer says: with any margin all that were taken exactly are in it, with none those alone that slopes put
-    there and that were not taken exactly."""
+    """The equivalence class of a refitted effect contains the refitted effects within the margin.
+
+    With any margin these are all that were refitted. With none, only those remain that the linearised search put there and that
+    were not refitted.
+    """
     points, _ = turned_and_zoomed
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     classes = {}

@@ -39,8 +39,10 @@ def test_disparities_of_a_rough_wall_show_none() -> None:
 
 
 def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -> None:
-    """0.115 px beside noise of 0.22: the first multiple alone shows. Twenty times: the mean within 8 %, 18 or more within 1.645
-    standard deviations."""
+    """Locking of 0.115 px beside noise of 0.22 px is estimated although only the first multiple stands out.
+
+    Of twenty draws, the mean is within 8 %, and 18 or more values are within 1.645 standard deviations.
+    """
     found = []
     for seed in range(20):
         random = np.random.default_rng(seed)
@@ -55,8 +57,10 @@ def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -
 
 
 def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one() -> None:
-    """A tenth of the disparities snapped to whole pixels beside 0.12 px of locking: the mean of the first multiple alone is as
-    that of 0.46 px, which no matcher makes. Snapping is no sine, so the amplitude is held to a sixth."""
+    """Locking of 0.12 px is estimated to a sixth although a tenth of the disparities are snapped to whole pixels.
+
+    The mean of the first multiple alone would fit 0.46 px too, which no matcher has. Snapping is no sine, hence the tolerance.
+    """
     rng = np.random.default_rng(3)
     plain = rng.uniform(0, 80, 60_000)
     locked = plain + 0.12 * np.sin(2 * np.pi * plain)

@@ -82,8 +82,11 @@ def test_a_shrub_before_the_wall_is_none() -> None:
 
 
 def test_lines_that_the_scanner_dropped_are_none() -> None:
-    """Nine gaps of some lines and a fifth of their height, as often by chance in one sector; of 20 draws one may be taken for a
-    sector's losses, two with a chance of 2 % where that of each is 1 %."""
+    """Gaps of some scan lines are not taken for the losses of a sector.
+
+    A scan has nine gaps, each over a fifth of the lines' height; by chance several may be in one sector. One of 20 draws may be
+    taken for a sector's losses. Two have a chance of 2 % if each has one of 1 %.
+    """
     _, _, covariates = pulses()
     azimuth, zenith = covariates["azimuth"], covariates["zenith"]
     wrong = 0

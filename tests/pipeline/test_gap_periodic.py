@@ -79,8 +79,11 @@ def square(x: FloatArray, period: float) -> FloatArray:
 
 @pytest.mark.parametrize(("period", "least"), [(PERIOD, 0.93), (96.0, 0.96)])
 def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least: float) -> None:
-    """A square has the odd overtones: beyond the fifth 7 % of its variance are left, a correlation of 0.97 without noise, beyond
-    the eleventh 3 %, 0.983; 16 columns a period show none beyond the eighth."""
+    """A square wave is described by its odd overtones, as far as the raster shows them.
+
+    Beyond the fifth, 7 % of its variance are left (a correlation of 0.97 without noise), beyond the eleventh 3 % (0.983). With 16
+    columns a period none beyond the eighth is visible.
+    """
     found = residuals(square(PIXELS[:, 0], period))
     _, estimate = best(found, [])
     assert estimate.candidate.form == FOLDED
@@ -99,8 +102,11 @@ def test_a_sine_stays_a_sine() -> None:
 
 @pytest.mark.parametrize("lines", [3, 4, 5])
 def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) -> None:
-    """Facets of 0, 1, -0.6, 0.3 and -0.2 times 0.1 px: no sine of any period has them. Planes of cells as wide as five columns
-    take most of what tells these apart: 0.19 of their scatter is left then, 0.04 of that of three."""
+    """Offsets that repeat every few columns are found, with the number of columns.
+
+    They are 0, 1, -0.6, 0.3 and -0.2 times 0.1 px, which is no sine of any period. The planes of cells that are as wide as five
+    columns absorb most of the offsets: 0.19 of their scatter is then left, and 0.04 with three columns.
+    """
     column = PIXELS[:, 0] / STRIDE
     error = 0.1 * np.array([0.0, 1.0, -0.6, 0.3, -0.2])[(column % lines).astype(int)]
     found = residuals(error)
@@ -115,8 +121,11 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
 
 @pytest.mark.parametrize("scale", [1.0, 0.985])
 def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: float) -> None:
-    """Two cycles a pixel, of a rectification whose principal distance may be another, on a wall of 40 px of disparity; the sine's
-    amplitude of 0.1 px is known to 0.2 sqrt(2 / 10,000) = 3 %."""
+    """An error of two cycles a pixel is found on a wall of 40 px of disparity.
+
+    The matcher's rectification may have another principal distance. The sine's amplitude of 0.1 px has a standard error of 0.2
+    sqrt(2 / 10,000), 3 %.
+    """
     x, y = PIXELS.T / (STRIDE * SIDE)
     disparity = 500 + 40 * (x + 0.3 * np.sin(5 * y) + 0.1 * np.sin(9 * x * y))
     error = 0.1 * np.sin(4 * np.pi * scale * disparity + 0.7)
@@ -132,8 +141,11 @@ def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: flo
 
 @pytest.mark.parametrize(("points", "least"), [(12_000, 34), (300, 0)])
 def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_path: Path, points: int, least: int) -> None:
-    """A read-out in blocks may repeat tens of times over an image, twelve of which is what a wall's shape may do; a raster with
-    fewer than two columns a cycle shows another wave."""
+    """Waves along the columns are tried down to two columns a cycle.
+
+    A sensor that is read out in blocks may repeat tens of times over an image; a wall's shape is allowed twelve cycles. With
+    fewer than two columns a cycle the raster would show another wave.
+    """
     make(Case(0, (3, 1), "none", "stereo", (), points, 6_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")
     found = residuals_of(measurement)

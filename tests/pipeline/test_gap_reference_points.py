@@ -71,8 +71,11 @@ def test_noise_of_points_is_told_from_relief() -> None:
 
 
 def test_chords_across_a_ball_are_bent_back(tmp_path: Path) -> None:
-    """Seen from its middle every range is 5 m. The middle of a chord of c lies c^2 / 8 r inside, 31 micrometres for 3.5 cm, and a
-    triangle two thirds of that and more on average."""
+    """Planes through the vertices remove the bias of a reference of triangles inside a ball.
+
+    Seen from the ball's centre every range is 5 m. The middle of a chord c lies c^2 / 8 r inside, 31 micrometres for 3.5 cm; a
+    triangle lies inside by two thirds of that or more on average.
+    """
     sweeps = 0.0035 * np.arange(180), 1.2 + 0.0035 * np.arange(180)
     azimuth, zenith = (each.ravel() for each in np.meshgrid(*sweeps, indexing="ij"))
     noise = 0.001 * np.random.default_rng(4).standard_normal((len(azimuth), 1))
@@ -99,8 +102,12 @@ def test_draws_of_the_vertices_errors_have_the_stated_variances(residuals: TlsRe
 
 
 def test_slopes_do_not_share_the_noise_of_the_ranges(tmp_path: Path) -> None:
-    """Level ground 1.7 m below: no slope by azimuth. That of a triangle is the noise of its corners, as is the range on it:
-    correlated by 4.6 standard deviations here, which passes for an error of the azimuth; that of planes is not."""
+    """The derivative of the range by the azimuth does not share the noise of the ranges.
+
+    The ground is level, 1.7 m below, so the derivative is zero. That of a triangle is noise of its corners, like the range on it:
+    the two are correlated by 4.6 standard deviations here, which would pass for an error of the azimuth. That of the planes is
+    not.
+    """
     rng = np.random.default_rng(8)
     azimuth, zenith = (
         each.ravel() for each in np.meshgrid(np.arange(-0.5, 0.5, 0.008), np.arange(1.9, 2.4, 0.004), indexing="ij")

@@ -94,8 +94,11 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
 
 
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
-    """Depth maps have cells of two pixels or more, the measurement's pixels are half a pixel off their middles: what the surface
-    does between is none of the sensor's."""
+    """A simulation without noise agrees with the surface at the measurement's own pixels.
+
+    Depth maps have cells of two pixels or more, and the measurement's pixels are half a pixel off their centres. How the surface
+    varies between them must not count as an error of the sensor.
+    """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     there, residuals, _ = settled(read_measurement(tmp_path / "case"))
     assert isinstance(there, StereoMeasurement)

@@ -88,8 +88,12 @@ def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkey
 
 
 def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> None:
-    """Against moving the cameras and low-passing the reference anew, on a wall with ledges and relief; by mm and tens of
-    microradians, where the change is straight. Points beside what no pixel sees are left out: the low-pass does not know it."""
+    """The Jacobian of the pose, of low-passed disparities, predicts what a small move of the cameras changes.
+
+    It is compared with moving the cameras and filtering the reference anew, on a wall with ledges and relief. The move has mm and
+    tens of microradians, where the change is linear. Points beside pixels without a hit are left out, because the low-pass does
+    not know what is there.
+    """
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
@@ -277,8 +281,11 @@ def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
 
 
 def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
-    """A pencil whose directions scatter by 55 microradians, on ledges of strata: at edges it records on average what a beam of
-    four times that does (a quiet case of the second judge, who cast no footprint)."""
+    """Noise of the beam's direction does not pass for a beam footprint if the model contains it.
+
+    A beam without width scatters by 55 microradians on ledges. At edges it records on average what a beam of four times that
+    divergence does. The case is a quiet one of the second generator, which simulated no footprint.
+    """
     build(schedule(78, 40)[26], 78, tmp_path / "case")
     there, residuals, _ = settled(read_measurement(tmp_path / "case"))
     assert isinstance(there, TlsMeasurement)
@@ -339,8 +346,11 @@ def _few_families(measurement: Measurement, part: Residuals) -> list[Candidate |
 
 
 def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All is named again beside it: noise shared over cells had passed for a reference that is off by as much, so that with its
-    name the model predicted too wide a scatter of patches, and the right name went."""
+    """After grid-correlated noise is named, the systematic effects are selected again with it in the model.
+
+    Noise that is shared over whole cells had passed for an error of the reference of that size. With its name the model then
+    predicted too large a scatter of patches, and the right name was dropped.
+    """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     left = residuals.covariates["image_x"]
     part = residuals.part(residuals.smooth & (left < np.median(left)))

@@ -138,8 +138,11 @@ def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_take_some_of_it(seed: int) -> None:
-    """Its mean square within cells is below white noise's (the control). A measurement less noisy than that is said to be so:
-    some 150 nodes, the share scatters by 6 %; 20 %."""
+    """A measurement with correlated noise is not called quieter than the model.
+
+    Its mean square within cells is below that of white noise (the control), because cells absorb some of it. A measurement that
+    is less noisy is recognised, to 20 %: with about 150 nodes the ratio scatters by 6 %.
+    """
     pixels = raster(100)
     field = SharedNoise((NOISE,), pixels).field(len(pixels))
     residuals = noisy(seed, pixels, field.weights @ np.linalg.cholesky(field.covariance))

@@ -68,8 +68,11 @@ def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> N
 def test_an_effect_that_does_little_harm_is_taken_out_too(
     tmp_path: Path, name: str, key: str, value: float, kind: str, kept: int
 ) -> None:
-    """Half as much noise again, no more than chance would make of it, goes, named or not, and so does a description that clearly
-    does harm; what is there, and as small, stays."""
+    """An effect that does slight harm is dropped, and so is an empirical term that does clear harm.
+
+    Noise that is half as large again does no more harm than chance would, and is dropped whether it has a name or not. An effect
+    of that size that is real stays.
+    """
     result, _ = _validation(tmp_path, _biased(0.003)).validate([replace(_named(name, key, value), kind=kind)])
     assert len(result.named) == kept
 
@@ -88,8 +91,11 @@ def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
 
 
 def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An effect brings points near that were too far off to count: 7 mm without it on all of these, 3 with it. That the
-    others score 1 mm alone, and that a few held-out edges score worse, is nothing against it."""
+    """An effect is kept if it improves the score of the same points.
+
+    It brings points near that were too far off to count: all of these have 7 mm without it and 3 mm with it. It does not matter
+    that the other points have 1 mm alone, nor that a few validation points at edges get worse.
+    """
     validation = _validation(tmp_path, _biased(0.003))
     with_it, alone = {True: (0.009, 0.011), False: (0.007, 0.003)}, {True: (0.001, 0.001), False: (0.001, 0.001)}
 
@@ -105,8 +111,12 @@ def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_few_points_far_off_do_not_stand_for_the_wall(tmp_path: Path) -> None:
-    """In a strip, 4 % of the wall, a term moves all points by 30 cm, and half of them are there: it neither helps nor harms. The
-    bias of some millimetres beside it is what the gap tells of, which the strip's points as they are would make 23 mm."""
+    """Outliers in a narrow strip do not dominate the score of the wall.
+
+    In a strip of 4 % of the wall an empirical term moves all points by 30 cm, and half of them are there, so that it neither
+    helps nor harms. The score describes the bias of some millimetres beside it. With the strip's points as they are it would be
+    23 mm.
+    """
     middle, half = 1.5, 0.02
 
     def moved(scan: Scan) -> Array:

@@ -81,7 +81,7 @@ def test_sphere():
 
 
 def step_points(edge, depth):
-    """z = 0 left of column `edge`, z = -depth from it on."""
+    """Return points with z = 0 left of column `edge`, and z = -depth from it on."""
     direction = rays()
     z = np.where(np.arange(SHAPE[1]) < edge, 0.0, -depth)
     return VIEWPOINT + (VIEWPOINT[2] - z)[None, :, None] * direction

@@ -103,5 +103,4 @@ def test_the_script_loads_both_maps(folder: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_the_script_is_python_3_8() -> None:
     """Metashape 2 brings Python 3.8 or newer."""
-
     ast.parse(SCRIPT, feature_version=(3, 8))

@@ -61,7 +61,7 @@ def _chunk(folder: Path, cameras: dict[str, Camera]) -> str:
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """rock wall.psx with two chunks, of which the second is active."""
+    """Write a project "rock wall.psx" with two chunks, of which the second is active."""
     files = tmp_path / "rock wall.files"
     (tmp_path / "rock wall.psx").write_text(DESCRIPTOR)
     _archive(files / "project.zip", CHUNKS)

@@ -72,7 +72,7 @@ def test_what_stands_where_the_lock_should_is_refused_and_stays(make: Callable[[
 
 
 def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
-    """kill -9 leaves the lock's file, and nobody holds it."""
+    """A killed process leaves the lock's file, but nobody holds the lock."""
     program = (
         "import sys, pathlib, os; from pipeline.formats.files.lock import locked\n"
         "with locked(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
@@ -97,7 +97,7 @@ def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_goes_on_to_the_same_bytes(finished: Path, tmp_path: Path) -> None:
-    """kill -9 of the command itself in the middle of the reference epoch, then of its successor among the maps."""
+    """Kill the command in the middle of the reference epoch, then its successor among the maps."""
     out, coarse = tmp_path / "run", tmp_path / "coarse.yaml"
     coarse.write_text(json.dumps(config(**COARSE).model_dump(mode="json")))
     program = "from pipeline.cli.main import simulate; raise SystemExit(simulate())"

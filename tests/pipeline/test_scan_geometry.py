@@ -159,10 +159,11 @@ def test_an_origin_that_is_off_shows_in_the_residuals() -> None:
 
 @pytest.mark.skipif(not FOREST.exists(), reason=f"the real scan is not there: {FOREST}")
 def test_a_real_scan_has_the_documented_pattern() -> None:
-    """RIEGL VZ-400i in a forest, 1 mm coordinates at 1 to 15 m (its README): 580 lines, steps 0.622 x 0.048 deg, zenith from 30
-    to 130.024 deg, roll 1.026 and pitch 0.746 deg.
+    """The pattern of a RIEGL VZ-400i scan in a forest is as its README documents it.
 
-    RIEGL scanners fire about 1 % faster than nominal, so the true zenith step is that much smaller than the documented one.
+    Coordinates have 1 mm, ranges 1 to 15 m. The scan has 580 lines, steps of 0.622 x 0.048 deg, zenith angles from 30 to 130.024
+    deg, and a roll of 1.026 and a pitch of 0.746 deg. RIEGL scanners fire about 1 % faster than nominal, so the true zenith step
+    is that much smaller than the documented one.
     """
     data = np.load(FOREST)
     found = recover_pattern(np.stack([data[axis] for axis in "XYZ"], axis=1))

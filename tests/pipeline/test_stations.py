@@ -68,8 +68,11 @@ def misfit(found: RigidTransform, true: RigidTransform) -> FloatArray:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_stations_with_wrong_poses_are_registered_to_the_noise_over_the_root_of_the_points(seed: int) -> None:
-    """Tolerance 40 sigma / sqrt(n), 0.3 mm here: the relief (slopes about 0.3) tells shifts along the wall three times less well
-    than across, both stations are noisy, neighbouring pairs share reference points, and the wall's worst corner counts."""
+    """Two stations with wrong poses are registered to 40 sigma / sqrt(n), 0.3 mm here, anywhere on the wall.
+
+    The relief (slopes of about 0.3) determines shifts along the wall three times less well than across. Both stations are noisy,
+    neighbouring pairs share reference points, and the wall's worst corner counts.
+    """
     scanners = [station(LEFT), station(RIGHT, SECOND_POSE)]
     result = joined(scanners, seed)
     true = pose_error(scanners[1], KeyedRandom(seed).child(1))
@@ -98,8 +101,10 @@ def test_without_registration_the_surveyed_poses_stand() -> None:
 
 
 def test_the_merged_surface_covers_what_either_station_sees_and_is_the_better_ones_there() -> None:
-    """Stations that each see two thirds of the wall: a height at each pixel that has one in either; equal to one of them, which
-    is the near one's beside each station."""
+    """The merged surface has a height at each pixel that either station sees, equal to one of theirs.
+
+    Each station sees two thirds of the wall. Beside a station the height is that station's.
+    """
     scanners = [station(LEFT), station(RIGHT)]
     random = KeyedRandom(4)
     meshes = []

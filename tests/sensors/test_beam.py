@@ -96,7 +96,7 @@ def nominal(seen: Observation) -> FloatArray:
 
 
 def axis_at(seen: Observation, z: float) -> tuple[FloatArray, FloatArray]:
-    """x of the beams' axes in a plane of constant z, m, and the ranges there."""
+    """Return x of the beams' axes in a plane of constant z, m, and the ranges there."""
     ray = nominal(seen)
     range_m = (z - POSITION[2]) / ray[..., 2]
     return POSITION[0] + range_m * ray[..., 0], range_m

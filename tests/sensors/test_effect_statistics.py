@@ -183,8 +183,11 @@ def test_smooth_noise_with_heavy_tails_is_not_white() -> None:
 )
 @pytest.mark.parametrize("side", [20, 80, 200])
 def test_the_mean_of_a_square_has_the_variance_that_its_pairs_give(effect: MatchingNoise, side: int) -> None:
-    """side: px; means over the squares of 20 images, at least 2,000 of them: 20 %, what bilinear nodes half a
-    step apart are off by (heavy tails: 8 %) and four times what they scatter."""
+    """The mean of correlated noise over squares of `side` px has the variance that the covariances of its pixels give.
+
+    There are at least 2,000 squares, in 20 images. The tolerance is 20 %: bilinear nodes half a step apart are off by that much
+    (heavy tails: 8 %), and it is four times the scatter.
+    """
     cells = side // REDUCTION
     count = CELLS // cells
     field = noise(effect, range(20))[:, : count * cells, : count * cells]

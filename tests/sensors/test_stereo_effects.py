@@ -190,10 +190,10 @@ def parallel_pair(distance: float, base: float) -> CameraPair:
 
 
 def test_radial_distortion_domes_a_parallel_pair_by_the_closed_form() -> None:
-    """dZ = -Z k1 [3 (u - b/2)^2 + v^2 + b^2/4]: to 0.01 mm for k1 = 5e-5, the remainder being of second order in k1.
+    """The depth error is dZ = -Z k1 [3 (u - b/2)^2 + v^2 + b^2/4], to 0.01 mm for k1 = 5e-5.
 
-    Undistorting the left pixel and inverting the disparity both add terms of Z (k1 r^2)^2; so twice the k1 has four times the
-    remainder.
+    The remainder is of second order in k1. Undistorting the left pixel and inverting the disparity both add terms of Z (k1
+    r^2)^2; so twice the k1 has four times the remainder.
     """
     distance, base = 105.0, 28.0
     pair = parallel_pair(distance, base)

@@ -82,7 +82,10 @@ def test_a_step_edge_is_recorded_without_points_between_its_two_planes() -> None
 
 
 def test_directions_are_the_contracts_angles() -> None:
-    """azimuth = atan2(y, x), zenith from +z, in the scanner's frame; rows are lines in azimuth, columns run in zenith."""
+    """In the scanner's frame azimuth = atan2(y, x), and zenith is from +z.
+
+    Rows are lines in azimuth, columns run in zenith.
+    """
     sensor = scanner()
     seen = sensor.observe(RayCaster(plane(np.array([0, 0, 1.0]), np.zeros(3))), KeyedRandom(1))
     local = (seen.points - POSITION) @ ROTATION
