@@ -53,7 +53,7 @@ def _with_model(site: SensorSite, model: object) -> SensorSite:
 
 
 def unscaled(config: DatasetConfig) -> DatasetConfig:
-    """The config with every scale at 1."""
+    """Return the config with every scale at 1."""
     values = config.model_dump(mode="json")
     for level in values["noise"].values():
         for model in level.values():

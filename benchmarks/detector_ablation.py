@@ -134,12 +134,12 @@ def part(folder: Path, out: Path, *, ignore: bool = True, wanted: Callable[[Coco
 
 
 def content(folder: Path) -> Coco:
-    """A folder's annotations."""
+    """Return a folder's annotations."""
     return dict(json.loads((folder / "annotations.json").read_text(encoding="utf-8")))
 
 
 def rows(arguments: argparse.Namespace) -> Iterator[str]:
-    """The table's, in Markdown, as they are made."""
+    """Yield the rows of the table, in Markdown, as they are made."""
     heads = [f"{size}: {', '.join(f'{overlap:g}' for overlap in OVERLAPS)}" for size in SIZES]
     yield f"| change | {' | '.join(heads)} | against the first row |"
     yield "|---" * (2 + len(SIZES)) + "|"

@@ -23,7 +23,7 @@ sys.path.insert(0, str(ROOT))
 
 
 def through(commands: list[str], examples: int) -> int:
-    """The number of bad answers among `examples` cases of each command."""
+    """Run `examples` cases of each command to the end, and return the number of bad answers."""
     from hypothesis import HealthCheck, Phase, given, settings
     from hypothesis import strategies as st
 

@@ -215,7 +215,7 @@ def main() -> None:
 
 
 def _made_by(arguments: argparse.Namespace) -> str:
-    """The table of how the results were made."""
+    """Return the table of how the results were made."""
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     words = f"python benchmarks/gap_thresholds.py --cases {arguments.cases} --seed {arguments.seed} --out DIR --table {_PAGE}"
     row = f"| {arguments.cases} | {arguments.seed} | {commit} | `{words}` |"

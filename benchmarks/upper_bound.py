@@ -80,7 +80,10 @@ class Niches:
 
 
 def observed(config: SimulationConfig, blocks_per_m2: float, given: Wall | None = None) -> Niches:
-    """What one epoch shows of its blocks. given: a wall that takes the place of the config's."""
+    """Simulate one epoch and return the niches of its blocks.
+
+    given: a wall that replaces the config's.
+    """
     random, progress = KeyedRandom(config.seed), Progress()
     site = prepare_site(config, "stereo", random, given)
     reference = observe_reference(config, site, random, progress)

@@ -293,7 +293,7 @@ def prepare(folder: Path) -> None:
 
 
 def outcome(kind: Kind, door: str, fault: str) -> str:
-    """What a door does with a file that has a fault, in a prepared working folder: "refused", or what it does instead."""
+    """Return what a door does with a file that has a fault, in a prepared working folder: "refused", or what it does instead."""
     file = Path(f"bad{kind.suffix}")
     make = kind.good if fault == NO_FAULT else kind.faults[fault]
     if make is not None:
@@ -317,14 +317,14 @@ def outcome(kind: Kind, door: str, fault: str) -> str:
 
 
 def table(kind: Kind, found: dict[tuple[str, str], str]) -> str:
-    """The table of one kind of files: a row for each fault, a column for each door."""
+    """Return the table of one kind of files: a row for each fault, a column for each door."""
     lines = [f"| fault | {' | '.join(kind.doors)} |", "|---" * (len(kind.doors) + 1) + "|"]
     lines += [f"| {fault} | {' | '.join(found[door, fault] for door in kind.doors)} |" for fault in kind.faults]
     return "\n".join(lines)
 
 
 def tried(kind: Kind) -> dict[tuple[str, str], str]:
-    """What each door does with each fault, every time in a folder of its own."""
+    """Return what each door does with each fault, every time in a folder of its own."""
     found, here = {}, Path.cwd()
     for door in kind.doors:
         for fault in kind.faults:

@@ -253,7 +253,7 @@ _EMPTY: dict[str, tuple[str, ...]] = {
 
 
 def _beside(folder: Path) -> None:
-    """A copy of run/ and two maps whose names differ by a space."""
+    """Make a copy of run/ and two maps whose names differ by a space."""
     if (folder / "run").exists():
         shutil.copytree(folder / "run", folder / "run copy")
         for name in ("a b.tif", "a_b.tif"):

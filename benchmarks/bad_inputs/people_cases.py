@@ -171,7 +171,7 @@ _FRAMES: dict[str, Change] = {
 
 
 def _stray(where: str) -> Change:
-    """What a file manager, an editor and a cloud leave in a folder."""
+    """Leave files in a folder as a file manager, an editor and a cloud do."""
 
     def change(folder: Path) -> None:
         base = folder / where

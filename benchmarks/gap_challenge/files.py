@@ -12,7 +12,7 @@ from benchmarks.gap_challenge.casting import Array
 
 
 def write_mesh(path: Path, vertices: Array, faces: Any) -> None:
-    """A binary PLY mesh in double precision."""
+    """Write a binary PLY mesh in double precision."""
     record = np.zeros(len(faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
     record["n"], record["v"] = 3, faces
     lines = [f"element vertex {len(vertices)}", *_doubles("xyz"), f"element face {len(faces)}"]

@@ -150,7 +150,7 @@ def _control(truth: Json, named: list[Json]) -> Json | None:
 
 
 def _figures(rows: list[Json]) -> list[Json]:
-    """The rows of GAP.md's table."""
+    """Return the rows of GAP.md's table."""
     of = {stratum: [row for row in rows if row["stratum"] == stratum] for stratum in ("none", "one", "two", "off", "change")}
     clear_one = [row for row in of["one"] if _clear(row["true"][0])]
     clear_two = [row for row in of["two"] if all(_clear(effect) for effect in row["true"])]

@@ -101,7 +101,10 @@ def times(parameters: Parameters, factor: float) -> Parameters:
 
 
 def real_pair(pair: Pair, name: str, p: Parameters, world: Array) -> Pair:
-    """The cameras with an effect. world: (3, 3) world to the cameras' frame, for shifts along the world's axes."""
+    """Return the cameras with an effect.
+
+    world: (3, 3) world to the cameras' frame, for shifts along the world's axes.
+    """
     camera = p.get("camera", "both")
     if name in _INTERIOR:
         return pair.each(camera, lambda c: c.changed(**{_INTERIOR[name]: p["delta_px"]}))

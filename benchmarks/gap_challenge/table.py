@@ -66,7 +66,7 @@ def markdown(found: Json) -> str:
 
 
 def _introduction(found: Json) -> str:
-    """What was evaluated, and what it comes to."""
+    """Say what was evaluated, and with which result."""
     figures = {row["what"].split(" at S/N")[0]: row for row in found["figures"]}
 
     def counted(what: str) -> str:

@@ -33,7 +33,7 @@ class Rays:
     by_ze: Array
 
     def part(self, rows: Any) -> Rays:
-        """Some of the pulses."""
+        """Return some of the pulses."""
         return Rays(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     @property

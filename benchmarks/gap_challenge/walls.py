@@ -48,11 +48,11 @@ class Wall:
         return np.concatenate([np.stack(corner, axis=-1).reshape(-1, 3) for corner in ((a, b, c), (a, c, d))])
 
     def surface(self) -> Surface:
-        """The wall for a ray caster."""
+        """Return the wall for a ray caster."""
         return Surface(self.vertices, self.faces)
 
     def deeper(self, change: Array) -> Wall:
-        """The wall with its nodes moved into the slope by `change`, m."""
+        """Return the wall with its nodes moved into the slope by `change`, m."""
         return Wall(self.spacing, self.depth + change)
 
 
@@ -119,7 +119,7 @@ def wave_numbers(length: float, count: int, random: Random) -> Array:
 
 
 def waves(x: Array, z: Array, length: float, random: Random) -> Array:
-    """A field of standard deviation 1 that is correlated over `length`, m."""
+    """Return a field of standard deviation 1 that is correlated over `length`, m."""
     phase = random.uniform(0, 2 * np.pi, _WAVES)
     total = np.zeros(x.shape)
     for (kx, kz), shift in zip(wave_numbers(length, _WAVES, random), phase, strict=True):

@@ -132,7 +132,7 @@ def _counts(rows: list[Json]) -> str:
 
 
 def _in_short(rows: list[Json]) -> str:
-    """What the counts come to."""
+    """Summarise the counts in sentences."""
     good = [row for row in rows if row["judgement"] in ("right", "class")]
     known = [row for row in good if not row["effect"].startswith("off_")]
     spoiled = [row for row in known if row["verdict"] == "unknown"]

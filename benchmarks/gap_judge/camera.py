@@ -28,11 +28,11 @@ class Camera:
     frame: Frame
 
     def with_lens(self, **added: float) -> Camera:
-        """The same with something added to numbers of the lens."""
+        """Return the same camera with something added to parameters of the lens."""
         return replace(self, lens={**self.lens, **{name: self.lens[name] + value for name, value in added.items()}})
 
     def with_frame(self, frame: Frame) -> Camera:
-        """The same elsewhere."""
+        """Return the same camera in another frame."""
         return replace(self, frame=frame)
 
     def distorted(self, x: Array, y: Array) -> tuple[Array, Array]:

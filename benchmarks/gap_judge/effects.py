@@ -47,7 +47,7 @@ class Effect:
         return {**self.others(rng, shot), **{key: signs[key] * size * rng.uniform(0.7, 1.4) for key, size in self.sizes.items()}}
 
     def scaled(self, parameters: Parameters, factor: float) -> Parameters:
-        """The same with the sizes `factor` times as large."""
+        """Return the parameters with the sizes `factor` times as large."""
         return {key: value * factor if key in self.sizes else value for key, value in parameters.items()}
 
 

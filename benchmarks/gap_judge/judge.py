@@ -65,7 +65,7 @@ class Result:
 
 
 def judged(out: Path, name: str) -> Result:
-    """The case `name` of the folder `out`."""
+    """Compare the answer to the case `name` of the folder `out` with its truth."""
     truth = json.loads((out / "truth" / f"{name}.json").read_text())
     said = json.loads((out / "answers" / name / "said.json").read_text())
     written = out / "answers" / name / "gap.json"
@@ -148,7 +148,7 @@ def table(results: list[Result], command: str, commit: str) -> str:
 
 
 def _in_short(results: list[Result]) -> str:
-    """What was evaluated, and what it comes to."""
+    """Say what was evaluated, and with which result."""
     clear = [each for each in results if each.truth["kind"] in ("one", "two") and each.clarity >= CLEAR]
     quiet = [each for each in results if each.truth["kind"] == "none"]
     spoke = [each for each in results if each.outcome in _NAMING]

@@ -130,7 +130,7 @@ class Strength:
         self.whitening = Whitening(self.variance, patch, patch_variance, pose)
 
     def of(self, effect: Effect, parameters: Parameters) -> float:
-        """The ratio."""
+        """Return the effect's signal-to-noise ratio."""
         if effect.stage in ("range", "aim"):
             return self.whitening.strength(self._shift(effect, parameters))
         if effect.stage == "footprint":
@@ -211,7 +211,7 @@ _STAGES = ("aim", "ray_spread", "footprint", "range", "spread", "loss", "step")
 def _emitted(
     site: Site, shot: Shot, noise: Noise, of: dict[str, list[tuple[Effect, Parameters]]], rng: Rng
 ) -> tuple[Array, Hits, Array, Array]:
-    """True rays (scanner frame), what they hit, the places, the cosines of incidence."""
+    """Return true rays (scanner frame), what they hit, the places, and the cosines of incidence."""
     aim = sum((effect.act(p, shot) for effect, p in of["aim"]), np.zeros((2, len(shot.line))))
     spread = sum((effect.act(p, shot) ** 2 for effect, p in of["ray_spread"]), np.full((2, len(shot.line)), noise.angle_rad**2))
     off = np.sqrt(spread) * rng.standard_normal((2, len(shot.line))) - aim

@@ -94,7 +94,7 @@ def view(surface: Surface, wall: Frame, nominal: Pair, real: tuple[Camera, Camer
 
 
 def real_pair(pair: Pair, effects: dict[str, Parameters]) -> tuple[Camera, Camera]:
-    """The nominal pair with the effects of the stage `camera` in it."""
+    """Return the nominal pair with the effects of the stage `camera` in it."""
     left, right = pair.left, pair.right
     for name, parameters in effects.items():
         if EFFECTS[name].stage == "camera":
@@ -137,7 +137,7 @@ class Strength:
         return np.concatenate([self.normal, np.cross(middle, self.normal)], axis=1) * per_metre[:, None]
 
     def of(self, effect: Effect, parameters: Parameters) -> float:
-        """The ratio; 0 for `fill`, which is counted afterwards."""
+        """Return the effect's signal-to-noise ratio; 0 for `fill`, which is counted afterwards."""
         if effect.stage in ("camera", "disparity"):
             return self.whitening.strength(self._shift(effect, parameters))
         if effect.stage == "spread":

@@ -54,7 +54,7 @@ def _whose(p: Parameters, camera: str) -> bool:
 
 
 def _lens(**names: str) -> Any:
-    """Adds parameters (second name) to numbers of the lens (first name)."""
+    """Return a function that adds parameters (second name) to those of the lens (first name)."""
 
     def act(p: Parameters, pair: Pair) -> tuple[Camera, Camera]:
         added = {number: p[name] for number, name in names.items()}

@@ -37,11 +37,11 @@ class Surface:
     height: Array
 
     def with_height(self, height: Array) -> Surface:
-        """The same grid with other heights (a, b), m."""
+        """Return the same grid with other heights (a, b), m."""
         return replace(self, height=height)
 
     def vertices(self) -> Array:
-        """(a b, 3) local, m."""
+        """Return the vertices (a b, 3), local frame, m."""
         x, z = np.meshgrid(self.x, self.z, indexing="ij")
         return np.stack([x.ravel(), self.height.ravel(), z.ravel()], axis=1)
 

@@ -44,7 +44,10 @@ def quarry(x: Array, z: Array, rng: Rng) -> Array:
 
 
 def dam(x: Array, z: Array, rng: Rng) -> Array:
-    """A concrete face: an arch with a batter, blocks of 12 to 16 m set off against each other, grooves at their joints, lifts."""
+    """Return a concrete face: an arch with a batter, blocks of 12 to 16 m, grooves at their joints, and lifts.
+
+    The blocks are set off against each other.
+    """
     block, lift = rng.uniform(9, 14), rng.uniform(2.0, 3.2)
     number, place = np.floor(x / block).astype(int), np.mod(x, block)
     offset = rng.normal(0, 0.05, 100)[number - number.min()]
@@ -55,7 +58,7 @@ def dam(x: Array, z: Array, rng: Rng) -> Array:
 
 
 def portal(x: Array, z: Array, rng: Rng) -> Array:
-    """A cut slope with the mouth of a tunnel, its frame, wing walls that step back, anchors' heads."""
+    """Return a cut slope with the mouth of a tunnel, its frame, wing walls that step back, anchors' heads."""
     middle, radius = rng.uniform(-6, 6), rng.uniform(3.0, 5.0)
     out = np.hypot(x - middle, np.maximum(z - radius - 1, 0.0))
     height = -rng.uniform(0.2, 0.5) * np.maximum(z - 8, 0) + rng.uniform(0.05, 0.15) * fractal(x.shape, rng, 1.9, 0.3)
@@ -164,7 +167,10 @@ def changes(surface: Surface, rng: Rng, count: int) -> list[Change]:
 
 
 def moved(surface: Surface, found: list[Change], rng: Rng) -> Array:
-    """(a, b) m: how far out the surface moved; blocks leave wedge-shaped scars, debris lies as a mound."""
+    """Return how far out the surface moved, (a, b), m.
+
+    Blocks leave wedge-shaped scars; debris lies as a mound.
+    """
     x, z = np.meshgrid(surface.x, surface.z, indexing="ij")
     out = np.zeros_like(x)
     for each in found:
