@@ -66,8 +66,11 @@ def build_surface(request: Request, out: Path) -> Interpretation:
 def _check(request: Request) -> None:
     """Raise InputError for options that only scans have, or a file that is given twice."""
     if request.reference == HALF:
-        raise InputError("half needs scans: neighbours in a matched cloud share their errors", where="--reference half",
-                         remedy="name a mesh, a cloud or a DEM")  # fmt: skip
+        raise InputError(
+            "half works only with laser scans: neighbouring points of a photogrammetric cloud share their errors",
+            where="--reference half",
+            remedy="name a mesh, a cloud or a DEM",
+        )
     if request.scanner is not None:
         raise InputError("the option needs laser scans", where="--scanner", remedy="leave out --scanner or --photographs")
     if len(set(request.scans)) < len(request.scans):

@@ -146,8 +146,8 @@ def changed(**values: Any) -> TriangleMesh:
 NOTHING = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 0\n"
 NOTHING += "property list uchar int vertex_indices\nend_header\n"
 BAD = {
-    "nothing in it": (NOTHING, "holds no triangles|is not a valid ply file"),
-    "points alone": (replace(sheet(), faces=np.empty((0, 3), np.int32)), "holds no triangles"),
+    "nothing in it": (NOTHING, "contains no triangles|is not a valid ply file"),
+    "points alone": (replace(sheet(), faces=np.empty((0, 3), np.int32)), "contains no triangles"),
     "nan": (changed(v7=np.nan), r"1 of 48 vertices are not finite, the first is vertex 7 at \(nan, nan, nan\)"),
     "infinite": (changed(v7=np.inf), "1 of 48 vertices are not finite"),
     "1e300": (changed(v7=1e300), r"1 of 48 vertices are not on earth, the first is vertex 7 at \(1e\+300"),

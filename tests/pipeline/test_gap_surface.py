@@ -218,7 +218,7 @@ BAD = {
     "one point": "has 1 points",
     "all NaN": "no point with finite values",
     "scanner": "needs laser scans",
-    "half": "half needs scans",
+    "half": "half works only with laser scans",
     "cameras too": "whose cameras are not at hand",
     "a model in pixels": "a model whose noise is in metres",
     "cameras in the model": "the model has focal_length",

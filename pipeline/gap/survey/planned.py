@@ -168,7 +168,9 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
         pair = StereoView(seen.part(_thinned(seen, most)), int(seen.smooth.sum()), 0, measurement)
         return StereoSurvey((pair,), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
-        raise InputError("has no cameras, so no effect that it could show", where="--identifiability", remedy="name `cameras`")
+        raise InputError(
+            "the measurement has no cameras, so no effect can be identified", where="--identifiability", remedy="name `cameras`"
+        )
     measurement = measurement.changed(order=None)
     several = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
     found, *others = [(number, one, tls_residuals(one)) for number, one in several or [(0, measurement)]]
